@@ -36,7 +36,7 @@ _BINS = np.logspace(-6, -1, 101)
 
 
 @dataclass(frozen=True)
-class Agreement:
+class DepthAgreement:
     """Of one height, both ways. errors: (N,) relative, of what both views see; hidden: share of all
     pixels compared.
     """
@@ -92,7 +92,7 @@ def _inverse_depth(depth: Float32, uv: Array) -> Array:
     return flat
 
 
-def agreement(renderer: MapRenderer, side_m: float, height_m: float, pairs: int) -> Agreement:
+def agreement(renderer: MapRenderer, side_m: float, height_m: float, pairs: int) -> DepthAgreement:
     """Pairs of views over the middle of a map, `height_m` above its ground."""
     rng = np.random.default_rng([round(height_m), 14])
     errors, compared, hidden = [], 0, 0
@@ -103,7 +103,7 @@ def agreement(renderer: MapRenderer, side_m: float, height_m: float, pairs: int)
             relative = (z - seen) / z
             compared, hidden = compared + len(z), hidden + int((relative > _HIDDEN).sum())
             errors.append(np.abs(relative[relative <= _HIDDEN]))
-    return Agreement(height_m, np.concatenate(errors), hidden / max(compared, 1))
+    return DepthAgreement(height_m, np.concatenate(errors), hidden / max(compared, 1))
 
 
 def _pair(

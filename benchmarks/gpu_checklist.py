@@ -29,7 +29,7 @@ _LAST_S = 5.0  # with less time than this left nothing is started
 
 
 @dataclass(frozen=True)
-class Step:
+class ChecklistStep:
     """A command and the seconds it may take."""
 
     title: str
@@ -38,48 +38,48 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StepOutcome:
     """What became of a step: ok, failed, out of time, or skipped with the reason."""
 
-    step: Step
+    step: ChecklistStep
     verdict: str
     seconds: float
     output: str
 
 
-def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[Step]:
+def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[ChecklistStep]:
     python = sys.executable
     tests = (python, "-m", "pytest", "-q", "-rs", "-m", "gpu", TESTS)
     found = [
-        Step("machine", ("nvidia-smi",), 20),
-        Step("tests marked gpu", tests, 150),
+        ChecklistStep("machine", ("nvidia-smi",), 20),
+        ChecklistStep("tests marked gpu", tests, 150),
     ]
     for tool in ("memcheck", "racecheck"):
         sanitizer = ("compute-sanitizer", "--tool", tool, "--error-exitcode", "9",
                      "--target-processes", "all")  # fmt: skip
         command = (*sanitizer, *tests, "-k", "agrees_with_the_reference or agrees_with_the_cpu")
-        found.append(Step(f"compute-sanitizer {tool}", command, 90))
+        found.append(ChecklistStep(f"compute-sanitizer {tool}", command, 90))
     speed = (python, "-m", "benchmarks.features.network_speed")
-    found.append(Step("networks: s0 and tiny on every provider", speed, 120))
-    found.append(Step("pairs while training", (python, "-m", "benchmarks.pairs",
+    found.append(ChecklistStep("networks: s0 and tiny on every provider", speed, 120))
+    found.append(ChecklistStep("pairs while training", (python, "-m", "benchmarks.pairs",
                       "configs/train_s0.yaml", "--pairs", "32", "--no-photos"), 90))  # fmt: skip
-    found.append(Step("optimizer", (python, "-m", "benchmarks.optimizer.gpu"), 150))
+    found.append(ChecklistStep("optimizer", (python, "-m", "benchmarks.optimizer.gpu"), 150))
     if sequence is not None and cache is not None:
         for device in ("cuda", "cpu"):
             evaluation = (
                 python, "-m", "companion", "eval", str(sequence), "--map", str(cache),
                 "--device", device, "--limit", "100", "--report", str(report) + f".{device}",
             )  # fmt: skip
-            found.append(Step(f"companion eval --device {device}", evaluation, 90))
+            found.append(ChecklistStep(f"companion eval --device {device}", evaluation, 90))
     return found
 
 
-def run(step: Step, limit_s: float) -> Outcome:
+def run(step: ChecklistStep, limit_s: float) -> StepOutcome:
     """Run one step within a limit."""
     if shutil.which(step.command[0]) is None:
-        return Outcome(step, f"skipped: no {step.command[0]} here", 0.0, "")
+        return StepOutcome(step, f"skipped: no {step.command[0]} here", 0.0, "")
     if limit_s < _LAST_S:
-        return Outcome(step, "skipped: no time left", 0.0, "")
+        return StepOutcome(step, "skipped: no time left", 0.0, "")
     started = time.monotonic()
     try:
         done = subprocess.run(
@@ -90,10 +90,10 @@ def run(step: Step, limit_s: float) -> Outcome:
     except subprocess.TimeoutExpired as error:
         verdict = f"out of time ({limit_s:.0f} s)"
         output = error.stdout.decode(errors="replace") if isinstance(error.stdout, bytes) else ""
-    return Outcome(step, verdict, time.monotonic() - started, output)
+    return StepOutcome(step, verdict, time.monotonic() - started, output)
 
 
-def text_of(outcomes: list[Outcome]) -> str:
+def text_of(outcomes: list[StepOutcome]) -> str:
     """The report, as Markdown."""
     lines = ["# GPU checklist", "", "| step | result | s |", "|---|---|---|"]
     lines += [f"| {o.step.title} | {o.verdict} | {o.seconds:.0f} |" for o in outcomes]
@@ -119,7 +119,7 @@ def main() -> int:
         print(f"nothing to do: {error}")
         return 2
     deadline = time.monotonic() + 60 * arguments.minutes
-    outcomes: list[Outcome] = []
+    outcomes: list[StepOutcome] = []
     for step in steps(arguments.sequence, arguments.map, arguments.report.resolve()):
         outcomes.append(run(step, min(step.limit_s, deadline - time.monotonic())))
         print(f"{step.title}: {outcomes[-1].verdict}", flush=True)

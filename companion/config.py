@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from companion.errors import ConfigError
-from companion.guardian.config import GuardianConfig
+from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
@@ -261,7 +261,7 @@ class CompanionConfig(_Model):
     bridge: BridgeConfig = BridgeConfig()
     targets: TargetConfig = TargetConfig()
     prior: PriorConfig = PriorConfig()
-    guardian: GuardianConfig = GuardianConfig()
+    integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
     record: RecordConfig | None = None
     klv: KlvConfig | None = Field(
         None, description="the camera's video on to a ground station, with metadata; null: not sent"

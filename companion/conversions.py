@@ -48,7 +48,7 @@ _FARTHEST_M = 1e7  # from the map's origin; beyond it something said what is no 
 
 
 @dataclass(frozen=True)
-class Installation:
+class CameraExtrinsics:
     """What stays the same for a flight: the map's frame and the camera's place on the vehicle."""
 
     frame: LocalFrame
@@ -59,7 +59,7 @@ class Installation:
 
 def vision_fix(
     estimate: PoseEstimate,
-    installation: Installation,
+    extrinsics: CameraExtrinsics,
     attitude: Attitude | None,
     gimbal: GimbalAttitude | None,
     *,
@@ -71,7 +71,7 @@ def vision_fix(
     Without them the vehicle's attitude is unknown, and the place that is told is the camera's: the
     lever arm's length is added to its covariance.
     """
-    frame = installation.frame
+    frame = extrinsics.frame
     camera = frame.position(estimate.world_from_camera.translation)
     to_ned = ned_from_world(frame, camera)
     roll = pitch = yaw = None
@@ -81,12 +81,12 @@ def vision_fix(
         body, ned_from_body = vehicle_from_camera_pose(
             estimate.world_from_camera,
             camera_on_body(attitude, gimbal),
-            installation.lever_arm_m,
+            extrinsics.lever_arm_m,
             to_ned,
         )
         roll, pitch, yaw = euler_from_matrix(ned_from_body)
     else:
-        arm = installation.lever_arm_m
+        arm = extrinsics.lever_arm_m
         covariance = covariance + np.eye(3) * float(arm @ arm)
     position = frame.position(body)
     return VisionFix(
@@ -125,7 +125,7 @@ def vehicle_prior(
     state: VehicleState,
     attitude: Attitude | None,
     gimbal: GimbalAttitude | None,
-    installation: Installation,
+    extrinsics: CameraExtrinsics,
     sigma: tuple[float, float],
     time_ns: int,
 ) -> PosePrior | None:
@@ -139,9 +139,9 @@ def vehicle_prior(
     place = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
     if place[0] is None or place[1] is None or place[2] is None:
         return None
-    frame = installation.frame
+    frame = extrinsics.frame
     try:
-        position = Geodetic(place[0], place[1], place[2] + installation.geoid_separation_m)
+        position = Geodetic(place[0], place[1], place[2] + extrinsics.geoid_separation_m)
     except GeoreferenceError:
         return None
     body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
@@ -152,7 +152,7 @@ def vehicle_prior(
         body = body + velocity * age_ns * 1e-9
     ned_from_body = matrix_from_quaternion(attitude.quaternion)
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
-    arm = installation.lever_arm_m
+    arm = extrinsics.lever_arm_m
     camera = world_from_camera(body, ned_from_body, ned_from_camera, arm, to_ned)
     numbers = np.concatenate((camera.rotation.ravel(), camera.translation))
     if not np.abs(numbers).max() < _FARTHEST_M:  # NaN is below nothing

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from companion.errors import ReportError
-from mavlink_bridge.whole_file import replace_whole
+from mavlink_bridge.atomic_file import replace_file
 
 _BY_UMASK = 0o666
 
@@ -75,7 +75,7 @@ class NewestFile:
 
     def _write(self, text: str) -> None:
         try:
-            replace_whole(self._path, text, _BY_UMASK)
+            replace_file(self._path, text, _BY_UMASK)
         except OSError as error:
             if not self._has_failed:
                 self._failed(error)

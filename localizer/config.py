@@ -13,7 +13,7 @@ from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.render.select import RendererName
-from localizer.tracking.horizon import AttitudePrior
+from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import MotionConfig
 
 

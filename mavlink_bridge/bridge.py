@@ -16,8 +16,8 @@ from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, message_id
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.closed_loop import LoopVerdict
-from mavlink_bridge.injection.gate_memory import GateMemory, RestartMemory
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.injection_enable import InjectionEnable
+from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import Link, LinkHandler, LinkOptions
@@ -46,8 +46,8 @@ from mavlink_bridge.messages import (
 )
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status import OperatorStatus, named_values
-from mavlink_bridge.texts import Teller
-from mavlink_bridge.vehicle.mission import Waypoint
+from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.vehicle.mission import MissionWaypoint
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -87,7 +87,7 @@ class Bridge:
         self._started = self._stopped = False
         self._utc = SteadyUtc()
         self._status = OperatorStatus(self._tell_text, on_text)
-        teller = Teller(self.say)
+        teller = StatusNotifier(self.say)
         self._recorder = None
         if config.tlog is not None:
             self._recorder = TlogRecorder(
@@ -99,7 +99,7 @@ class Bridge:
             config.camera.mount == "fixed",
             (config.camera.gimbal_component, config.camera.gimbal_device),
         )
-        gate = _gate(config, teller)
+        enable = _enable(config, teller)
         self._shared = shared = Shared(
             config,
             geoid_separation_m,
@@ -110,8 +110,8 @@ class Bridge:
             self.say,
             on_track,
             on_hint,
-            VehicleWatch(self.say, gate.announce if gate is not None else lambda: None),
-            gate,
+            VehicleWatch(self.say, enable.announce if enable is not None else lambda: None),
+            enable,
             LookAt(config, geoid_separation_m, self.say),
             on_vehicle_text,
         )
@@ -134,11 +134,11 @@ class Bridge:
 
     # --- life -----------------------------------------------------------------------------------
 
-    def flies_over(self, map_id: str) -> None:
+    def set_map_id(self, map_id: str) -> None:
         """Before `start`, which map the fixes are of: what spoke against another one in a process
         before is not remembered of it.
         """
-        self._fc.flies_over(map_id)
+        self._fc.set_map_id(map_id)
 
     def start(self) -> None:
         """Open the links and keep them open."""
@@ -147,25 +147,25 @@ class Bridge:
         self._started = True
         if self._recorder is not None:
             self._recorder.start()
-        if self._shared.gate is not None:
-            self._shared.gate.recall()  # before a link finds the vehicle and has it announced
+        if self._shared.enable is not None:
+            self._shared.enable.recall()  # before a link finds the vehicle and has it announced
         self._fc.recall()
         for link in self._links:
             link.start()
 
-    def leave(self) -> None:
+    def hand_over(self) -> None:
         """What follows is no end in order: what is remembered over a restart stays so."""
-        if self._shared.gate is not None:
-            self._shared.gate.stop(in_order=False)
-        self._fc.end(in_order=False)
+        if self._shared.enable is not None:
+            self._shared.enable.stop(clean_shutdown=False)
+        self._fc.end(clean_shutdown=False)
 
     def stop(self) -> None:
         """Close the links; the bridge cannot be started again. Harmless when called again."""
         if self._stopped:
             return
         self._stopped = True
-        if self._shared.gate is not None:
-            self._shared.gate.stop()
+        if self._shared.enable is not None:
+            self._shared.enable.stop()
         for link in self._links:
             link.stop()
         self._fc.end()
@@ -207,15 +207,15 @@ class Bridge:
         if self._shared.on_track is not None:
             self._shared.on_track(request)
 
-    def doubt(self, why: str) -> None:
+    def suppress_ekf_ok(self, why: str) -> None:
         """Until it is called with an empty text, "the EKF follows" is not said."""
-        self._fc.outcome.doubt = why
+        self._fc.outcome.suppress_ekf_ok = why
 
-    def forbid(self, why: str) -> None:
+    def inhibit(self, why: str) -> None:
         """Until it is called with an empty text, injection and a switch to vision do not begin, but
         by the pilot's gate (mode ``rc``) or `injection.force`.
         """
-        self._fc.forbid(why)
+        self._fc.inhibit(why)
 
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
@@ -297,7 +297,7 @@ class Bridge:
         """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""
         return self._tracker.inertial_since(time_ns)
 
-    def mission(self) -> tuple[Waypoint, ...]:
+    def mission(self) -> tuple[MissionWaypoint, ...]:
         """The places that the vehicle's mission flies to, as far as they are known. The first call
         begins to read it, and it is followed from then on.
         """
@@ -309,9 +309,9 @@ class Bridge:
         """The last lines told to the operator, oldest first."""
         return self._status.texts()
 
-    def turns(self) -> dict[str, int]:
+    def last_ticks_ns(self) -> dict[str, int]:
         """When each link's thread began its newest turn, CLOCK_MONOTONIC ns, by the link's name."""
-        return {f"link {link.name}": link.turn_ns for link in self._links}
+        return {f"link {link.name}": link.last_tick_ns for link in self._links}
 
     @property
     def port(self) -> int | None:
@@ -333,11 +333,11 @@ class Bridge:
         return self._fc.sender.reaches_ekf(monotonic_ns())
 
     @property
-    def trouble(self) -> str:
+    def injection_fault(self) -> str:
         """Why the EKF does not have what it should while injecting: positions are not sent, or not
         followed; empty while all is well. The operator was told.
         """
-        return self._fc.trouble
+        return self._fc.injection_fault
 
     def shadow_score(self) -> ShadowScore:
         """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
@@ -404,12 +404,12 @@ class _LinkMaker:
         return Link(Endpoint.parse(connection), handler, options)
 
 
-def _gate(config: BridgeConfig, teller: Teller) -> InjectionGate | None:
+def _enable(config: BridgeConfig, teller: StatusNotifier) -> InjectionEnable | None:
     if config.mode != "rc":
         return None
     file = config.state_file
-    memory = None if file is None else GateMemory(RestartMemory(file))
-    return InjectionGate(config.rc, teller.notice, memory)
+    memory = None if file is None else InjectionEnableMemory(RestartMemory(file))
+    return InjectionEnable(config.rc, teller.notice, memory)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

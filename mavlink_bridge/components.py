@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.component import TRACKING, CameraComponent
 from mavlink_bridge.camera.look_at import LOOKS
-from mavlink_bridge.injection.rc_gate import COMMANDS
+from mavlink_bridge.injection.injection_enable import COMMANDS
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import (
     CameraView,
@@ -166,12 +166,12 @@ class Components:
         """What gates injection and what hints at the place; others are refused in the protocol's
         way.
         """
-        gate = self._shared.gate
+        enable = self._shared.enable
         result = mavlink.MAV_RESULT_UNSUPPORTED
         if message.command == PLACE_HINT and self._shared.on_hint is not None:
             result = self._hint(message, time_ns, self._shared.on_hint)
-        elif gate is not None:
-            result = gate.command(message.command, message.param1)
+        elif enable is not None:
+            result = enable.command(message.command, message.param1)
         ack = mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
         )

@@ -137,7 +137,7 @@ class SourceSwitchConfig(_Model):
         return self
 
 
-class RcGateConfig(_Model):
+class InjectionEnableConfig(_Model):
     """In mode ``rc`` a channel's pulse width or a command decides between shadow and inject."""
 
     channel: int = Field(default=9, ge=1, le=18)
@@ -279,7 +279,7 @@ class BridgeConfig(_Model):
     injection: InjectionConfig = InjectionConfig()
     origin: OriginConfig | None = None
     switch: SourceSwitchConfig = SourceSwitchConfig()
-    rc: RcGateConfig = RcGateConfig()
+    rc: InjectionEnableConfig = InjectionEnableConfig()
     camera: CameraConfig = CameraConfig()
     targets: TargetsConfig = TargetsConfig()
     signing: SigningConfig | None = None

@@ -31,7 +31,7 @@ class ParameterError(BridgeError):
     """A flight-controller parameter that cannot be read or written."""
 
 
-class RecordError(BridgeError):
+class TlogError(BridgeError):
     """A .tlog file that cannot be opened, or is none."""
 
 

@@ -13,24 +13,24 @@ from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
-from mavlink_bridge.injection.gate_memory import NoGoMemory, RestartMemory
 from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.outcome import InjectionOutcome
+from mavlink_bridge.injection.restart_memory import RestartMemory, ShadowFailureMemory
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.injection.switching import SourceOrders
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Figures, VehicleState
-from mavlink_bridge.news import VehicleNews
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander, accepted
 from mavlink_bridge.vehicle.mission import MISSION_IN
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
 from mavlink_bridge.vehicle.readings import MESSAGES_IN
 from mavlink_bridge.vehicle.requests import VehicleRequests
-from mavlink_bridge.vehicle.strangers import StrangerWatch
 from mavlink_bridge.vehicle.timesync import TimeSync
+from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
+from mavlink_bridge.vehicle_events import VehicleEvents
 
 _FIRST_GUESS = 1  # the system id that vehicles are delivered with
 _IDLE_NS = 100_000_000
@@ -71,7 +71,9 @@ class FlightControllerEnd:
         self.components = Components(shared, ground=False)
         self._shared = shared
         self._tracker = shared.tracker
-        self._teller = teller = Teller(shared.say, {"inject": "nothing yet", "loop": "nothing yet"})
+        self._teller = teller = StatusNotifier(
+            shared.say, {"inject": "nothing yet", "loop": "nothing yet"}
+        )
         self._commander = commander = Commander(config.companion_component)
         self.requests = VehicleRequests(config, commander)
         self.time_sync = TimeSync(shared.tracker, config.companion_component, teller)
@@ -85,11 +87,11 @@ class FlightControllerEnd:
             self.shadow_score,
             lambda: self.outcome.compared_ns,
             teller,
-            None if no_go is None else NoGoMemory(no_go),
+            None if no_go is None else ShadowFailureMemory(no_go),
         )
-        self.news = VehicleNews(teller)
+        self.news = VehicleEvents(teller)
         self._warnings = FixWarnings(shared, self.sender.injector, teller)
-        self._strangers = StrangerWatch(config, shared.tracker, teller, self.counters)
+        self._strangers = UnexpectedSenderMonitor(config, shared.tracker, teller, self.counters)
         self._next_check_ns = 0
         self._connected = False
         self._mode: Mode = "off"
@@ -109,7 +111,7 @@ class FlightControllerEnd:
             return False
         return None if current is None else self.sources.on_gnss
 
-    def flies_over(self, map_id: str) -> None:
+    def set_map_id(self, map_id: str) -> None:
         """Before `recall`: which map the fixes are of."""
         if self._no_go is not None:
             self._no_go.about = map_id
@@ -118,11 +120,11 @@ class FlightControllerEnd:
         """Before the link begins: what a process that was killed knew."""
         self._interlock.recall()
 
-    def end(self, *, in_order: bool = True) -> None:
+    def end(self, *, clean_shutdown: bool = True) -> None:
         """After the link has ended; before, where that is not in order."""
-        self._interlock.end(in_order=in_order)
+        self._interlock.end(clean_shutdown=clean_shutdown)
 
-    def forbid(self, why: str) -> None:
+    def inhibit(self, why: str) -> None:
         """Until it is called with an empty text, nothing begins."""
         self._interlock.forbidden = why
 
@@ -132,7 +134,7 @@ class FlightControllerEnd:
         return self._mode == self._shared.mode() == "inject"
 
     @property
-    def trouble(self) -> str:
+    def injection_fault(self) -> str:
         """Why the EKF does not have what it should, as it was told: positions are not sent, or are
         not followed. Empty while all is well, and in other modes than ``inject``.
         """
@@ -198,8 +200,8 @@ class FlightControllerEnd:
                 self.sources.on_text(str(message.text))
             sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
             self._shared.on_vehicle_text(int(message.severity), str(message.text), sender)
-        elif kind == "RC_CHANNELS" and self._shared.gate is not None:
-            self._shared.gate.channels(self._tracker.snapshot(time_ns).rc_channels_us)
+        elif kind == "RC_CHANNELS" and self._shared.enable is not None:
+            self._shared.enable.channels(self._tracker.snapshot(time_ns).rc_channels_us)
 
     def _acknowledged(self, link: Link, message: Any) -> None:
         if not self._commander.is_ours(link, message):
@@ -269,7 +271,7 @@ class FlightControllerEnd:
         sender.take(now_ns)
         shared = self._shared
         mode = self._mode = self._interlock.mode(
-            shared.mode(), state, now_ns, by_pilot=shared.gate is not None
+            shared.mode(), state, now_ns, by_pilot=shared.enable is not None
         )
         if mode == "off" or not state.connected:
             sender.injector.skip()

@@ -7,7 +7,7 @@ from typing import Any
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 
 _TICK_NS = 20_000_000
 
@@ -18,7 +18,7 @@ class GroundEnd:
     def __init__(self, shared: Shared) -> None:
         self.components = Components(shared, ground=True)
         self._shared = shared
-        self._teller = Teller(shared.say)
+        self._teller = StatusNotifier(shared.say)
 
     def on_open(self, link: Link) -> None:
         """Announce at once."""

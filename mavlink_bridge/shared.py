@@ -8,7 +8,7 @@ from itertools import chain, count
 
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import BridgeConfig, Mode
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import HealthLevel, PlaceHint, TrackRequest
 from mavlink_bridge.vehicle.presence import VehicleWatch
@@ -41,7 +41,7 @@ class Shared:
     on_track: Callable[[TrackRequest], None] | None
     on_hint: Callable[[PlaceHint], bool] | None
     watch: VehicleWatch
-    gate: InjectionGate | None
+    enable: InjectionEnable | None
     look: LookAt
     on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
     target_numbers: Iterator[int] = field(default_factory=clicked_numbers)
@@ -53,6 +53,6 @@ class Shared:
 
     def mode(self) -> Mode:
         """off, shadow or inject; mode rc follows its gate."""
-        if self.gate is None:
+        if self.enable is None:
             return self.config.mode
-        return "inject" if self.gate.open else "shadow"
+        return "inject" if self.enable.open else "shadow"

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import HealthLevel, without_figures
-from mavlink_bridge.texts import Settling
+from mavlink_bridge.status_notifier import Hysteresis
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class OperatorStatus:
         self._health_lock = threading.Lock()
         self._text_lock = threading.Lock()
         self._health = (HealthLevel.STARTING, "")
-        self._settling = Settling()
+        self._settling = Hysteresis()
         self._told_ns: dict[tuple[HealthLevel, str], int] = {}
         self._last_told = self._health
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)

@@ -24,7 +24,7 @@ from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
-from sitl.demo.flight import FlightRecord, Onlookers, fly
+from sitl.demo.flight import DemoRecord, Onlookers, fly
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import LogProgress, shown_progress
 from sitl.demo.report import make_report, print_report
@@ -316,7 +316,7 @@ def _world_of(
         return prepare(seed, worlds, progress, script.world_m, ideal, script.world)
 
 
-def _report(console: Console, record: FlightRecord, script: Scenario, seed: int) -> None:
+def _report(console: Console, record: DemoRecord, script: Scenario, seed: int) -> None:
     """Of a flight that broke off, too: FlightError then says why, after its report."""
     try:
         report = make_report(record, script, seed)

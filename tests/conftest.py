@@ -20,7 +20,7 @@ import pytest
 
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
-from sitl.demo.scenario import CameraSpec, Leg, Scenario
+from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 from sitl.errors import SimulationError
 from tests.parts import PARTS, SHARED_FOLDER, part_of
 
@@ -82,7 +82,7 @@ def small_assets(shared_folder: Path) -> FlightAssets:
 @pytest.fixture(scope="session")
 def small_sequence(small_assets: FlightAssets, shared_folder: Path) -> Path:
     """A video of the small world at 5 Hz with its true poses, as `companion eval` reads it."""
-    leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
+    leg = ScenarioLeg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
     scenario = Scenario(
         takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
     ).ideal()

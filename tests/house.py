@@ -19,7 +19,7 @@ MOST_MODULES, MOST_LINES, MOST_METHODS, MOST_PARAMETERS = 15, 200, 15, 7
 _MANY_PARAMETERS = {
     # One registration's inputs, as the paper and the reference name them; the CPU and the GPU take
     # the same, so that they can be exchanged.
-    "localizer/registration/whole.py:register",
+    "localizer/registration/device_registration.py:register",
     "localizer/registration/cuda/registration.py:register",
     "localizer/registration/cuda/schedule.py:run",
     "localizer/registration/cuda/schedule.py:_upload",

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.site.__main__ import outdated
 from benchmarks.site.kept import DATA, load
-from companion.guardian.findings import RULES
+from companion.integrity_monitor.alert_rules import RULES
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(

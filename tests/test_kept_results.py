@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 
 from benchmarks.site.forms import tables_of
-from benchmarks.site.kept import DATA, Kept, Table, load, save, with_tables
+from benchmarks.site.kept import DATA, Kept, PrintedTable, load, save, with_tables
 from companion.errors import ReportError
 from companion.versions import made_by
 
 ROOT = Path(__file__).parents[1]
-KEPT = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", Table(("a", "b"), (("1", "2"),)))
+KEPT = Kept(
+    "make x", "abc1234", "2026-11-22", "2 cores", "", PrintedTable(("a", "b"), (("1", "2"),))
+)
 FLIGHT = {
     "report": {
         "localizer": {"recall_1": 99.0, "recall_3": 100.0, "recall_5": 100.0, "completeness": 100.0,
@@ -46,7 +48,7 @@ def test_results_of_one_form_stand_together_and_others_are_refused(tmp_path):
     made = with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)
     assert made.count("| 1 | 2 |") == 2
     assert "[x](data/x.json), [y](data/y.json)" in made
-    other = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", Table(("c",), (("1",),)))
+    other = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", PrintedTable(("c",), (("1",),)))
     save(other, tmp_path / "y.json")
     with pytest.raises(ReportError, match="differ in their columns"):
         with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)

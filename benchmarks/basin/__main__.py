@@ -27,7 +27,7 @@ from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.basin import axes as basin_axes
-    from benchmarks.basin.run import Outcome, groups, run, sized_starts, summary
+    from benchmarks.basin.run import BasinOutcome, groups, run, sized_starts, summary
     from benchmarks.basin.tables import Cells, ablation_table, covariance_table
     from benchmarks.basin.variants import (
         DEFAULT_ANCHORS,
@@ -37,7 +37,7 @@ with needs_torch():
         paper_rows,
         prior_rows,
     )
-    from benchmarks.basin.views import View, load_views
+    from benchmarks.basin.views import BasinView, load_views
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 
@@ -48,7 +48,7 @@ def photos_of(args: argparse.Namespace) -> int:
     return len(views) if views[0].condition == "photo" else 0
 
 
-def views_of(args: argparse.Namespace) -> list[View]:
+def views_of(args: argparse.Namespace) -> list[BasinView]:
     """The set's views; caliterra's few photos again, from other starts."""
     views = load_views(args.set, args.folder, args.data, args.pairs)
     return (
@@ -56,14 +56,14 @@ def views_of(args: argparse.Namespace) -> list[View]:
     )
 
 
-def _registered(args: argparse.Namespace, rows: list[Variant]) -> list[Outcome]:
+def _registered(args: argparse.Namespace, rows: list[Variant]) -> list[BasinOutcome]:
     if args.only:
         rows = [v for v in rows if any(text in v.name for text in args.only) or v.name == FULL]
     starts = partial(sized_starts, sizes=tuple(args.starts))
     return run(views_of(args), rows, starts, args.model, args.processes)
 
 
-def ablation(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
+def ablation(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """Table 4, or the priors: one line a variant and start."""
     rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
     outcomes = _registered(args, rows)
@@ -86,7 +86,7 @@ def ablation(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
     return outcomes, ablation_table(args.set, outcomes)
 
 
-def covariance(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
+def covariance(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """NEES of "ours", those on which it was fitted apart."""
     outcomes = _registered(args, [Variant(FULL)])
     columns, rows = covariance_table(args.set, outcomes, photos_of(args))
@@ -95,7 +95,7 @@ def covariance(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
     return outcomes, (columns, rows)
 
 
-def axes(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
+def axes(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """Table 6 and Fig. 10: share converged against the initial error of each axis."""
     variants = basin_axes.axis_variants()
     outcomes = run(views_of(args), variants, basin_axes.axis_starts, args.model, args.processes)
@@ -106,7 +106,7 @@ def axes(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
     return outcomes, basin_axes.table(outcomes)
 
 
-_TABLES: dict[str, Callable[[argparse.Namespace], tuple[list[Outcome], Cells]]] = {
+_TABLES: dict[str, Callable[[argparse.Namespace], tuple[list[BasinOutcome], Cells]]] = {
     "ablation": ablation, "priors": ablation, "covariance": covariance, "axes": axes,
 }  # fmt: skip
 

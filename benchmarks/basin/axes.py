@@ -7,7 +7,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.basin.run import Outcome, Start, groups, random_start, summary
+from benchmarks.basin.run import BasinOutcome, Start, groups, random_start, summary
 from benchmarks.basin.tables import Cells
 from benchmarks.basin.variants import FULL, Variant
 from localizer.registration import JNGOConfig
@@ -19,7 +19,7 @@ MOTION = {"yaw": 6.7, "pitch": 3.0, "roll": 10.1, "x": 0.7, "y": 0.7, "z": 0.3} 
 _RESAMPLES = 400
 _JOINT = STEPS[-3:]
 
-Shares = dict[tuple[str, str], list[Outcome]]
+Shares = dict[tuple[str, str], list[BasinOutcome]]
 
 
 def axis_start(axis: str, size: float, seed: int) -> Start:
@@ -61,7 +61,7 @@ def axis_variants() -> list[Variant]:
     ]
 
 
-def report(outcomes: list[Outcome]) -> None:
+def report(outcomes: list[BasinOutcome]) -> None:
     """Prints the share converged of each axis and size, and the limits beside Table 6."""
     cells = {(v, s): mine for v, s, mine, _ in groups(outcomes)}
     names = list(dict.fromkeys(o.variant for o in outcomes))
@@ -83,7 +83,7 @@ def report(outcomes: list[Outcome]) -> None:
         print(f"{name:35s}" + "".join(f"{t:>19s}" for t in texts))
 
 
-def table(outcomes: list[Outcome]) -> Cells:
+def table(outcomes: list[BasinOutcome]) -> Cells:
     """The limits beside Table 6, and the shares from the three largest errors of all axes."""
     cells = {(v, s): mine for v, s, mine, _ in groups(outcomes)}
     columns = ("", *AXES, f"from {' / '.join(f'{s:.0f}' for s in _JOINT)} m and ° in all, %")
@@ -136,7 +136,7 @@ def most(value: float) -> str:
     return f"{value:.1f}" if np.isfinite(value) else f">{STEPS[-1]:.0f}"
 
 
-def plot(outcomes: list[Outcome], path: Path) -> None:
+def plot(outcomes: list[BasinOutcome], path: Path) -> None:
     """Share converged over the initial error, one panel an axis, with Wilson's intervals."""
     share = {(v, s): summary(mine, []) for v, s, mine, _ in groups(outcomes)}
     names = list(dict.fromkeys(o.variant for o in outcomes))

@@ -26,7 +26,7 @@ from benchmarks.common.named_errors import named_errors, needs_torch
 with needs_torch():
     from benchmarks.basin.run import random_start, squared_error
     from benchmarks.basin.tables import BOUND, Cells, row_name
-    from benchmarks.basin.views import SIZE, View, load_views, photo_views
+    from benchmarks.basin.views import SIZE, BasinView, load_views, photo_views
 from numpy.typing import NDArray
 
 from benchmarks.features.report import wilson
@@ -75,7 +75,7 @@ def covered(view: RenderedView, kept: NDArray[np.bool_]) -> RenderedView:
 
 
 @dataclass(frozen=True)
-class Trial:
+class PatchTrial:
     """One registration: of which part and view, how wrong, and whether the tracker accepts it."""
 
     part: str
@@ -87,8 +87,8 @@ class Trial:
 
 
 def trials(
-    views: list[View], parts: list[str], start_m: float, model: Path | None
-) -> Iterator[Trial]:
+    views: list[BasinView], parts: list[str], start_m: float, model: Path | None
+) -> Iterator[PatchTrial]:
     """Every view, each from one start, against every part of its reference view."""
     extractor, optimizer = DetailExtractor(load_extractor(model, threads=1)), JNGO(threads=1)
     for cache in dict.fromkeys(v.map_cache for v in views):
@@ -113,9 +113,9 @@ def trials(
                         yield _trial(part, index, found, view)
 
 
-def _trial(part: str, index: int, found: Registration, view: View) -> Trial:
+def _trial(part: str, index: int, found: Registration, view: BasinView) -> PatchTrial:
     pose = found.world_from_camera
-    return Trial(
+    return PatchTrial(
         part,
         index,
         *pose.distance_to(view.truth),
@@ -131,7 +131,7 @@ def share(values: list[float]) -> str:
     return f"{100 * inside / max(len(values), 1):5.1f} [{low:4.1f}, {high:5.1f}] of {len(values)}"
 
 
-def report(part: str, mine: list[Trial]) -> str:
+def report(part: str, mine: list[PatchTrial]) -> str:
     """The line of one part."""
     near = [t.nees for t in mine if t.metres < 3 and t.degrees < 3]
     if not near:
@@ -142,7 +142,7 @@ def report(part: str, mine: list[Trial]) -> str:
     )
 
 
-def table(source: str, done: list[Trial], parts: list[str], photos: int) -> Cells:
+def table(source: str, done: list[PatchTrial], parts: list[str], photos: int) -> Cells:
     """Share within the bound of those within 3 m and 3 degrees, and their number, by part."""
     near = [t for t in done if t.metres < 3 and t.degrees < 3]
     names = dict.fromkeys(row_name(source, t.view, photos) for t in near)
@@ -154,7 +154,7 @@ def table(source: str, done: list[Trial], parts: list[str], photos: int) -> Cell
     return ("set", *parts), rows
 
 
-def views_of(args: argparse.Namespace) -> tuple[list[View], int]:
+def views_of(args: argparse.Namespace) -> tuple[list[BasinView], int]:
     """The set's views, and how many different photos they repeat; 0: renders."""
     photos = args.data / args.set / "queries"
     views = load_views(args.set, args.folder, args.data, args.pairs)

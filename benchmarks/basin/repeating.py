@@ -33,7 +33,7 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Ground:
+class RepeatingGround:
     """The plane z = 0 with features that repeat every `period` metres both ways.
 
     waves: per level (C, W, 3) wave numbers (rad/m) and phases.
@@ -43,7 +43,7 @@ class Ground:
     waves: tuple[Array, ...]
 
     @classmethod
-    def random(cls, rng: np.random.Generator) -> Ground:
+    def random(cls, rng: np.random.Generator) -> RepeatingGround:
         """A period of 12 to 24 m and random features."""
         period = float(rng.uniform(12, 24))
         size = (_CHANNELS, _WAVES)
@@ -105,7 +105,7 @@ def trials(count: int) -> Iterator[tuple[str, bool, bool]]:
     made = [(v, v.optimizer()) for v in rows()]
     for index in range(count):
         rng = np.random.default_rng(index // 2)
-        ground = Ground.random(rng)
+        ground = RepeatingGround.random(rng)
         pose = look_at(np.zeros(3), 110.0, np.radians(rng.uniform(60, 90)), rng)
         anchors = select_anchors(ground.view(pose), ground.pyramid(pose, rng), _ANCHORS)
         query = ground.pyramid(pose, rng)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.basin.variants import FULL, Variant
-from benchmarks.basin.views import View
+from benchmarks.basin.views import BasinView
 from benchmarks.features.report import wilson
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
@@ -39,7 +39,7 @@ _LEAST_DEPTH = 0.5  # share of a reference view that must show the map
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BasinOutcome:
     """One registration: who, which view, which start, and its errors; sigma: of the position
     by its own covariance, m; nees: against that covariance, None where it failed.
     """
@@ -99,16 +99,16 @@ def sized_starts(index: int, sizes: tuple[float, ...]) -> list[Start]:
 
 
 def run_views(
-    job: tuple[int, list[View]],
+    job: tuple[int, list[BasinView]],
     variants: list[Variant],
     starts_of: Callable[[int], list[Start]],
     model: Path | None,
-) -> list[Outcome]:
+) -> list[BasinOutcome]:
     """Every variant from every start on the views of one map, numbered from `job`'s index on."""
     first, views = job
     extractor = DetailExtractor(load_extractor(model, threads=1))
     optimizers = [(v, v.optimizer()) for v in variants]
-    outcomes: list[Outcome] = []
+    outcomes: list[BasinOutcome] = []
     with TileStreamer(TileCache.open(views[0].map_cache)) as streamer:
         renderer = NumbaRenderer(streamer, 1)
         for index, view in enumerate(views, first):
@@ -118,17 +118,17 @@ def run_views(
                 reference = renderer.render(prior.world_from_camera, view.camera, wait=True)
                 if (reference.depth > 0).mean() < _LEAST_DEPTH:
                     continue  # the start leads off the map: no method could tell
-                trial = Trial(index, view, start, prior, query, reference)
+                trial = BasinTrial(index, view, start, prior, query, reference)
                 outcomes += trial.run(optimizers, extractor.extract(fill_holes(reference)))
     return outcomes
 
 
 @dataclass(frozen=True)
-class Trial:
+class BasinTrial:
     """One view from one start, for all variants."""
 
     index: int
-    view: View
+    view: BasinView
     start: Start
     prior: PosePrior
     query: FeaturePyramid
@@ -136,7 +136,7 @@ class Trial:
 
     def run(
         self, optimizers: list[tuple[Variant, JNGO]], features: FeaturePyramid
-    ) -> Iterator[Outcome]:
+    ) -> Iterator[BasinOutcome]:
         """Anchors, registration and errors of every variant; equal anchors are selected once."""
         chosen: dict[tuple[object, ...], Anchors] = {}
         for variant, optimizer in optimizers:
@@ -163,11 +163,11 @@ class Trial:
             seed=self.index,
         )
 
-    def _outcome(self, variant: str, found: Registration, ms: float) -> Outcome:
+    def _outcome(self, variant: str, found: Registration, ms: float) -> BasinOutcome:
         pose, truth = found.world_from_camera, self.view.truth
         metres, degrees = pose.distance_to(truth)
         ok = found.status is RegistrationStatus.OK
-        return Outcome(
+        return BasinOutcome(
             variant,
             self.index,
             self.start.label,
@@ -189,12 +189,12 @@ def squared_error(pose: Pose, covariance: Array, truth: Pose) -> float:
 
 
 def run(
-    views: list[View],
+    views: list[BasinView],
     variants: list[Variant],
     starts_of: Callable[[int], list[Start]],
     model: Path | None,
     processes: int,
-) -> list[Outcome]:
+) -> list[BasinOutcome]:
     """All views, in chunks of one map each, over processes."""
     jobs = []
     for first in range(0, len(views), _CHUNK):
@@ -215,7 +215,7 @@ def bootstrap(values: np.ndarray, statistic: Callable[..., np.ndarray]) -> tuple
     return float(low), float(high)
 
 
-def summary(outcomes: list[Outcome], full: list[Outcome]) -> dict[str, float | None]:
+def summary(outcomes: list[BasinOutcome], full: list[BasinOutcome]) -> dict[str, float | None]:
     """Shares in per cent with intervals, and the paired difference to `full`, same views."""
     hits = sum(o.hit for o in outcomes)
     three = sum(o.metres < 3 and o.degrees < 3 for o in outcomes)
@@ -237,9 +237,11 @@ def summary(outcomes: list[Outcome], full: list[Outcome]) -> dict[str, float | N
     }  # fmt: skip
 
 
-def groups(outcomes: list[Outcome]) -> Iterator[tuple[str, str, list[Outcome], list[Outcome]]]:
+def groups(
+    outcomes: list[BasinOutcome],
+) -> Iterator[tuple[str, str, list[BasinOutcome], list[BasinOutcome]]]:
     """(variant, start, its outcomes, those of "ours" from the same start)."""
-    by: dict[tuple[str, str], list[Outcome]] = {}
+    by: dict[tuple[str, str], list[BasinOutcome]] = {}
     for o in outcomes:
         by.setdefault((o.variant, o.start), []).append(o)
     for (variant, start), mine in by.items():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.basin.run import Outcome, groups, summary
+from benchmarks.basin.run import BasinOutcome, groups, summary
 from benchmarks.basin.variants import FULL
 from benchmarks.basin.views import VIEWS_PER_WORLD
 from benchmarks.features.report import wilson
@@ -33,20 +33,20 @@ def row_name(source: str, view: int, photos: int) -> str:
     return f"{what} of odd number" if number % 2 else f"{what} of even number, fitted"
 
 
-def near(outcomes: Sequence[Outcome]) -> list[Outcome]:
+def near(outcomes: Sequence[BasinOutcome]) -> list[BasinOutcome]:
     """Those whose covariance is asked for: within 3 m and 3 degrees."""
     return [o for o in outcomes if o.nees is not None and o.metres < 3 and o.degrees < 3]
 
 
-def covariance_table(source: str, outcomes: Sequence[Outcome], photos: int) -> Cells:
+def covariance_table(source: str, outcomes: Sequence[BasinOutcome], photos: int) -> Cells:
     """How the claimed covariance holds, of "ours" from every start together."""
-    by: dict[str, list[Outcome]] = {}
+    by: dict[str, list[BasinOutcome]] = {}
     for o in near([o for o in outcomes if o.variant == FULL]):
         by.setdefault(row_name(source, o.view, photos), []).append(o)
     return COVARIANCE_COLUMNS, [_covariance_row(name, mine, photos) for name, mine in by.items()]
 
 
-def _covariance_row(name: str, mine: Sequence[Outcome], photos: int) -> tuple[str, ...]:
+def _covariance_row(name: str, mine: Sequence[BasinOutcome], photos: int) -> tuple[str, ...]:
     values = np.array([o.nees for o in mine], dtype=float)
     low, high = _mean_interval(values, [o.view % photos if photos else o.view for o in mine])
     inside = int((values < BOUND).sum())
@@ -68,7 +68,7 @@ def _mean_interval(values: np.ndarray, views: Sequence[int]) -> tuple[float, flo
     return float(low), float(high)
 
 
-def ablation_table(source: str, outcomes: Sequence[Outcome]) -> Cells:
+def ablation_table(source: str, outcomes: Sequence[BasinOutcome]) -> Cells:
     """Table 4: a row a variant, a column a start; milliseconds over all starts."""
     cells = {(v, s): (mine, full) for v, s, mine, full in groups(list(outcomes))}
     starts = list(dict.fromkeys(o.start for o in outcomes))
@@ -86,7 +86,7 @@ def ablation_table(source: str, outcomes: Sequence[Outcome]) -> Cells:
     return columns, rows
 
 
-def _ablation_cell(variant: str, mine: list[Outcome], full: list[Outcome]) -> str:
+def _ablation_cell(variant: str, mine: list[BasinOutcome], full: list[BasinOutcome]) -> str:
     s = summary(mine, full)
     if variant == FULL:
         return f"{s['r1']:.1f} %, {s['median']:.2f} m"

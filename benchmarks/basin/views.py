@@ -45,7 +45,7 @@ _LEAST_MAP = 0.9  # share of the true view that shows the map
 
 
 @dataclass(frozen=True)
-class View:
+class BasinView:
     """One query. map_cache: the tile cache of its place; height: of the camera above ground, m."""
 
     map_cache: Path
@@ -56,7 +56,7 @@ class View:
     height: float
 
 
-def load_views(name: str, folder: Path, data: Path, count: int) -> list[View]:
+def load_views(name: str, folder: Path, data: Path, count: int) -> list[BasinView]:
     """At least `count` views of a set, where it has so many, made on the first call.
 
     name: "generated"; "plain", generated views of ground with little texture in fog, at dusk and at
@@ -91,7 +91,7 @@ def _make_world(home: Path) -> None:
                    VIEWS_PER_WORLD)  # fmt: skip
 
 
-def _plain_views(views: list[View], home: Path, count: int) -> list[View]:
+def _plain_views(views: list[BasinView], home: Path, count: int) -> list[BasinView]:
     """Views of the generated worlds' plainest ground: of random poses in each world, those whose
     reference view has the least contrast.
     """
@@ -104,7 +104,7 @@ def _plain_views(views: list[View], home: Path, count: int) -> list[View]:
     return load_kept(home)[:count]
 
 
-def _plain_of(world: Path, count: int, seed: int) -> list[View]:
+def _plain_of(world: Path, count: int, seed: int) -> list[BasinView]:
     rng = np.random.default_rng(seed)
     half = 0.36 * WORLD_M
     with (
@@ -118,14 +118,14 @@ def _plain_of(world: Path, count: int, seed: int) -> list[View]:
             view = map_renderer.render(truth, camera, wait=True)
             if (view.depth > 0).mean() >= _LEAST_MAP:
                 candidates.append((contrast(view.rgb), truth, camera, height))
-        views: list[View] = []
+        views: list[BasinView] = []
         for k, (_, truth, camera, height) in enumerate(sorted(candidates, key=lambda c: c[0])):
             seen = day_renderer.render(truth, camera, wait=True)
             if (seen.depth > 0).mean() < _LEAST_MAP or len(views) == count:
                 continue
             condition = _DULL[k % len(_DULL)]
             query = _weathered(seen, condition, rng)
-            views.append(View(world / "survey.cache", query, truth, camera, condition, height))
+            views.append(BasinView(world / "survey.cache", query, truth, camera, condition, height))
     return views
 
 
@@ -163,7 +163,7 @@ def _make_real(source: Path, home: Path, count: int) -> None:
         store_renders(home, cache, cache, halves[source.name], rng, count)
 
 
-def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list[View]:
+def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list[BasinView]:
     """The photos of a folder with camera.json and poses.json, of `size` (width, height)."""
     camera = Camera.from_json(photos / "camera.json").resized(*size)
     poses = json.loads((photos / "poses.json").read_text())
@@ -172,7 +172,7 @@ def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list
         photo = read_rgb(path)
         query = cv2.resize(photo, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         truth = Pose.from_matrix(np.array(poses[path.name]["T_enu_from_cam"]))
-        views.append(View(cache, query, truth, camera, "photo", 40.0))
+        views.append(BasinView(cache, query, truth, camera, "photo", 40.0))
     return views
 
 
@@ -185,7 +185,7 @@ def store_renders(
     count: int,
 ) -> None:
     """Views from 55 to 220 m above ground, straight down to 30 degrees below the horizon."""
-    views: list[View] = []
+    views: list[BasinView] = []
     with (
         TileStreamer(TileCache.open(map_cache)) as survey,
         TileStreamer(TileCache.open(day_cache)) as day,
@@ -199,7 +199,7 @@ def store_renders(
                 continue
             condition = CONDITIONS[len(views) % len(CONDITIONS)]
             query = _weathered(seen, condition, rng)
-            views.append(View(map_cache, query, truth, camera, condition, height))
+            views.append(BasinView(map_cache, query, truth, camera, condition, height))
     _store(home, views)
 
 
@@ -227,7 +227,7 @@ def ground_height(renderer: NumbaRenderer, target: np.ndarray) -> float:
     return 1500.0 - float(depth) if depth > 0 else 0.0
 
 
-def _store(home: Path, views: list[View]) -> None:
+def _store(home: Path, views: list[BasinView]) -> None:
     np.savez(
         home / "views.npz",
         map_cache=np.array([os.path.relpath(v.map_cache, home) for v in views]),
@@ -239,11 +239,11 @@ def _store(home: Path, views: list[View]) -> None:
     )
 
 
-def load_kept(home: Path) -> list[View]:
+def load_kept(home: Path) -> list[BasinView]:
     """The views that a folder keeps."""
     with np.load(home / "views.npz") as f:
         return [
-            View((home / str(m)).resolve(), q, Pose.from_matrix(t),
+            BasinView((home / str(m)).resolve(), q, Pose.from_matrix(t),
                  Camera.from_dict(json.loads(str(c))), str(k), float(h))
             for m, q, t, c, k, h in zip(
                 f["map_cache"], f["query"], f["truth"], f["camera"], f["condition"], f["height"],

@@ -25,8 +25,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bridge.soak_line import HOME, Fault, world
-from benchmarks.bridge.soak_report import COLUMNS, FIX_HZ, WARM_UP_S, Sample, judge, plot, told
+from benchmarks.bridge.soak_line import HOME, LineFault, world
+from benchmarks.bridge.soak_report import (
+    COLUMNS,
+    FIX_HZ,
+    WARM_UP_S,
+    ProcessSample,
+    judge,
+    plot,
+    told,
+)
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
@@ -66,9 +74,9 @@ def feed(bridge: Bridge, stop: threading.Event) -> None:
             bridge.set_health(level, f"localization {level.value}")
 
 
-def take(bridge: Bridge, begun: float) -> Sample:
+def take(bridge: Bridge, begun: float) -> ProcessSample:
     """A sample now."""
-    return Sample(
+    return ProcessSample(
         time.monotonic() - begun,
         rss_mib(),
         threading.active_count(),
@@ -78,7 +86,9 @@ def take(bridge: Bridge, begun: float) -> Sample:
     )
 
 
-def fly(minutes: float, seed: int, trace: bool) -> tuple[list[Sample], list[Fault], dict[str, Any]]:
+def fly(
+    minutes: float, seed: int, trace: bool
+) -> tuple[list[ProcessSample], list[LineFault], dict[str, Any]]:
     """The run: (samples, faults, the bridge's counters at the end)."""
     here, there = multiprocessing.get_context("spawn").Pipe()
     process = multiprocessing.get_context("spawn").Process(
@@ -87,8 +97,8 @@ def fly(minutes: float, seed: int, trace: bool) -> tuple[list[Sample], list[Faul
     process.start()
     there.close()
     fc_port, ground_port = here.recv()
-    samples: list[Sample] = []
-    faults: list[Fault] = []
+    samples: list[ProcessSample] = []
+    faults: list[LineFault] = []
     with tempfile.TemporaryDirectory() as folder:
         config = BridgeConfig(
             connection=f"tcp:127.0.0.1:{fc_port}",

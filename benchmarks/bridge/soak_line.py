@@ -34,7 +34,7 @@ SCHEDULE = (
 
 
 @dataclass(frozen=True)
-class Fault:
+class LineFault:
     """What the line did, CLOCK_MONOTONIC seconds."""
 
     kind: str
@@ -64,7 +64,7 @@ def damage(data: bytes, rng: random.Random, held: list[bytes]) -> bytes:
     return data
 
 
-class Line:
+class SoakLine:
     """A TCP line between the bridge and the vehicle, and a ground station that talks nonsense."""
 
     def __init__(self, vehicle: EmbeddedSitl, rng: random.Random) -> None:
@@ -160,13 +160,13 @@ def world(pipe: Any, minutes: float, seed: int) -> None:
     """Vehicle and line; sends the ports, waits for the start, then the faults as they end."""
     rng = random.Random(seed)
     with EmbeddedSitl(HOME, parameters={**vision_only_parameters(), **GIMBAL}) as vehicle:
-        line = Line(vehicle, rng)
+        line = SoakLine(vehicle, rng)
         pipe.send((line.port, line.ground.getsockname()[1]))
         begun, scale = time.monotonic(), minutes / 30.0
         for share, kind, seconds in SCHEDULE:
             line.pass_for(begun + share * minutes * 60.0 - time.monotonic())
             start = time.monotonic()
-            pipe.send(Fault(kind, start, 0.0))
+            pipe.send(LineFault(kind, start, 0.0))
             if kind == "reboot":
                 line.hang_up()
                 vehicle.restart()
@@ -178,6 +178,6 @@ def world(pipe: Any, minutes: float, seed: int) -> None:
                 if kind == "cut":
                     line.refuse(refusing=False)
                 line.kind = ""
-            pipe.send(Fault(kind, start, time.monotonic()))
+            pipe.send(LineFault(kind, start, time.monotonic()))
         line.pass_for(begun + minutes * 60.0 - time.monotonic())
         line.hang_up()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bridge.soak_line import Fault
+from benchmarks.bridge.soak_line import LineFault
 
 FIX_HZ = 20.0
 WARM_UP_S = 120.0
@@ -17,7 +17,7 @@ RECOVERY_BOUND_S = 45.0  # a reboot includes the vehicle's own start
 
 
 @dataclass(frozen=True)
-class Sample:
+class ProcessSample:
     """One second of this process. rss_mib; descriptors; waiting: messages and bytes in queues."""
 
     time_s: float
@@ -28,7 +28,7 @@ class Sample:
     injected: int
 
 
-def recovery_s(samples: list[Sample], fault: Fault, begun: float) -> float | None:
+def recovery_s(samples: list[ProcessSample], fault: LineFault, begun: float) -> float | None:
     """Seconds from a fault's end until injection flows again for 3 s; None if it never did."""
     after = [s for s in samples if s.time_s >= fault.ended - begun]
     for i in range(len(after) - 3):
@@ -55,7 +55,9 @@ class Bound:
 COLUMNS = ("figure", "found", "wanted")
 
 
-def bounds(samples: list[Sample], faults: list[Fault], counters: dict[str, Any]) -> list[Bound]:
+def bounds(
+    samples: list[ProcessSample], faults: list[LineFault], counters: dict[str, Any]
+) -> list[Bound]:
     """Every kind of fault with the seconds until injection was back, then what must not grow."""
     found = [
         _returns(kind, [f for f in faults if f.kind == kind], samples, counters["begun"])
@@ -86,7 +88,9 @@ def bounds(samples: list[Sample], faults: list[Fault], counters: dict[str, Any])
     ]  # fmt: skip
 
 
-def _returns(kind: str, alike: list[Fault], samples: list[Sample], begun: float) -> Bound:
+def _returns(
+    kind: str, alike: list[LineFault], samples: list[ProcessSample], begun: float
+) -> Bound:
     seconds = [recovery_s(samples, fault, begun) for fault in alike]
     # A reboot's length is the vehicle's own.
     lasted = " and ".join(dict.fromkeys(f"{f.ended - f.begun:.0f} s" for f in alike))
@@ -96,7 +100,9 @@ def _returns(kind: str, alike: list[Fault], samples: list[Sample], begun: float)
     return Bound(what, told, f"<= {RECOVERY_BOUND_S:.0f}", good)
 
 
-def judge(samples: list[Sample], faults: list[Fault], counters: dict[str, Any]) -> list[Bound]:
+def judge(
+    samples: list[ProcessSample], faults: list[LineFault], counters: dict[str, Any]
+) -> list[Bound]:
     """What must hold, printed with the course of the run and its counters."""
     print("\n  minute   RSS MiB  threads  descriptors  waiting   injected")
     step = max(len(samples) // 15, 1)
@@ -121,7 +127,7 @@ def told(counters: dict[str, Any]) -> dict[str, int]:
     return {key: int(counters.get(key) or 0) for key in keys}
 
 
-def plot(samples: list[Sample], faults: list[Fault], begun: float, path: Path) -> None:
+def plot(samples: list[ProcessSample], faults: list[LineFault], begun: float, path: Path) -> None:
     """The curves over time, faults shaded."""
     import matplotlib
 

@@ -23,7 +23,7 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.flight import home_of
 from sitl.demo.scenario import CameraSpec
 from sitl.desk.film import Exposed, Eye, Localized, exposures, write_record
-from sitl.desk.flight import Aircraft, Corner, DeskFlight, Flown
+from sitl.desk.flight import Corner, DeskAircraft, DeskFlight, DeskFlightRecord
 from sitl.desk.port import RecordedPort
 
 SECONDS, RATE_HZ = 180.0, 1.5
@@ -111,7 +111,7 @@ class Sortie:
 
     folder: Path
     deployment: CompanionConfig
-    flown: Flown
+    flown: DeskFlightRecord
     eye: Eye
 
     @property
@@ -138,7 +138,7 @@ def fly(
     cache = TileCache.open(assets.map_cache)
     spec = CameraSpec()
     port = RecordedPort(folder / "flight.tlog", _BOOT_NS, _UTC_NS, seed)
-    aircraft = Aircraft(
+    aircraft = DeskAircraft(
         Mount.from_degrees(*draw.mount_deg, lever_arm_m=draw.arm_m), gimbal, draw.shift_m
     )
     geoid_m = cache.manifest.geoid_separation_m

@@ -118,7 +118,7 @@ def _again(
     true = sortie.deployment.camera.model_copy(
         update={
             "model": model, "lever_arm_m": draw.arm_m,
-            "settings": settings.model_copy(update={"stamps_late_ms": 1e3 * draw.late_s}),
+            "settings": settings.model_copy(update={"time_offset_ms": 1e3 * draw.late_s}),
         }
     )  # fmt: skip
     roll, pitch, yaw = (float(x) for x in np.degrees(euler_from_matrix(true_mount(draw, gimbal))))

@@ -27,12 +27,12 @@ from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from companion.calibrate import unknowns as u
 from companion.calibration_watch.config import CalibrationLimits
-from companion.calibration_watch.sighting import Figure, Sighting
+from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
 from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.errors import CompanionError, RecordError
 from companion.geometry import ned_from_world
-from companion.guardian.findings import FOCAL
-from companion.guardian.inertial import InertialTrack
+from companion.integrity_monitor.alert_rules import FOCAL
+from companion.integrity_monitor.inertial import InertialTrack
 from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.replay import FlightRecord, RecordedEstimate, load_record
 from localizer.errors import MapCacheError
@@ -141,19 +141,21 @@ def watch_flight(folder: Path) -> Watched:
     )  # fmt: skip
 
 
-def _of(figures: CalibrationFigures) -> tuple[Figure, Figure, Figure]:
+def _of(
+    figures: CalibrationFigures,
+) -> tuple[CalibrationEstimate, CalibrationEstimate, CalibrationEstimate]:
     return figures.focal, figures.boresight_deg, figures.late_s
 
 
 def _latched(bad: Sequence[float], all_s: Sequence[float], begin_s: float) -> float | None:
-    """Seconds until a finding has stood as long as the guardian waits before it tells."""
+    """Seconds until a finding has stood as long as the monitor waits before it tells."""
     told, since = set(bad), None
     for t in all_s:
         if t not in told:
             since = None
             continue
         since = t if since is None else since
-        if t - since >= FOCAL.alert_s:
+        if t - since >= FOCAL.raise_s:
             return t - begin_s
     return None
 
@@ -199,7 +201,7 @@ def _figures(
 def _sighting(
     estimate: RecordedEstimate, record: FlightRecord, cache: TileCache, surface: MapSurface,
     vehicle: _Vehicle, sigmas: dict[int, float],
-) -> Sighting | None:  # fmt: skip
+) -> CalibrationObservation | None:  # fmt: skip
     pose = estimate.world_from_camera
     hit = float(surface.cast(pose.translation, pose.rotation[:, 2][None]).distances[0])
     if not np.isfinite(hit):
@@ -211,7 +213,7 @@ def _sighting(
         body = to_ned.T @ matrix_from_quaternion(attitude.quaternion)
         at = at - body @ np.array(record.config.camera.lever_arm_m)
     where = cache.frame.position(at)
-    return Sighting(
+    return CalibrationObservation(
         estimate.exposure_time_ns, (where.latitude_deg, where.longitude_deg, where.height_m),
         sigmas.get(estimate.exposure_time_ns, 0.5),
         ned_from_world(cache.frame, where) @ pose.rotation, hit,

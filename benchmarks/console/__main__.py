@@ -38,7 +38,7 @@ from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.console.chromium import NOTE_AGES, ages, browser_used_s, opened_browser, used_s
 from benchmarks.console.limits import LIMITS
-from benchmarks.console.vehicle import Sequence, Vehicle, begun_ns
+from benchmarks.console.vehicle import FirstFrames, ReplayVehicle, begun_ns
 from companion.errors import ReportError
 from companion.offline.tables import read_columns
 from localizer.geometry.camera import Camera
@@ -51,10 +51,10 @@ _SETTLED_S = 5.0  # after the first estimate: the way up is no part of the cost
 
 
 @dataclass(frozen=True)
-class Work:
+class FlownWork:
     """What is flown."""
 
-    sequence: Sequence
+    sequence: FirstFrames
     camera: dict[str, Any]
     map_path: Path
     geoid_m: float
@@ -159,7 +159,7 @@ class BrowserPage(Page):
             browser.close()
 
 
-def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
+def fly(work: FlownWork, condition: Condition, folder: Path) -> dict[str, Any]:
     """One run; what it took and how well it localized."""
     listen = f"127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
     port = _free_port(socket.SOCK_DGRAM)
@@ -170,7 +170,7 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
     begun = _Begin(record, work.sequence)
     command = [sys.executable, "-m", "companion", "run", str(deployment)]
     with (
-        Vehicle(port, work.sequence, work.geoid_m, begun.read),
+        ReplayVehicle(port, work.sequence, work.geoid_m, begun.read),
         (folder / "run.log").open("wb") as log,
         _ended(subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)) as process,
     ):
@@ -218,13 +218,13 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
     return cost | quality(record, work.sequence)
 
 
-def _page(work: Work, condition: Condition, listen: str) -> Page:
+def _page(work: FlownWork, condition: Condition, listen: str) -> Page:
     if work.browser_nice is None or condition == "light client":
         return Page(listen, pictures=True)
     return BrowserPage(listen, work.browser_nice)
 
 
-def quality(record: Path, sequence: Sequence) -> dict[str, float]:
+def quality(record: Path, sequence: FirstFrames) -> dict[str, float]:
     """Rate, latency and error of a run, of the rows after the first seconds."""
     columns = read_columns(record / "estimates.csv", ("state", "status"))
     number = columns["sequence"].astype(int)
@@ -283,7 +283,7 @@ def print_table(told: dict[str, Any]) -> None:
 class _Begin:
     """When the flight's first image was exposed, asked of its record until it is known."""
 
-    def __init__(self, record: Path, sequence: Sequence) -> None:
+    def __init__(self, record: Path, sequence: FirstFrames) -> None:
         self._record, self._sequence = record, sequence
         self._known: int | None = None
 
@@ -294,7 +294,7 @@ class _Begin:
 
 
 def _deployment(
-    work: Work, condition: Condition, folder: Path, port: int, listen: str
+    work: FlownWork, condition: Condition, folder: Path, port: int, listen: str
 ) -> dict[str, Any]:
     return {
         "map": str(work.map_path),
@@ -392,8 +392,8 @@ def main() -> None:
     parser.add_argument("--out", type=output, help="JSON file of all runs")
     options = parser.parse_args()
     cache = TileCache.open(options.map)
-    work = Work(
-        Sequence.read(options.sequence, cache.frame, options.frames),
+    work = FlownWork(
+        FirstFrames.read(options.sequence, cache.frame, options.frames),
         Camera.from_json(options.sequence / "camera.json").to_dict(),
         options.map, cache.manifest.geoid_separation_m, options.console_nice,
         options.browser_nice if options.browser else None,

@@ -34,7 +34,7 @@ from benchmarks.console.chromium import opened_browser
 from companion.errors import ReportError
 from sitl.camera.movers import Mover
 from sitl.operator.operator import Asked
-from sitl.operator.truth import Witness
+from sitl.operator.truth import GroundTruth
 from sitl.operator.wishes import Wish
 from sitl.suite.loop.case import LoopCase, load_loop_cases
 from sitl.suite.loop.flight import Cabin, fly
@@ -225,13 +225,13 @@ def press(
     fly(case, assets, kind, seed, folder, operator)
     told = operator.told
     if "order" in told:
-        witness = Witness(assets.world, case.scenario.camera.camera(), folder / "frames.csv")
+        witness = GroundTruth(assets.world, case.scenario.camera.camera(), folder / "frames.csv")
         told["target_off_m"] = target_error(witness, told["order"], told["target"])
     told["hint_to_tracking_s"] = told.get("tracking_s", np.nan) - told.get("hint_s", np.nan)
     return told | {"vehicle": kind, "seed": seed, "problems": problems(told)}
 
 
-def target_error(witness: Witness, order: dict[str, Any], target: dict[str, Any]) -> float:
+def target_error(witness: GroundTruth, order: dict[str, Any], target: dict[str, Any]) -> float:
     """3-D, of what the page's table told to what the clicked pixel saw, m."""
     wish = Wish("point", 0.0, (order["x"], order["y"]))
     when = order["exposure_ns"]

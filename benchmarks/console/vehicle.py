@@ -25,7 +25,7 @@ _ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFET
 
 
 @dataclass(frozen=True)
-class Sequence:
+class FirstFrames:
     """The first frames of a sequence. times_ns: since the first; poses: world_from_camera."""
 
     images: tuple[Path, ...]
@@ -34,7 +34,7 @@ class Sequence:
     positions: tuple[Geodetic, ...]
 
     @classmethod
-    def read(cls, folder: Path, frame: LocalFrame, frames: int) -> Sequence:
+    def read(cls, folder: Path, frame: LocalFrame, frames: int) -> FirstFrames:
         """Images, their times and the truth, in the map's frame."""
         images = tuple(list_images(folder / "images")[:frames])
         stamps = read_timestamps(folder / "images" / TIMESTAMPS_NAME)
@@ -61,13 +61,13 @@ class Sequence:
         (folder / TIMESTAMPS_NAME).write_text("".join(lines))
 
 
-class Vehicle:
+class ReplayVehicle:
     """Sends heartbeat, attitude, position, GNSS and gimbal. begun_ns: when the first image was
     exposed, CLOCK_MONOTONIC, or None while that is not known: it stands until then.
     """
 
     def __init__(
-        self, port: int, sequence: Sequence, geoid_m: float, begun_ns: Callable[[], int | None]
+        self, port: int, sequence: FirstFrames, geoid_m: float, begun_ns: Callable[[], int | None]
     ) -> None:
         self._to, self._sequence, self._geoid_m = ("127.0.0.1", port), sequence, geoid_m
         self._begun_ns = begun_ns
@@ -77,7 +77,7 @@ class Vehicle:
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
 
-    def __enter__(self) -> Vehicle:
+    def __enter__(self) -> ReplayVehicle:
         self._thread.start()
         return self
 
@@ -128,7 +128,7 @@ class Vehicle:
         self._codec.seq = (self._codec.seq + 1) % 256
 
 
-def begun_ns(record: Path, sequence: Sequence) -> int | None:
+def begun_ns(record: Path, sequence: FirstFrames) -> int | None:
     """When the first image was exposed, by the first row of the record; None before it stands."""
     try:
         with (record / "estimates.csv").open(newline="", encoding="utf-8") as file:

@@ -42,7 +42,7 @@ from localizer.types import PosePrior
 
 with needs_torch():
     from benchmarks.features.methods import (
-        Direct,
+        DirectMethod,
         IntensityExtractor,
         Levelled,
         Method,
@@ -60,7 +60,7 @@ with needs_torch():
         narrowed,
     )
     from benchmarks.features.real import real_pairs
-    from benchmarks.features.report import Outcome, read_outcomes, report, write_outcomes
+    from benchmarks.features.report import PairOutcome, read_outcomes, report, write_outcomes
     from benchmarks.features.tables import TABLES
 
 _log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ SHIPPED = Path("shipped")  # stands for the shipped network
 
 def evaluate(
     methods: dict[str, Method | Levelled], pairs: Sequence[TestPair], source: str, seed: int
-) -> list[Outcome]:
+) -> list[PairOutcome]:
     """Every method on every pair of the set `source`."""
     axes = np.diag([METRES**2 / 3] * 3 + [np.radians(DEGREES) ** 2 / 3] * 3)
     outcomes = []
@@ -83,7 +83,7 @@ def evaluate(
             seconds = time.perf_counter() - began
             metres, degrees = pose.distance_to(pair.truth)
             outcomes.append(
-                Outcome(
+                PairOutcome(
                     name, source, seed, k, pair.place, pair.condition, metres, degrees, seconds,
                 )
             )  # fmt: skip
@@ -91,8 +91,8 @@ def evaluate(
 
 
 BASELINES: dict[str, tuple[str, Callable[[int], Method]]] = {
-    "intensity": ("intensity", lambda n: Direct(IntensityExtractor(), n)),
-    "gradient": ("gradient", lambda n: Direct(DetailExtractor(GradientExtractor()), n)),
+    "intensity": ("intensity", lambda n: DirectMethod(IntensityExtractor(), n)),
+    "gradient": ("gradient", lambda n: DirectMethod(DetailExtractor(GradientExtractor()), n)),
     "sift": ("SIFT + PnP", lambda _: sift_pnp),
     "xfeat": ("XFeat + PnP", lambda _: load_xfeat()),
 }
@@ -121,8 +121,8 @@ def build_methods(
         name = "tiny" if model == SHIPPED else str(model)
         if alone:
             swarm = JNGOConfig(preselected=0)
-            methods[f"{name}, swarm alone"] = Direct(extractor, anchors, swarm)
-        direct = methods[name] = Direct(extractor, anchors)
+            methods[f"{name}, swarm alone"] = DirectMethod(extractor, anchors, swarm)
+        direct = methods[name] = DirectMethod(extractor, anchors)
         for tilt_deg in tilts_deg:
             methods[f"{name}, tilt to {tilt_deg:g} deg"] = Levelled(direct, tilt_deg)
     return methods

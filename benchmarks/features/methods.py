@@ -40,7 +40,7 @@ class IntensityExtractor:
         return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
 
-class Direct:
+class DirectMethod:
     """Feature-metric registration with one extractor, as the product does it."""
 
     def __init__(
@@ -62,11 +62,11 @@ class Direct:
 
 @dataclass(frozen=True)
 class Levelled:
-    """`Direct` that hears an autopilot's roll and pitch: off by `tilt_deg` an axis, one sigma. No
+    """`DirectMethod` that hears an autopilot's roll and pitch: off by `tilt_deg` an axis, one sigma. No
     heading: where vision feeds the autopilot's, hearing it would be hearing oneself.
     """
 
-    direct: Direct
+    direct: DirectMethod
     tilt_deg: float
 
     def hearing(self, truth: Pose, seed: int) -> Method:

@@ -31,7 +31,7 @@ SIZES = ((320, 240), (512, 512))
 
 
 @dataclass(frozen=True)
-class Row:
+class SpeedRow:
     """One cell's worth of times, milliseconds; on_device: None on a CPU."""
 
     model: str
@@ -78,7 +78,7 @@ def median_ms(call: Callable[[Image], object], image: Image, count: int) -> floa
 
 def measure(
     models: Sequence[Path], sizes: Sequence[tuple[int, int]], threads: int, count: int
-) -> Iterator[Row]:
+) -> Iterator[SpeedRow]:
     """Every model at every size on every installed provider that runs it."""
     installed = [SHORT_NAMES[n] for n in ort.get_available_providers() if n in SHORT_NAMES]
     for model in models:
@@ -96,10 +96,10 @@ def measure(
                 device = None
                 if provider != "CPU":
                     device = median_ms(extractor.extract_on_device, image, count)
-                yield Row(extractor.info.name, provider, size, host, device)
+                yield SpeedRow(extractor.info.name, provider, size, host, device)
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[SpeedRow]) -> str:
     """As Markdown."""
     lines = ["| network | provider | size | to host, ms | on device, ms |", "|---|---|---|---|---|"]
     for r in rows:

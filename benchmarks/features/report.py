@@ -16,7 +16,7 @@ _DRAWS = 2000  # of the bootstrap
 
 
 @dataclass(frozen=True)
-class Outcome:
+class PairOutcome:
     """One method on one pair of the set `source`: errors (metres, degrees) and the pair's kind."""
 
     method: str
@@ -34,17 +34,17 @@ class Outcome:
         return self.metres < limit and self.degrees < limit
 
 
-def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
+def write_outcomes(outcomes: Sequence[PairOutcome], path: Path) -> None:
     """Store outcomes, so that a report needs no second run."""
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Outcome)])
+        writer = csv.DictWriter(file, [f.name for f in fields(PairOutcome)])
         writer.writeheader()
         writer.writerows(asdict(o) for o in outcomes)
 
 
-def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
+def read_outcomes(paths: Sequence[Path]) -> list[PairOutcome]:
     """Outcomes of several runs together."""
-    found: list[Outcome] = []
+    found: list[PairOutcome] = []
     for path in paths:
         try:
             with path.open(newline="", encoding="utf-8") as file:
@@ -57,8 +57,8 @@ def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
     return found
 
 
-def _outcome(row: dict[str, str]) -> Outcome:
-    return Outcome(
+def _outcome(row: dict[str, str]) -> PairOutcome:
+    return PairOutcome(
         row["method"],
         row["source"],
         int(row["seed"]),
@@ -82,7 +82,7 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
 
 
 def difference(
-    a: Sequence[Outcome], b: Sequence[Outcome], limit: float = 1
+    a: Sequence[PairOutcome], b: Sequence[PairOutcome], limit: float = 1
 ) -> tuple[float, float, float]:
     """Points by which `a` beats `b` within `limit` m and deg, with a 95 % interval: a bootstrap
     over places, because the pairs of a place are alike. Both must be of the same pairs in order.
@@ -99,7 +99,7 @@ def difference(
     return 100 * float(gain.mean()), float(low), float(high)
 
 
-def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+def groups(outcomes: Sequence[PairOutcome]) -> dict[str, list[PairOutcome]]:
     """All, each set and each seed of a set where there are several, each condition over all sets,
     and where there are several sets each condition in each.
     """
@@ -124,7 +124,7 @@ def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
     return {name: members for name, members in found.items() if members}
 
 
-def report(outcomes: Sequence[Outcome]) -> str:
+def report(outcomes: Sequence[PairOutcome]) -> str:
     """Markdown tables. First, per group and method the share within 1 m / 1 deg with Wilson's
     interval and within 3 m / 3 deg, and the medians; then, per group, the last method's lead over
     each other one at 1 m / 1 deg, and where it is behind.
@@ -143,7 +143,7 @@ def report(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines + (_leads(split) if len(methods) > 1 else []))
 
 
-def _leads(split: dict[str, dict[str, list[Outcome]]]) -> list[str]:
+def _leads(split: dict[str, dict[str, list[PairOutcome]]]) -> list[str]:
     *others, last = split
     lines = ["", f"Points by which {last} leads at 1 m / 1 deg:", ""]
     lines += ["| pairs | n | " + " | ".join(others) + " |", "|---" * (len(others) + 2) + "|"]
@@ -163,7 +163,7 @@ def _leads(split: dict[str, dict[str, list[Outcome]]]) -> list[str]:
     return [*lines, "", f"{last} is behind in {len(behind)} of these cells:", *behind]
 
 
-def _cell(members: Sequence[Outcome]) -> str:
+def _cell(members: Sequence[PairOutcome]) -> str:
     if not members:
         return ""
     near = sum(o.within(1) for o in members)
@@ -173,7 +173,7 @@ def _cell(members: Sequence[Outcome]) -> str:
     return f"{share:.0f} [{low:.0f}, {high:.0f}], {share3:.0f}"
 
 
-def _medians(members: Sequence[Outcome]) -> str:
+def _medians(members: Sequence[PairOutcome]) -> str:
     metres = float(np.median([o.metres for o in members]))
     degrees = float(np.median([o.degrees for o in members]))
     return f"{metres:.2f} m, {degrees:.2f}°"

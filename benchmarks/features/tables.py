@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from benchmarks.features.report import Outcome, difference, groups, wilson
+from benchmarks.features.report import PairOutcome, difference, groups, wilson
 from localizer.synth.appearance.model import CONDITIONS
 
 Cells = tuple[tuple[str, ...], list[tuple[str, ...]]]  # columns and rows
@@ -17,19 +17,19 @@ _KINDS = {
 }  # fmt: skip
 
 
-def by_set(outcomes: Sequence[Outcome]) -> Cells:
+def by_set(outcomes: Sequence[PairOutcome]) -> Cells:
     """A row a set, a column a method."""
     named = {s: [o for o in outcomes if o.source == s] for s in _sources(outcomes)}
     return _by_method("pairs", named | ({"all": list(outcomes)} if len(named) > 1 else {}))
 
 
-def by_condition(outcomes: Sequence[Outcome]) -> Cells:
+def by_condition(outcomes: Sequence[PairOutcome]) -> Cells:
     """A row a kind of pair, a column a method, over all sets."""
     named = {"all": list(outcomes)}
     return _by_method("pairs", named | {k: _of(outcomes, k) for k in _kinds(outcomes)})
 
 
-def by_light(outcomes: Sequence[Outcome]) -> Cells:
+def by_light(outcomes: Sequence[PairOutcome]) -> Cells:
     """A row a kind of pair, a column a set: the last method alone."""
     mine = [o for o in outcomes if o.method == _methods(outcomes)[-1]]
     sets = _sources(mine)
@@ -40,7 +40,7 @@ def by_light(outcomes: Sequence[Outcome]) -> Cells:
     return ("light and weather", *sets), rows
 
 
-def leads(outcomes: Sequence[Outcome]) -> Cells:
+def leads(outcomes: Sequence[PairOutcome]) -> Cells:
     """Points by which the last method leads at 1 m and 1 degree: over all, by set, and at night."""
     *others, last = _methods(outcomes)
     split = {m: groups([o for o in outcomes if o.method == m]) for m in (*others, last)}
@@ -53,7 +53,7 @@ def leads(outcomes: Sequence[Outcome]) -> Cells:
     return (f"lead of {last}, points", "n", *(f"over {m}" for m in others)), rows
 
 
-def against(outcomes: Sequence[Outcome]) -> Cells:
+def against(outcomes: Sequence[PairOutcome]) -> Cells:
     """The last method against the first, on the same pairs: a row a set, and its hard kinds."""
     first, *_, last = _methods(outcomes)
     rows = []
@@ -74,13 +74,13 @@ def against(outcomes: Sequence[Outcome]) -> Cells:
     return columns, rows
 
 
-TABLES: dict[str, Callable[[Sequence[Outcome]], Cells]] = {
+TABLES: dict[str, Callable[[Sequence[PairOutcome]], Cells]] = {
     "sets": by_set, "conditions": by_condition, "light": by_light, "leads": leads,
     "against": against,
 }  # fmt: skip
 
 
-def _by_method(title: str, named: dict[str, list[Outcome]]) -> Cells:
+def _by_method(title: str, named: dict[str, list[PairOutcome]]) -> Cells:
     methods = _methods([o for some in named.values() for o in some])
     rows = []
     for name, some in named.items():
@@ -89,31 +89,31 @@ def _by_method(title: str, named: dict[str, list[Outcome]]) -> Cells:
     return (title, "n", *methods), rows
 
 
-def _with_interval(mine: Sequence[Outcome]) -> str:
+def _with_interval(mine: Sequence[PairOutcome]) -> str:
     low, high = wilson(sum(o.within(1) for o in mine), len(mine))
     one, three = _shares(mine).split(", ")
     return f"{one} [{low:.0f}, {high:.0f}], {three}"
 
 
-def _shares(mine: Sequence[Outcome]) -> str:
+def _shares(mine: Sequence[PairOutcome]) -> str:
     """Per cent within 1 m and 1 degree, then within 3 m and 3 degrees."""
     return ", ".join(f"{100 * sum(o.within(k) for o in mine) / len(mine):.0f}" for k in (1, 3))
 
 
-def _methods(outcomes: Sequence[Outcome]) -> list[str]:
+def _methods(outcomes: Sequence[PairOutcome]) -> list[str]:
     return list(dict.fromkeys(o.method for o in outcomes))
 
 
-def _sources(outcomes: Sequence[Outcome]) -> list[str]:
+def _sources(outcomes: Sequence[PairOutcome]) -> list[str]:
     return list(dict.fromkeys(o.source for o in outcomes))
 
 
-def _kinds(outcomes: Sequence[Outcome]) -> list[str]:
+def _kinds(outcomes: Sequence[PairOutcome]) -> list[str]:
     """Those that are there, in the table's order, unknown ones last."""
     there = dict.fromkeys(_KINDS.get(o.condition, o.condition) for o in outcomes)
     known = [k for k in dict.fromkeys(_KINDS.values()) if k in there]
     return [*known, *(k for k in there if k not in known)]
 
 
-def _of(outcomes: Sequence[Outcome], kind: str) -> list[Outcome]:
+def _of(outcomes: Sequence[PairOutcome], kind: str) -> list[PairOutcome]:
     return [o for o in outcomes if _KINDS.get(o.condition, o.condition) == kind]

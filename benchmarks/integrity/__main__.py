@@ -32,7 +32,7 @@ from benchmarks.common.named_errors import named_errors, needs_torch
 with needs_torch():
     from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
     from benchmarks.integrity.report import by_condition, plot, rows, table
-    from benchmarks.integrity.run import Outcome, again, read, run_set, turn
+    from benchmarks.integrity.run import StartOutcome, again, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
 _USUAL = [name for name in SETS if name != UNSEEN]
@@ -46,7 +46,7 @@ def parser() -> Parser:
     p.add_argument("--sets", nargs="+", choices=list(SETS), default=_USUAL, help="to run")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--minutes", type=number(0.1, 1e4), default=10.0, help="until it pauses")
-    p.add_argument("--again", action="store_true", help="bring older outcomes up to date")
+    p.add_argument("--restart", action="store_true", help="bring older outcomes up to date")
     p.add_argument("--without", type=existing, help="folder whose outcomes' views are left out")
     p.add_argument("--report", action="store_true", help="tables of what is there; no run")
     p.add_argument("--json", type=output, help="the report's rows")
@@ -76,7 +76,7 @@ def main() -> None:
                     left[name] = run_set(*mine, seen)
                 print(f"{name}: {left[name]} of {len(views[name])} views left", flush=True)
         return
-    outcomes: list[Outcome] = []
+    outcomes: list[StartOutcome] = []
     for name in (n for n in args.sets if n != TUNING or args.sets == [TUNING]):
         if (home / f"{name}.jsonl").exists():
             outcomes += read(home / f"{name}.jsonl")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.basin.views import View
+from benchmarks.basin.views import BasinView
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.relocalization.patch import turned
@@ -26,7 +26,7 @@ WRONG = ("far", "lost", "elsewhere", "focal")  # "near" and "focal near" begin r
 
 
 @dataclass(frozen=True)
-class Beginning:
+class RegistrationStart:
     """One registration to try. camera: as it is believed; prior: told with an honest covariance;
     map_cache: what it is registered to; other: the view from whose pose the reference is rendered,
     where that serves several beginnings; has_truth: whether the place is on that map.
@@ -38,13 +38,13 @@ class Beginning:
     map_cache: Path
     camera: Camera
     prior: PosePrior
-    other: View | None = None
+    other: BasinView | None = None
     has_truth: bool = True
 
 
 def beginnings(
-    view: View, index: int, here: Sequence[View], others: Sequence[View]
-) -> Iterator[Beginning]:
+    view: BasinView, index: int, here: Sequence[BasinView], others: Sequence[BasinView]
+) -> Iterator[RegistrationStart]:
     """All of one view; here, others: views of its own map and of other places, where it is tried,
     too.
     """
@@ -52,7 +52,7 @@ def beginnings(
     for kind, starts in (("near", NEAR), ("far", FAR)):
         for metres, degrees in starts:
             prior = _off(view.truth, metres, degrees, rng)
-            yield Beginning(kind, metres, degrees, view.map_cache, view.camera, prior)
+            yield RegistrationStart(kind, metres, degrees, view.map_cache, view.camera, prior)
     away = [v for v in here if view.truth.distance_to(v.truth)[0] >= _LEAST_LOST_M]
     for k in rng.permutation(len(away))[:LOST]:
         yield _at(away[int(k)], view, "lost")
@@ -64,17 +64,17 @@ def beginnings(
         camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
         kind = "focal near" if metres == NEAR[0][0] else "focal"
         prior = _off(view.truth, metres, degrees, rng)
-        yield Beginning(kind, metres, degrees, view.map_cache, camera, prior)
+        yield RegistrationStart(kind, metres, degrees, view.map_cache, camera, prior)
 
 
-def _at(place: View, view: View, kind: str) -> Beginning:
+def _at(place: BasinView, view: BasinView, kind: str) -> RegistrationStart:
     """Where another view was taken, the prior as wide as the way there; no heading is known."""
     on_map = kind == "lost"
     metres, degrees = view.truth.distance_to(place.truth) if on_map else (20.0, 180.0)
     tilt = np.radians(max(_TILT_DEG, degrees)) if on_map else np.radians(_TILT_DEG)
     sigma = np.array([metres, metres, metres, tilt, tilt, np.pi])
     prior = PosePrior(place.truth, np.diag(sigma**2), 0)
-    return Beginning(
+    return RegistrationStart(
         kind, metres, degrees, place.map_cache, view.camera, prior, other=place, has_truth=on_map
     )
 

@@ -18,7 +18,7 @@ from rasterio.transform import Affine, from_origin
 
 from benchmarks.basin.views import (
     VIEWS_PER_WORLD,
-    View,
+    BasinView,
     load_kept,
     load_views,
     store_renders,
@@ -42,7 +42,7 @@ _HALF_M = 140.0  # within which its views look
 _WEST, _NORTH, _CRS = 465_000.0, 5_250_000.0, "EPSG:32632"
 
 
-def load_set(name: str, folder: Path, data: Path, count: int) -> list[View]:
+def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]:
     """The views of a set, made on the first call; a few photos are given again."""
     home = folder / name
     if name == TUNING:
@@ -66,7 +66,7 @@ def shift_of(name: str) -> tuple[float, float]:
     return SHIFT_M if name == "shifted" else (0.0, 0.0)
 
 
-def place_of(view: View) -> Path:
+def place_of(view: BasinView) -> Path:
     """What tells places apart: the folder of the map, or of the one that it was made from."""
     home = view.map_cache.parent
     return home.parent / "portugal" if home.name in ("shifted", "outdated") else home

@@ -11,10 +11,10 @@ import numpy as np
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.beginnings import WRONG
-from benchmarks.integrity.run import Outcome
+from benchmarks.integrity.run import StartOutcome
 from localizer.integrity.acceptance import IntegrityConfig
 
-Acceptance = Callable[[Outcome], bool]
+Acceptance = Callable[[StartOutcome], bool]
 
 WITHOUT, AGREE = "no added test", "parts agree"
 DISTINCT, FOCAL = "parts agree, stands out: ours", "parts agree, no other focal length"
@@ -35,18 +35,18 @@ def acceptances(config: IntegrityConfig) -> dict[str, Acceptance]:
     """What was accepted without the parts' votes, that with each test added, and all of them."""
     c = config
 
-    def plain(o: Outcome) -> bool:
+    def plain(o: StartOutcome) -> bool:
         good = o.ok and o.overlap >= c.min_overlap and o.quality >= c.min_quality
-        return good and o.sigma_m <= c.max_sigma_m and o.gate <= c.gate
+        return good and o.sigma_m <= c.max_sigma_m and o.gate <= c.chi2_threshold
 
-    def votes(o: Outcome, share: float) -> bool:
-        return plain(o) and o.parts >= c.min_parts and o.votes >= share * o.parts
+    def votes(o: StartOutcome, share: float) -> bool:
+        return plain(o) and o.parts >= c.min_patches and o.votes >= share * o.parts
 
-    def focal(o: Outcome) -> bool:
+    def focal(o: StartOutcome) -> bool:
         return o.focal_gain <= c.max_focal_gain
 
-    def stands_out(o: Outcome) -> bool:
-        return o.prior_sigma_m < c.distinct_from_m or o.peak >= c.min_peak
+    def stands_out(o: StartOutcome) -> bool:
+        return o.prior_sigma_m < c.ambiguity_sigma_m or o.peak >= c.peak_to_sidelobe_min
 
     return {
         WITHOUT: plain,
@@ -54,10 +54,10 @@ def acceptances(config: IntegrityConfig) -> dict[str, Acceptance]:
         "quality 0.3": lambda o: plain(o) and o.quality >= 0.3,
         "peak 4.5": lambda o: plain(o) and o.peak >= 4.5,
         "55 % of parts agree": lambda o: votes(o, 0.55),
-        AGREE: lambda o: votes(o, c.min_agreement),
-        DISTINCT: lambda o: votes(o, c.min_agreement) and stands_out(o),
-        FOCAL: lambda o: votes(o, c.min_agreement) and focal(o),
-        OURS: lambda o: votes(o, c.min_agreement) and focal(o) and stands_out(o),
+        AGREE: lambda o: votes(o, c.min_patch_inlier_ratio),
+        DISTINCT: lambda o: votes(o, c.min_patch_inlier_ratio) and stands_out(o),
+        FOCAL: lambda o: votes(o, c.min_patch_inlier_ratio) and focal(o),
+        OURS: lambda o: votes(o, c.min_patch_inlier_ratio) and focal(o) and stands_out(o),
     }
 
 
@@ -81,7 +81,7 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Row:
+class AcceptanceRow:
     """One acceptance on one set. false: accepted, and off by more than 3 m or 3 degrees, of wrong
     beginnings; false_far: by more than 10 m; lost: of the right results that are accepted without
     any added test, those that this one rejects.
@@ -94,7 +94,7 @@ class Row:
     lost: Rate
 
 
-def rows(outcomes: Sequence[Outcome], config: IntegrityConfig) -> list[Row]:
+def rows(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> list[AcceptanceRow]:
     """Every acceptance, on each set and on all of them."""
     made = []
     tests = acceptances(config)
@@ -107,7 +107,7 @@ def rows(outcomes: Sequence[Outcome], config: IntegrityConfig) -> list[Row]:
             false = [o for o in wrong if not o.right and accepts(o)]
             lost = sum(not accepts(o) for o in right)
             made.append(
-                Row(
+                AcceptanceRow(
                     name,
                     label,
                     Rate.of(len(false), len(wrong)),
@@ -118,7 +118,7 @@ def rows(outcomes: Sequence[Outcome], config: IntegrityConfig) -> list[Row]:
     return made
 
 
-def table(made: Sequence[Row]) -> str:
+def table(made: Sequence[AcceptanceRow]) -> str:
     """Shares in per cent with their intervals."""
     lines = [
         "| set | acceptance | accepted, > 3 m or 3° off | > 10 m off | right ones lost |",
@@ -128,7 +128,7 @@ def table(made: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def by_condition(outcomes: Sequence[Outcome], config: IntegrityConfig) -> str:
+def by_condition(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> str:
     """Right results lost by our tests, of each condition, and of a focal length that is 5 % off."""
     tests = acceptances(config)
     lines = ["| right results | lost by our tests, % |", "|---|---|"]
@@ -146,7 +146,7 @@ def by_condition(outcomes: Sequence[Outcome], config: IntegrityConfig) -> str:
     return "\n".join(lines)
 
 
-def plot(outcomes: Sequence[Outcome], config: IntegrityConfig, path: Path) -> None:
+def plot(outcomes: Sequence[StartOutcome], config: IntegrityConfig, path: Path) -> None:
     """Share of agreeing parts over quality, of right and of wrong results."""
     figure, axes = plt.subplots(figsize=(7, 5))
     seen = [o for o in outcomes if o.ok and o.parts]
@@ -154,7 +154,7 @@ def plot(outcomes: Sequence[Outcome], config: IntegrityConfig, path: Path) -> No
         mine = [o for o in seen if o.right is right and (right or o.far)]
         x, y = [o.quality for o in mine], [o.votes / o.parts for o in mine]
         axes.scatter(np.array(x), np.array(y), s=3, color=colour, label=f"{label}, {len(mine)}")
-    axes.axhline(config.min_agreement, color="black", ls="--", lw=0.8)
+    axes.axhline(config.min_patch_inlier_ratio, color="black", ls="--", lw=0.8)
     axes.axvline(config.min_quality, color="black", ls=":", lw=0.8)
     axes.set_xlabel("registration quality")
     axes.set_ylabel("share of the image's parts that agree")

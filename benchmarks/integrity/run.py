@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.basin.views import View
-from benchmarks.integrity.beginnings import Beginning, beginnings
+from benchmarks.basin.views import BasinView
+from benchmarks.integrity.beginnings import RegistrationStart, beginnings
 from benchmarks.integrity.maps import place_of, shift_of
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
@@ -35,7 +35,7 @@ _FAR_M = 1e6  # error where the place is not on the map
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StartOutcome:
     """One registration. metres, degrees: its error, and off_map_m: against the picture of a map
     whose picture is shifted; sigma_m: the largest of its position; gate: squared Mahalanobis
     distance from the prior, prior_sigma_m: of its horizontal place; the rest as `Registration` has
@@ -74,7 +74,7 @@ class Outcome:
         return min(self.metres, self.off_map_m) > 10
 
 
-class Registrar:
+class MapRegistrar:
     """Registers views to whichever map a beginning names; close it when done."""
 
     def __init__(self, config: LocalizerConfig) -> None:
@@ -85,16 +85,16 @@ class Registrar:
         self._elsewhere: dict[int, Anchors | None] = {}
         self._stack = ExitStack()
 
-    def __enter__(self) -> Registrar:
+    def __enter__(self) -> MapRegistrar:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def outcomes(
-        self, name: str, view: View, index: int, here: Sequence[View], others: Sequence[View],
+        self, name: str, view: BasinView, index: int, here: Sequence[BasinView], others: Sequence[BasinView],
         shift: tuple[float, float],
-    ) -> Iterator[Outcome]:  # fmt: skip
+    ) -> Iterator[StartOutcome]:  # fmt: skip
         """Of every beginning of a view that meets the map; shift: of the map's picture, m."""
         query = self._extractor.extract(view.query)
         for begun in beginnings(view, index, here, others):
@@ -103,9 +103,9 @@ class Registrar:
                 yield _outcome(name, view, index, begun, found, shift)
 
     def repeated(
-        self, name: str, view: View, index: int, begun: Beginning, shift: tuple[float, float],
-        kept: Outcome,
-    ) -> Outcome:  # fmt: skip
+        self, name: str, view: BasinView, index: int, begun: RegistrationStart, shift: tuple[float, float],
+        kept: StartOutcome,
+    ) -> StartOutcome:  # fmt: skip
         """The outcome of one beginning once more; it has to be the one that is kept."""
         found = self._register(self._extractor.extract(view.query), begun, index)
         if found is not None:
@@ -117,7 +117,9 @@ class Registrar:
             "registration or the views changed since: begin anew"
         )
 
-    def _register(self, query: FeaturePyramid, begun: Beginning, index: int) -> Registration | None:
+    def _register(
+        self, query: FeaturePyramid, begun: RegistrationStart, index: int
+    ) -> Registration | None:
         if begun.other is not None:  # the same few places for every view: rendered once
             key = id(begun.other)
             if key not in self._elsewhere:
@@ -130,7 +132,7 @@ class Registrar:
         found = self._optimizer.register(query, begun.camera, anchors, begun.prior, seed=index)
         return self._optimizer.focal_tested(query, begun.camera, anchors, found)
 
-    def _anchors(self, begun: Beginning, camera: Camera, seed: int) -> Anchors | None:
+    def _anchors(self, begun: RegistrationStart, camera: Camera, seed: int) -> Anchors | None:
         pose = begun.prior.world_from_camera
         reference = self._renderer(begun.map_cache).render(pose, camera, wait=True)
         if (reference.depth > 0).mean() < _LEAST_MAP:
@@ -147,10 +149,10 @@ class Registrar:
 
 
 def _outcome(
-    name: str, view: View, index: int, begun: Beginning, found: Registration,
+    name: str, view: BasinView, index: int, begun: RegistrationStart, found: Registration,
     shift: tuple[float, float],
-) -> Outcome:  # fmt: skip
-    head = Outcome(
+) -> StartOutcome:  # fmt: skip
+    head = StartOutcome(
         name, index, view.condition, begun.kind, begun.start_m, begun.start_deg,
         found.status is RegistrationStatus.OK,
     )  # fmt: skip
@@ -173,7 +175,7 @@ def _outcome(
         quality=found.quality,
         sigma_m=float(np.sqrt(found.covariance.diagonal()[:3].max())),
         gate=mahalanobis_squared(begun.prior, pose, found.covariance),
-        parts=votes.parts,
+        parts=votes.patches,
         votes=votes.votes,
         peak=votes.peak,
         lead=min(found.lead, 1e3),
@@ -184,8 +186,8 @@ def _outcome(
 
 def run_set(
     name: str,
-    views: Sequence[View],
-    everywhere: Sequence[View],
+    views: Sequence[BasinView],
+    everywhere: Sequence[BasinView],
     path: Path,
     more_time: Callable[[], bool],
     seen: Path | None = None,
@@ -201,7 +203,7 @@ def run_set(
         path.write_text("".join(json.dumps(asdict(o)) + "\n" for o in kept))
     done = {o.view for o in kept}
     left = [k for k in unseen(views, seen) if k not in done]
-    with Registrar(LocalizerConfig()) as registrar, path.open("a") as file:
+    with MapRegistrar(LocalizerConfig()) as registrar, path.open("a") as file:
         while left and more_time():
             k = left.pop(0)
             here, others = _around(views, k, places)
@@ -214,8 +216,8 @@ def run_set(
 
 def again(
     name: str,
-    views: Sequence[View],
-    everywhere: Sequence[View],
+    views: Sequence[BasinView],
+    everywhere: Sequence[BasinView],
     path: Path,
     more_time: Callable[[], bool],
 ) -> int:
@@ -227,7 +229,7 @@ def again(
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     old = list(dict.fromkeys(r["view"] for r in rows if "focal_gain" not in r))
     places, shift, config = places_of(everywhere), shift_of(name), IntegrityConfig()
-    with Registrar(LocalizerConfig()) as registrar:
+    with MapRegistrar(LocalizerConfig()) as registrar:
         while old and more_time():
             k = old.pop(0)
             here, others = _around(views, k, places)
@@ -236,7 +238,7 @@ def again(
             for begun in beginnings(views[k], k, here, others):
                 if row is None or _start(begun) != (row["kind"], row["start_m"], row["start_deg"]):
                     continue  # it did not meet the map
-                kept = Outcome(**row, prior_sigma_m=place_sigma_m(begun.prior))
+                kept = StartOutcome(**row, prior_sigma_m=place_sigma_m(begun.prior))
                 if votes_accept(kept, config):
                     kept = registrar.repeated(name, views[k], k, begun, shift, kept)
                 fresh.append(asdict(kept))
@@ -250,7 +252,7 @@ def again(
     return len(old)
 
 
-def unseen(views: Sequence[View], seen: Path | None) -> list[int]:
+def unseen(views: Sequence[BasinView], seen: Path | None) -> list[int]:
     """The numbers of the views that another run's outcomes do not have, each picture once."""
     if seen is None:
         return list(range(len(views)))
@@ -259,36 +261,38 @@ def unseen(views: Sequence[View], seen: Path | None) -> list[int]:
     return [k for k, view in enumerate(views) if id(view) not in known and first[id(view)] == k]
 
 
-def votes_accept(outcome: Outcome, config: IntegrityConfig) -> bool:
+def votes_accept(outcome: StartOutcome, config: IntegrityConfig) -> bool:
     """Whether it passes all tests but those for another focal length and for standing out."""
     o, c = outcome, config
     good = o.ok and o.overlap >= c.min_overlap and o.quality >= c.min_quality
     return (
         good
         and o.sigma_m <= c.max_sigma_m
-        and o.gate <= c.gate
-        and o.parts >= c.min_parts
-        and o.votes >= c.min_agreement * o.parts
+        and o.gate <= c.chi2_threshold
+        and o.parts >= c.min_patches
+        and o.votes >= c.min_patch_inlier_ratio * o.parts
     )
 
 
-def places_of(everywhere: Sequence[View]) -> list[View]:
+def places_of(everywhere: Sequence[BasinView]) -> list[BasinView]:
     """The views at whose places others are tried."""
     chosen = np.random.default_rng(37).permutation(len(everywhere))[:_PLACES]
     return [everywhere[int(k)] for k in chosen]
 
 
-def _around(views: Sequence[View], k: int, places: Sequence[View]) -> tuple[list[View], list[View]]:
+def _around(
+    views: Sequence[BasinView], k: int, places: Sequence[BasinView]
+) -> tuple[list[BasinView], list[BasinView]]:
     """The views of a view's own map, and those of other places."""
     own, at = views[k].map_cache, place_of(views[k])
     return [v for v in views if v.map_cache == own], [v for v in places if place_of(v) != at]
 
 
-def _start(begun: Beginning) -> tuple[str, float, float]:
+def _start(begun: RegistrationStart) -> tuple[str, float, float]:
     return begun.kind, begun.start_m, begun.start_deg
 
 
-def read(path: Path) -> list[Outcome]:
+def read(path: Path) -> list[StartOutcome]:
     """The outcomes of a file; a line that an interrupt cut short is left out with its view."""
     rows, cut = [], set()
     for line in path.read_text().splitlines():
@@ -296,10 +300,10 @@ def read(path: Path) -> list[Outcome]:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
             cut.add(rows[-1]["view"] if rows else 0)
-    names = {f.name for f in fields(Outcome)}
+    names = {f.name for f in fields(StartOutcome)}
     if any(set(row) != names for row in rows):
         raise SequenceError(f"{path}: not a file of this benchmark: begin anew without it")
-    return [Outcome(**row) for row in rows if row["view"] not in cut]
+    return [StartOutcome(**row) for row in rows if row["view"] not in cut]
 
 
 def turn(more_time: Callable[[], bool], count: int) -> Callable[[], bool]:

@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.odometry.flights import DEPTHS, Flown, Flyer, Scene, Step
+from benchmarks.odometry.flights import DEPTHS, FlownScene, FlownStretch, Flyer, OdometryStep
 from benchmarks.odometry.report import fitted_growth, rows
-from benchmarks.odometry.stretches import Plan, make_stretch, start, working_pinhole
+from benchmarks.odometry.stretches import StretchPlan, make_stretch, start, working_pinhole
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
@@ -52,7 +52,7 @@ class _Terrain:
     offset_m: float
 
     def height(self, east: ArrayLike, north: ArrayLike) -> Array:
-        """See `localizer.odometry.Ground`."""
+        """See `localizer.odometry.TerrainModel`."""
         return np.asarray(self.info.ground_height(east, north)) + self.offset_m
 
 
@@ -64,20 +64,20 @@ def surface_height(renderer: MapRenderer, place: Array) -> float:
     return _HIGH_M - float(np.quantile(seen, 0.7)) if len(seen) else 0.0
 
 
-def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> list[Flown]:
+def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> list[FlownStretch]:
     """All stretches; the file is written after each, so that what was flown is not lost."""
     camera = working_pinhole(args.width)
     terrain = None
     if args.terrain is not None:
         info = WorldInfo.load(args.terrain)
         terrain = _Terrain(info, info.origin.height_m - known.cache.frame.origin.height_m)
-    scene = Scene(args.map.parent.name, NumbaRenderer(seen, 1), NumbaRenderer(known, 1), camera,
+    scene = FlownScene(args.map.parent.name, NumbaRenderer(seen, 1), NumbaRenderer(known, 1), camera,
                   terrain)  # fmt: skip
     extractor = DetailExtractor(load_extractor(threads=1, size=(camera.width, camera.height)))
     config = OdometryConfig(**dict.fromkeys(_GROWTHS, _NONE)) if args.fit else OdometryConfig()
     flyer = Flyer(scene, extractor, JNGO(threads=args.threads), config)
-    plan = Plan(args.seconds, args.rate, args.speed, args.height, tuple(args.half))
-    flown: list[Flown] = []
+    plan = StretchPlan(args.seconds, args.rate, args.speed, args.height, tuple(args.half))
+    flown: list[FlownStretch] = []
     for k in range(args.stretches):
         for index, condition in enumerate(args.conditions):
             seed = args.seed + k * len(args.conditions) + index
@@ -98,10 +98,10 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
     return flown
 
 
-def read(path: Path) -> list[Flown]:
+def read(path: Path) -> list[FlownStretch]:
     """The stretches of an earlier run's file."""
     return [
-        Flown(**{**f, "steps": tuple(Step(**step) for step in f["steps"])})
+        FlownStretch(**{**f, "steps": tuple(OdometryStep(**step) for step in f["steps"])})
         for f in json.loads(path.read_text())["flown"]
     ]
 

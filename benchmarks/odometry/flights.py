@@ -10,14 +10,14 @@ from functools import partial
 import cv2
 import numpy as np
 
-from benchmarks.odometry.stretches import Stretch
+from benchmarks.odometry.stretches import TestStretch
 from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.odometry import (
-    Ground,
     OdometryConfig,
     OdometryFrame,
+    TerrainModel,
     VisualOdometry,
     examine,
     odometry_optimizer,
@@ -39,7 +39,7 @@ Surface = Callable[[], Array | None] | None
 
 
 @dataclass(frozen=True)
-class Step:
+class OdometryStep:
     """One frame's outcome. error, covariance: of the position, world axes, m and m²; displacement:
     from the beginning, in a straight line; flown_m: along the true path.
     """
@@ -56,41 +56,45 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Flown:
+class FlownStretch:
     """A stretch with one source of depth."""
 
     place: str
     condition: str
     seed: int
     depth: str
-    steps: tuple[Step, ...]
+    steps: tuple[OdometryStep, ...]
 
 
 @dataclass(frozen=True)
-class Scene:
+class FlownScene:
     """Where it is flown. seen: renders the world as it is; known: the map's geometry."""
 
     name: str
     seen: MapRenderer
     known: MapRenderer
     camera: Camera
-    terrain: Ground | None
+    terrain: TerrainModel | None
 
 
 class Flyer:
     """Flies stretches over a scene."""
 
     def __init__(
-        self, scene: Scene, extractor: FeatureExtractor, optimizer: JNGO, config: OdometryConfig
+        self,
+        scene: FlownScene,
+        extractor: FeatureExtractor,
+        optimizer: JNGO,
+        config: OdometryConfig,
     ) -> None:
         self._scene, self._extractor = scene, extractor
         self._optimizer, self._config = odometry_optimizer(optimizer), config
 
-    def fly(self, stretch: Stretch, depths: tuple[str, ...]) -> list[Flown]:
+    def fly(self, stretch: TestStretch, depths: tuple[str, ...]) -> list[FlownStretch]:
         """The stretch with each source of depth in `depths`, over the same pictures."""
         rng = np.random.default_rng((stretch.seed, 2))
         begun, covariance = _beginning(stretch, rng)
-        runs = [_Run(self._odometry(depth), depth, begun) for depth in depths]
+        runs = [_OdometryRun(self._odometry(depth), depth, begun) for depth in depths]
         ranges = self._ranges(stretch) if "range" in depths else {}
         for k, frame in enumerate(self._frames(stretch, rng)):
             for run in runs:
@@ -105,7 +109,7 @@ class Flyer:
                     )  # fmt: skip
         name = self._scene.name
         return [
-            Flown(name, stretch.condition, stretch.seed, run.depth, tuple(run.steps))
+            FlownStretch(name, stretch.condition, stretch.seed, run.depth, tuple(run.steps))
             for run in runs
         ]
 
@@ -113,7 +117,7 @@ class Flyer:
         ground = self._scene.terrain if depth == "ground" else None
         return VisualOdometry(self._scene.camera, self._optimizer, self._config, ground)
 
-    def _ranges(self, stretch: Stretch) -> dict[int, float]:
+    def _ranges(self, stretch: TestStretch) -> dict[int, float]:
         """A rangefinder's readings by number of the frame: what lies below in the seen world, roofs
         and crowns as well as ground.
         """
@@ -128,7 +132,7 @@ class Flyer:
                 found[k] = float(reading)
         return found
 
-    def _frames(self, stretch: Stretch, rng: np.random.Generator) -> Iterator[OdometryFrame]:
+    def _frames(self, stretch: TestStretch, rng: np.random.Generator) -> Iterator[OdometryFrame]:
         look = sample_appearance(rng, stretch.condition)
         previous: Image | None = None
         for time_s, pose in zip(stretch.times_s, stretch.poses, strict=True):
@@ -156,17 +160,17 @@ class Flyer:
         return points if len(points) else None
 
 
-class _Run:
+class _OdometryRun:
     """One odometry on its way. ahead: where the next frame is expected."""
 
     def __init__(self, odometry: VisualOdometry, depth: str, begun: Pose) -> None:
         self.odometry, self.depth, self.ahead = odometry, depth, begun
-        self.steps: list[Step] = []
+        self.steps: list[OdometryStep] = []
         self._begun = self._last = begun
 
     def step(
         self, frame: OdometryFrame, surface: Surface, clearance_m: float | None,
-        stretch: Stretch, k: int,
+        stretch: TestStretch, k: int,
     ) -> None:  # fmt: skip
         """Carry on by one frame, and measure it."""
         started = time.perf_counter()
@@ -178,7 +182,7 @@ class _Run:
         moved = found.translation - self._last.translation
         self.ahead, self._last = Pose(found.rotation, found.translation + moved), found
         self.steps.append(
-            Step(
+            OdometryStep(
                 estimate.status.name,
                 tuple(found.translation - stretch.poses[k].translation),
                 tuple(tuple(float(x) for x in row) for row in estimate.covariance[:3, :3]),
@@ -192,7 +196,7 @@ class _Run:
         )
 
 
-def _beginning(stretch: Stretch, rng: np.random.Generator) -> tuple[Pose, Array]:
+def _beginning(stretch: TestStretch, rng: np.random.Generator) -> tuple[Pose, Array]:
     """The tracker's last good fix, with its error and covariance."""
     true, sigma = stretch.poses[0], np.repeat([_BEGIN_M, _BEGIN_RAD], 3)
     error = rng.normal(0, sigma)

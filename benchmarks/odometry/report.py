@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from benchmarks.odometry.flights import Flown, Step
+from benchmarks.odometry.flights import FlownStretch, OdometryStep
 from localizer.geometry.pose import Array
 
 _CHI2_95 = 5.991
@@ -14,7 +14,7 @@ _LEAST_WAY_M = 50.0  # before it, per cent of the way mean nothing
 _GRID = np.geomspace(1e-4, 0.3, 28)
 
 
-def rows(flown: list[Flown]) -> list[dict[str, object]]:
+def rows(flown: list[FlownStretch]) -> list[dict[str, object]]:
     """One line for each place, source of depth and condition, and for all conditions."""
     found = []
     for place, depth in sorted({(f.place, f.depth) for f in flown}):
@@ -25,7 +25,7 @@ def rows(flown: list[Flown]) -> list[dict[str, object]]:
     return found
 
 
-def _row(flown: list[Flown]) -> dict[str, object]:
+def _row(flown: list[FlownStretch]) -> dict[str, object]:
     ends = [f.steps[-1] for f in flown]
     metres = np.array([_horizontal(s) for s in ends])
     share = 100 * metres / np.array([s.flown_m for s in ends])
@@ -50,15 +50,15 @@ def _row(flown: list[Flown]) -> dict[str, object]:
     }
 
 
-def _counted(flown: Flown) -> list[Step]:
+def _counted(flown: FlownStretch) -> list[OdometryStep]:
     return [s for s in flown.steps if s.flown_m >= _LEAST_WAY_M] or [flown.steps[-1]]
 
 
-def _horizontal(step: Step) -> float:
+def _horizontal(step: OdometryStep) -> float:
     return float(np.hypot(step.error[0], step.error[1]))
 
 
-def _inside(step: Step) -> bool:
+def _inside(step: OdometryStep) -> bool:
     return _distance(np.array(step.error[:2]), np.array(step.covariance)[:2, :2]) <= _CHI2_95
 
 
@@ -66,7 +66,7 @@ def _distance(error: Array, covariance: Array) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def fitted_growth(flown: list[Flown]) -> dict[str, float]:
+def fitted_growth(flown: list[FlownStretch]) -> dict[str, float]:
     """Scale and horizontal walk of greatest likelihood, for steps flown without any growth.
 
     Each stretch counts as one draw: errors of neighbouring steps are the same error.

@@ -21,7 +21,7 @@ TILT_SIGMA, HEADING_SIGMA, HEIGHT_SIGMA = float(np.radians(0.4)), float(np.radia
 
 
 @dataclass(frozen=True)
-class Stretch:
+class TestStretch:
     """A flight of constant speed. poses: world_from_camera, true; times_s from 0 on; sensed: the
     barometer's height and the attitude by autopilot and gimbal, with their errors.
     """
@@ -40,7 +40,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StretchPlan:
     """What the stretches of a run have in common. half_m: of the area, east and north."""
 
     seconds: float
@@ -50,7 +50,7 @@ class Plan:
     half_m: tuple[float, float]
 
 
-def make_stretch(plan: Plan, condition: str, seed: int, ground_m: float) -> Stretch:
+def make_stretch(plan: StretchPlan, condition: str, seed: int, ground_m: float) -> TestStretch:
     """Begins anywhere in the area, at `height_m` above `ground_m`, and turns back at its edge."""
     rng = np.random.default_rng((seed, 1))
     count = round(plan.seconds * plan.rate_hz) + 1
@@ -69,10 +69,10 @@ def make_stretch(plan: Plan, condition: str, seed: int, ground_m: float) -> Stre
         )
         place = place + plan.speed_m_s / plan.rate_hz * np.array([np.sin(heading), np.cos(heading)])
     velocity = (poses[1].translation - poses[0].translation) * plan.rate_hz
-    return Stretch(seed, condition, tuple(poses), times, _sensed(poses, times, rng), velocity)
+    return TestStretch(seed, condition, tuple(poses), times, _sensed(poses, times, rng), velocity)
 
 
-def start(plan: Plan, seed: int) -> tuple[Array, float]:
+def start(plan: StretchPlan, seed: int) -> tuple[Array, float]:
     """East and north (2,) where a stretch begins, and its first heading in radians."""
     rng = np.random.default_rng((seed, 0))
     place = rng.uniform(-1, 1, 2) * np.array(plan.half_m)

@@ -66,7 +66,7 @@ UNFUSED_STEPS = ("project", "sample", "jacobian", "accumulate", "solve")
 
 
 @dataclass(frozen=True)
-class Work:
+class EvaluationWork:
     """Of one evaluation of the swarm. flops: float32 operations; requested: bytes that the lanes
     load; unique: bytes that must come from memory at least once.
     """
@@ -76,7 +76,7 @@ class Work:
     unique: float
 
 
-def count_work(problem: LevelProblem, swarm: Poses, bytes_per_value: int) -> Work:
+def count_work(problem: LevelProblem, swarm: Poses, bytes_per_value: int) -> EvaluationWork:
     """Counted from the kernel's source: 25 operations a channel and about 220 besides."""
     h, w, C = problem.features.shape
     touched = np.zeros((h, w), dtype=bool)
@@ -93,7 +93,7 @@ def count_work(problem: LevelProblem, swarm: Poses, bytes_per_value: int) -> Wor
     per_anchor = 5 * C * bytes_per_value + 4 * 4 + 4
     everything = visible * per_anchor + 12 * anchors * len(swarm[0])
     once = touched.sum() * (C * bytes_per_value + 4) + anchors * (C * bytes_per_value + 16)
-    return Work(visible * (25.0 * C + 220.0), float(everything), float(once))
+    return EvaluationWork(visible * (25.0 * C + 220.0), float(everything), float(once))
 
 
 def median_ms(device: Device, prepare: Callable[[], None], run: Callable[[], None]) -> float:

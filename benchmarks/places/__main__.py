@@ -25,7 +25,7 @@ from benchmarks.common.named_errors import named_errors, needs_torch
 with needs_torch():
     from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS
     from benchmarks.places.rivals import RIVALS, unavailable
-    from benchmarks.places.run import Plan, chosen_cells, run
+    from benchmarks.places.run import PlacesPlan, chosen_cells, run
     from benchmarks.places.table import draw, markdown, read_results, write_json
     from benchmarks.places.worlds import PLACES
 
@@ -48,11 +48,13 @@ def main() -> None:
     parser.add_argument("--plot", type=output, help="PNG of the errors")
     args = parser.parse_args()
     wanted = chosen_cells(args.places or (), args.conditions or (), args.heights or ())
-    plan = Plan(args.folder, args.frames, args.width, tuple(args.methods or RIVALS), tuple(wanted))
+    plan = PlacesPlan(
+        args.folder, args.frames, args.width, tuple(args.methods or RIVALS), tuple(wanted)
+    )
     (_run if args.what == "run" else _table)(plan, args)
 
 
-def _run(plan: Plan, args: argparse.Namespace) -> None:
+def _run(plan: PlacesPlan, args: argparse.Namespace) -> None:
     left_out = {m: why for m in plan.methods if (why := unavailable(m))}
     for why in left_out.values():
         print(f"left out: {why}")
@@ -64,7 +66,7 @@ def _run(plan: Plan, args: argparse.Namespace) -> None:
     print(f"{len(plan.cells) - left} of {len(plan.cells)} sequences done by all methods")
 
 
-def _table(plan: Plan, args: argparse.Namespace) -> None:
+def _table(plan: PlacesPlan, args: argparse.Namespace) -> None:
     plan = replace(plan, methods=tuple(m for m in plan.methods if plan.has_any(m)))
     results = read_results(plan)
     text = markdown(plan, results)

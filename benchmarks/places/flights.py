@@ -14,20 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.places.worlds import LIVE, OUTDATED, PLACES, Place, PlaceFolder
+from benchmarks.places.worlds import LIVE, OUTDATED, PLACES, GeneratedPlace, PlaceFolder
 from localizer.evaluation.sequences import Sequence, load_sequence
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import sample_appearance
-from sitl.camera.realism import Stamps
+from sitl.camera.realism import CameraClock
 from sitl.camera.traffic import traffic
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.budget import draw_errors
 from sitl.demo.kinematic import camera_path
-from sitl.demo.scenario import Leg, Scenario
+from sitl.demo.scenario import Scenario, ScenarioLeg
 from sitl.demo.sequence import record_sequence
 
 CONDITIONS = ("day", "dusk", "night", "fog", "rain/snow", "season")
@@ -43,7 +43,7 @@ _BEGIN_S = 2.0  # the vehicle has gathered speed
 class Cell:
     """One sequence of the table."""
 
-    place: Place
+    place: GeneratedPlace
     condition: str
     height: str
 
@@ -77,7 +77,7 @@ class Cell:
         height, pitches = HEIGHT_M[self.height], _PITCH_DEG[self.height]
         ends = ((0.0, 70.0), (60.0, 70.0), (60.0, -70.0))
         legs = tuple(
-            Leg(east_m=e, north_m=n, height_m=height, gimbal_pitch_deg=pitches[k % 2])
+            ScenarioLeg(east_m=e, north_m=n, height_m=height, gimbal_pitch_deg=pitches[k % 2])
             for k, (e, n) in enumerate(ends)
         )
         return Scenario(takeoff_height_m=height, speed_m_s=8.0, legs=legs, cars=8, people=8)
@@ -124,7 +124,7 @@ def _record(cell: Cell, home: PlaceFolder, out: Path, frames: int) -> None:
     movers = traffic(home.world, frame, cars=scenario.cars, people=scenario.people, seed=seed)
     begin = path[0][0] + round((_BEGIN_S + first_frame(cell, frames) / _RATE_HZ) * 1e9)
     times_ns = [begin + round(k * 1e9 / _RATE_HZ) for k in range(frames)]
-    stamps, told = Stamps(errors.realism, seed), scenario.camera.camera()
+    stamps, told = CameraClock(errors.realism, seed), scenario.camera.camera()
     with TileStreamer(TileCache.open(home.seen_cache)) as streamer:
         options = CameraOptions(movers, seed=seed, realism=errors.realism)
         camera = WorldCamera(NumbaRenderer(streamer, 1), errors.camera, appearance, options)

@@ -34,9 +34,9 @@ from localizer.geometry.pose import Array, Pose
 from localizer.integrity.acceptance import is_acceptable
 from localizer.registration import JNGO, Registration
 from localizer.tracking.motion import (
+    AuxiliarySensors,
     MeasuredMotion,
     MotionConfig,
-    OtherSensors,
     mahalanobis_squared,
 )
 from localizer.tracking.opening import MapStack
@@ -49,18 +49,18 @@ from localizer.tracking.pipeline import (
 from localizer.types import PosePrior, TrackingState
 
 with needs_torch():
-    from benchmarks.basin.views import View
+    from benchmarks.basin.views import BasinView
     from benchmarks.integrity.beginnings import beginnings
     from benchmarks.places.flights import FULL, Cell, sequence_of, true_path
     from benchmarks.places.rivals import PASSES, stack_of
     from benchmarks.places.run import PRIOR
     from benchmarks.places.turns import ToldTurns
-    from benchmarks.places.worlds import Place, PlaceFolder, open_place
+    from benchmarks.places.worlds import GeneratedPlace, PlaceFolder, open_place
 
 PLACES = (
-    Place("village", 3_200_001),
-    Place("dense town", 3_200_002, "dense"),
-    Place("hills", 3_200_003, relief_m=90.0),
+    GeneratedPlace("village", 3_200_001),
+    GeneratedPlace("dense town", 3_200_002, "dense"),
+    GeneratedPlace("hills", 3_200_003, relief_m=90.0),
 )
 COLUMNS = (
     "prediction", "frames", "refused by the gate alone", "where the truth is refused, too",
@@ -75,7 +75,7 @@ _WRONG = 3.0  # beyond so many metres or degrees
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedFrame:
     """One frame of a row. distance, of_truth: squared, of the registration and of the true pose
     from the prediction; good: it passed every other test; reach (2,): metres, degrees.
     """
@@ -118,8 +118,8 @@ def tracked(
     home: PlaceFolder,
     sequence: Recorded,
     config: LocalizerConfig,
-    sensors: OtherSensors,
-) -> list[Judged]:
+    sensors: AuxiliarySensors,
+) -> list[JudgedFrame]:
     """Ours over a sequence, every frame with its prediction."""
     stack = stack_of(home.map_cache, config)
     optimizer = _Heard(config.registration, threads=1)
@@ -146,17 +146,17 @@ def tracked(
             found = optimizer.newest
             spread = ahead.covariance + found.covariance
             judged.append(
-                Judged(
+                JudgedFrame(
                     index,
                     ahead,
-                    seen.standing.state is TrackingState.TRACKING,
+                    seen.track_status.state is TrackingState.TRACKING,
                     estimate.accepted,
                     is_acceptable(config.integrity, found, 0.0),
                     truth.distance_to(found.world_from_camera),
                     mahalanobis_squared(ahead, found.world_from_camera, found.covariance),
                     mahalanobis_squared(ahead, truth, found.covariance),
                     truth.distance_to(estimate.world_from_camera),
-                    _reach(spread, config.integrity.gate),
+                    _reach(spread, config.integrity.chi2_threshold),
                 )
             )
     finally:
@@ -203,10 +203,10 @@ def intruders(
             stack.close()
 
 
-def _view(home: PlaceFolder, sequence: Recorded, index: int) -> View:
+def _view(home: PlaceFolder, sequence: Recorded, index: int) -> BasinView:
     camera = working_camera(sequence.camera, 320)
     picture = Undistorter(sequence.camera, camera)(sequence.frame(index))
-    return View(home.map_cache, picture, sequence.truth[index], camera, "day", 0.0)
+    return BasinView(home.map_cache, picture, sequence.truth[index], camera, "day", 0.0)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Counted:
     how many.
     """
 
-    judged: list[Judged]
+    judged: list[JudgedFrame]
     let_in: Array
 
 
@@ -227,20 +227,20 @@ def measured(cell: Cell, cells: Sequence[Cell], folder: Path, frames: int) -> di
         home = open_place(c.place, folder, c.seen)
         sequences[c] = home, sequence_of(c, home, folder, frames)
     home, sequence = sequences[cell]
-    told = OtherSensors(ToldTurns(true_path(cell, home), cell.seed).rotation)
+    told = AuxiliarySensors(ToldTurns(true_path(cell, home), cell.seed).rotation)
     base = LocalizerConfig(width=320, threads=1, renderer="numba", device="cpu")
     attack = list(intruders(cell, sequences, base))
     rows = {}
     for name, sigma in {**_ROWS, _TURNS: 1.0}.items():
         motion = MotionConfig(angular_acceleration_sigma=sigma)
         config = base.model_copy(update={"motion": motion})
-        sensors = told if name == _TURNS else OtherSensors()
+        sensors = told if name == _TURNS else AuxiliarySensors()
         judged = tracked(cell, home, sequence, config, sensors)
-        rows[name] = Counted(judged, _let_in(judged, attack, base.integrity.gate))
+        rows[name] = Counted(judged, _let_in(judged, attack, base.integrity.chi2_threshold))
     return rows
 
 
-def _let_in(judged: Sequence[Judged], attack: Sequence[Intruder], gate: float) -> Array:
+def _let_in(judged: Sequence[JudgedFrame], attack: Sequence[Intruder], gate: float) -> Array:
     at = {j.index: j.prediction for j in judged if j.tracking}
     counts = np.zeros((2, 2), int)
     for i in (i for i in attack if i.index in at):
@@ -284,7 +284,7 @@ def main() -> None:
     with ProcessPoolExecutor(args.processes) as pool:
         futures = [pool.submit(measured, c, cells, args.folder, args.frames) for c in cells]
         done = [future.result() for future in futures]
-    gate = LocalizerConfig().integrity.gate
+    gate = LocalizerConfig().integrity.chi2_threshold
     lines = [line(name, [rows[name] for rows in done], gate) for name in done[0]]
     print(f"| {' | '.join(COLUMNS)} |")
     print("|---" * len(COLUMNS) + "|")

@@ -28,7 +28,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.registration import JNGO, JNGOConfig, select_anchors
 from localizer.render.holes import fill_holes
 from localizer.tracking import motion
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer, Undistorter, working_camera
 from localizer.types import (
@@ -65,7 +65,7 @@ class Setting:
 
     camera: Camera
     config: LocalizerConfig
-    sensors: OtherSensors = field(default_factory=OtherSensors)
+    sensors: AuxiliarySensors = field(default_factory=AuxiliarySensors)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Ours:
 
 
 @dataclass(frozen=True)
-class Answer:
+class RivalPose:
     """A rival's pose of a frame with the covariance (6, 6) that the motion filter is told."""
 
     pose: Pose
@@ -103,7 +103,7 @@ class Answer:
 
 
 # (reference view, the frame's working picture, prediction, frame's number) -> answer or none
-Step = Callable[[RenderedView, Image, PosePrior, int], Answer | None]
+Step = Callable[[RenderedView, Image, PosePrior, int], RivalPose | None]
 
 
 class Rendered:
@@ -149,11 +149,11 @@ class Rendered:
 def _matching(method: Method) -> Step:
     """A matcher's step: an answer unless it fell back to the prior."""
 
-    def step(view: RenderedView, image: Image, prior: PosePrior, seed: int) -> Answer | None:
+    def step(view: RenderedView, image: Image, prior: PosePrior, seed: int) -> RivalPose | None:
         pose = method(view, image, prior, seed)
         if pose is prior.world_from_camera:
             return None
-        return Answer(pose, np.diag(_MATCHED_SIGMA**2))
+        return RivalPose(pose, np.diag(_MATCHED_SIGMA**2))
 
     return step
 
@@ -194,7 +194,7 @@ def flow_pnp(view: RenderedView, query: Image, prior: PosePrior, seed: int) -> P
 
 
 @dataclass(frozen=True)
-class Direct:
+class DirectRival:
     """One JNGO configuration as a rival, on the network's levels alone.
 
     motion: whether Eq. 10's term is used. least: sigmas (6,) that the prior has at least, for one
@@ -210,7 +210,7 @@ class Direct:
 
     def __call__(
         self, view: RenderedView, image: Image, prior: PosePrior, seed: int
-    ) -> Answer | None:
+    ) -> RivalPose | None:
         """One registration."""
         with self.active():
             reference = self.extractor.extract(fill_holes(view))
@@ -223,7 +223,7 @@ class Direct:
             )  # fmt: skip
         if found.status is not RegistrationStatus.OK:
             return None
-        return Answer(found.world_from_camera, found.covariance)
+        return RivalPose(found.world_from_camera, found.covariance)
 
 
 def _paper(stack: MapStack, setting: Setting) -> Tracking:
@@ -233,7 +233,7 @@ def _paper(stack: MapStack, setting: Setting) -> Tracking:
     variant = paper_rows()[-1]
     extractor = load_extractor(setting.config.model, threads=1)
     least = np.repeat([1.0, np.radians(5.0)], 3)  # N(0, 1 m), and +-11 degrees at 2.2 sigma
-    step = Direct(extractor, variant.optimizer(), variant.anchors, True, least, variant.active)
+    step = DirectRival(extractor, variant.optimizer(), variant.anchors, True, least, variant.active)
     return Rendered(stack, setting, step)
 
 
@@ -244,7 +244,7 @@ def _pixloc(stack: MapStack, setting: Setting) -> Tracking:
         swarm_anchors=(2000, 2000, 2000), distinct_px=0.0, preselected=0,
     )  # fmt: skip
     extractor = load_extractor(setting.config.model, threads=1)
-    step = Direct(extractor, JNGO(config, threads=1), 2000, False, np.zeros(6))
+    step = DirectRival(extractor, JNGO(config, threads=1), 2000, False, np.zeros(6))
     return Rendered(stack, setting, step)
 
 
@@ -252,7 +252,9 @@ def _gradient(stack: MapStack, setting: Setting) -> Tracking:
     """Ours, with hand-made features in the network's place, and without the votes of the image's
     parts: their limits were drawn for the network's features and refuse right poses of these.
     """
-    no_votes = setting.config.integrity.model_copy(update={"min_parts": 0, "min_agreement": 0.0})
+    no_votes = setting.config.integrity.model_copy(
+        update={"min_patches": 0, "min_patch_inlier_ratio": 0.0}
+    )
     config = setting.config.model_copy(update={"integrity": no_votes})
     localizer = Localizer(
         stack.renderer, DetailExtractor(GradientExtractor()), JNGO(config.registration, threads=1),

@@ -19,13 +19,13 @@ from benchmarks.places.worlds import open_place
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Perturbation
 from localizer.evaluation.sequences import Sequence as Recorded
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 
 PRIOR = Perturbation(10.0, 10.0)  # of the first frame, in metres and degrees, as the paper's
 
 
 @dataclass(frozen=True)
-class Plan:
+class PlacesPlan:
     """What is run. folder: of worlds, sequences and results; frames: of each sequence."""
 
     folder: Path
@@ -60,7 +60,7 @@ def chosen_cells(
     ]
 
 
-def run(plan: Plan, processes: int, minutes: float) -> Iterator[str]:
+def run(plan: PlacesPlan, processes: int, minutes: float) -> Iterator[str]:
     """Runs what is missing, a sequence with all its methods at a time; yields what was done.
 
     minutes: after which no new sequence is begun.
@@ -79,19 +79,19 @@ def run(plan: Plan, processes: int, minutes: float) -> Iterator[str]:
                 yield futures[future].name
 
 
-def _in_time(plan: Plan, cell: Cell, until_s: float) -> bool:
+def _in_time(plan: PlacesPlan, cell: Cell, until_s: float) -> bool:
     if time.time() > until_s:
         return False
     run_cell(plan, cell)
     return True
 
 
-def run_cell(plan: Plan, cell: Cell) -> None:
+def run_cell(plan: PlacesPlan, cell: Cell) -> None:
     """Every method that is missing on one sequence, all on the same pictures."""
     cv2.setNumThreads(1)
     home = open_place(cell.place, plan.folder, cell.seen)
     sequence = sequence_of(cell, home, plan.folder, plan.frames)
-    sensors = OtherSensors(ToldTurns(true_path(cell, home), cell.seed).rotation)
+    sensors = AuxiliarySensors(ToldTurns(true_path(cell, home), cell.seed).rotation)
     for method in plan.missing(cell):
         config = LocalizerConfig(width=plan.width, threads=1, renderer="numba", device="cpu")
         document = {
@@ -108,7 +108,7 @@ def run_cell(plan: Plan, cell: Cell) -> None:
 
 def localized(
     method: str, map_cache: Path, sequence: Recorded, config: LocalizerConfig, seed: int,
-    sensors: OtherSensors,
+    sensors: AuxiliarySensors,
 ) -> dict[str, object]:  # fmt: skip
     """One method over one sequence: errors per frame (None: no answer) and processor time."""
     stack = stack_of(map_cache, config)

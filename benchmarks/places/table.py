@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.common.figures import write_figures
 from benchmarks.places.flights import CONDITIONS, HEIGHT_M, HEIGHTS
 from benchmarks.places.rivals import MISSING, OURS, RIVALS
-from benchmarks.places.run import PRIOR, Plan
+from benchmarks.places.run import PRIOR, PlacesPlan
 from benchmarks.places.worlds import PLACES
 from localizer.errors import SequenceError
 from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
@@ -53,7 +53,7 @@ class Result:
     cpu_ms: Array
 
 
-def read_results(plan: Plan) -> list[Result]:
+def read_results(plan: PlacesPlan) -> list[Result]:
     """Of the sequences that all of the plan's methods have done."""
     return [
         _read(plan.result(cell, method))
@@ -123,7 +123,7 @@ def _blocks(results: Sequence[Result]) -> list[Array]:
     return [_errors([r for r in results if r.place == p]) for p in places]
 
 
-def write_json(plan: Plan, results: Sequence[Result], folder: Path) -> None:
+def write_json(plan: PlacesPlan, results: Sequence[Result], folder: Path) -> None:
     """The tables that the documentation keeps: the whole one, and medians and R@3 by group."""
     folder.mkdir(parents=True, exist_ok=True)
     mine = {m: [r for r in results if r.method == m] for m in plan.methods}
@@ -153,7 +153,7 @@ def groups(results: Sequence[Result]) -> dict[str, list[Result]]:
     return {name: members for name, members in found.items() if members}
 
 
-def markdown(plan: Plan, results: Sequence[Result]) -> str:
+def markdown(plan: PlacesPlan, results: Sequence[Result]) -> str:
     """What was run, the whole table, then median and R@3 by condition, place and height."""
     if not results:
         return "No sequence has been done by all methods yet.\n"
@@ -218,7 +218,7 @@ def _with_interval(value: float | None, between: tuple[float, float] | None, dig
     return f"{value:.{digits}f} [{between[0]:.{digits}f}, {between[1]:.{digits}f}]"
 
 
-def draw(plan: Plan, results: Sequence[Result], path: Path) -> None:
+def draw(plan: PlacesPlan, results: Sequence[Result], path: Path) -> None:
     """Share of all frames within an error, a curve for each method, a panel for each condition."""
     import matplotlib
 

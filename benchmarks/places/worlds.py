@@ -23,7 +23,7 @@ _YEARS = Changes(gone=0.08, rebuilt=0.08, new=0.08, felled=0.15)
 
 
 @dataclass(frozen=True)
-class Place:
+class GeneratedPlace:
     """A generated place; the seeds are of no training, test or demo."""
 
     name: str
@@ -38,12 +38,12 @@ class Place:
 
 
 PLACES = (
-    Place("village", 3_100_001),
-    Place("dense town", 3_100_002, "dense"),
-    Place("industrial", 3_100_003, "industrial"),
-    Place("fields", 3_100_004, "fields"),
-    Place("forest", 3_100_005, "forest"),
-    Place("hills", 3_100_006, relief_m=90.0),
+    GeneratedPlace("village", 3_100_001),
+    GeneratedPlace("dense town", 3_100_002, "dense"),
+    GeneratedPlace("industrial", 3_100_003, "industrial"),
+    GeneratedPlace("fields", 3_100_004, "fields"),
+    GeneratedPlace("forest", 3_100_005, "forest"),
+    GeneratedPlace("hills", 3_100_006, relief_m=90.0),
 )
 
 
@@ -51,13 +51,13 @@ PLACES = (
 class PlaceFolder:
     """A place on disk. map_cache: what every method gets; seen_cache: what the camera sees."""
 
-    place: Place
+    place: GeneratedPlace
     world: WorldInfo
     map_cache: Path
     seen_cache: Path
 
 
-def visits(place: Place) -> dict[str, Visit]:
+def visits(place: GeneratedPlace) -> dict[str, Visit]:
     """The survey and both later visits, drawn from the place's seed."""
     config = place.config
     survey, live = surveyed_and_lived(config)
@@ -67,7 +67,7 @@ def visits(place: Place) -> dict[str, Visit]:
     return {SURVEY: survey, LIVE: live, OUTDATED: Visit(OUTDATED, look, changes)}
 
 
-def open_place(place: Place, folder: Path, seen: str, processes: int = 1) -> PlaceFolder:
+def open_place(place: GeneratedPlace, folder: Path, seen: str, processes: int = 1) -> PlaceFolder:
     """Build what is missing of a place as seen at one visit; the rest is reused."""
     home = folder / "worlds" / f"{place.name.replace(' ', '-')}-{place.seed}"
     wanted = {name: visit for name, visit in visits(place).items() if name in (SURVEY, seen)}

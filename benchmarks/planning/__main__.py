@@ -25,7 +25,7 @@ from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.planning.report import COLUMNS, fitted, rows_of, summary
-from benchmarks.planning.run import Flown, read, run_world
+from benchmarks.planning.run import FlownLeg, read, run_world
 from localizer.forecast.risk import RISK_LIMIT, SIGMA
 from localizer.synth.config import Character
 from sitl.demo.assets import prepare
@@ -62,7 +62,7 @@ def parser() -> Parser:
     return p
 
 
-def report(legs: list[Flown]) -> dict[str, Any]:
+def report(legs: list[FlownLeg]) -> dict[str, Any]:
     """All legs, and by condition and world."""
     parts = {"all": legs}
     for key in ("condition", "world"):

@@ -22,7 +22,7 @@ _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @dataclass(frozen=True)
-class Leg:
+class TestLeg:
     """A straight way at one height. start: (3,) ENU; height_m: above the ground at its start."""
 
     number: int
@@ -44,7 +44,7 @@ class Leg:
 
 def draw_legs(
     seed: int, size_m: float, count: int, ground: Callable[[float, float], float]
-) -> list[Leg]:
+) -> list[TestLeg]:
     """The legs of a world; ground: height (m) of its terrain at east and north."""
     rng = np.random.default_rng((83, seed))
     legs = []
@@ -54,7 +54,7 @@ def draw_legs(
         half = 0.49 * size_m
         low = ground(*np.clip([east, north], -half, half))
         legs.append(
-            Leg(
+            TestLeg(
                 number,
                 CONDITIONS[number % len(CONDITIONS)],
                 np.array([east, north, low + height]),

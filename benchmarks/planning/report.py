@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from scipy.stats import rankdata, spearmanr
 
 from benchmarks.planning.legs import FORECASTS, PICTURES
-from benchmarks.planning.run import Flown, Picture
+from benchmarks.planning.run import FlownLeg, RegisteredFrame
 from localizer.forecast.risk import (
     RIGHT_M,
     RISK_LIMIT,
@@ -38,12 +38,12 @@ _STUDENT = 4.0  # degrees of freedom
 _CHI2_MEDIAN = 0.789  # of a third of chi-square with three degrees of freedom
 
 
-def failed(picture: Picture) -> bool:
+def failed(picture: RegisteredFrame) -> bool:
     """Refused, or more than 1 m off."""
     return not picture.accepted or picture.error_m > RIGHT_M
 
 
-def is_bad(leg: Flown) -> bool:
+def is_bad(leg: FlownLeg) -> bool:
     """Whether the leg did fail."""
     return float(np.mean([failed(p) for p in leg.pictures])) > FAILED_SHARE
 
@@ -72,7 +72,7 @@ class Scored:
 
     @classmethod
     def of(
-        cls, leg: Flown, sigma: tuple[float, float], weights: Sequence[float] = WEIGHTS
+        cls, leg: FlownLeg, sigma: tuple[float, float], weights: Sequence[float] = WEIGHTS
     ) -> Scored:
         """Under the constants of sigma and the weights of the risk."""
         told = [failure_risk(f, weights) for f in leg.figures]
@@ -110,7 +110,7 @@ def area(legs: Sequence[Scored]) -> float:
     return auc(np.array([x.risk for x in legs]), np.array([x.bad for x in legs]))
 
 
-def paired(leg: Flown) -> list[tuple[Figures, Picture]]:
+def paired(leg: FlownLeg) -> list[tuple[Figures, RegisteredFrame]]:
     """Each picture with the forecast nearest to it."""
     each = PICTURES // FORECASTS
     return [(leg.figures[k // each], p) for k, p in enumerate(leg.pictures)]
@@ -136,7 +136,9 @@ def rank_correlation(legs: Sequence[Scored]) -> float:
     return float(spearmanr(*pairs.T).statistic)
 
 
-def summary(legs: Sequence[Flown], sigma: tuple[float, float], threshold: float) -> dict[str, Any]:
+def summary(
+    legs: Sequence[FlownLeg], sigma: tuple[float, float], threshold: float
+) -> dict[str, Any]:
     """All figures of some legs."""
     scored = [Scored.of(leg, sigma) for leg in legs]
     bad, risk = np.array([x.bad for x in scored]), np.array([x.risk for x in scored])
@@ -170,7 +172,7 @@ def rows_of(parts: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
     ]  # fmt: skip
 
 
-def _reliability(risk: Array, legs: Sequence[Flown]) -> list[dict[str, Any]]:
+def _reliability(risk: Array, legs: Sequence[FlownLeg]) -> list[dict[str, Any]]:
     """Forecast risk against the share of pictures that failed, by bins of risk."""
     shares = np.array([np.mean([failed(p) for p in leg.pictures]) for leg in legs])
     edges = (0.0, 0.05, 0.2, 0.5, 0.8, 1.0001)
@@ -189,7 +191,7 @@ def _reliability(risk: Array, legs: Sequence[Flown]) -> list[dict[str, Any]]:
     return rows
 
 
-def fitted(legs: Sequence[Flown]) -> dict[str, Any]:
+def fitted(legs: Sequence[FlownLeg]) -> dict[str, Any]:
     """`SIGMA` and `WEIGHTS` of these legs: ridge-regularized logistic regression; errors of
     Student's distribution with four degrees of freedom.
     """
@@ -215,7 +217,9 @@ def fitted(legs: Sequence[Flown]) -> dict[str, Any]:
     }
 
 
-def _spread(pairs: Sequence[tuple[Figures, Picture]], weights: Sequence[float]) -> list[float]:
+def _spread(
+    pairs: Sequence[tuple[Figures, RegisteredFrame]], weights: Sequence[float]
+) -> list[float]:
     """`SIGMA`: likeliest for what is accepted where vision is said to do, then scaled until half of
     the errors are below their median.
     """

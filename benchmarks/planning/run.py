@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.planning.legs import FORECASTS, PICTURES, Leg, draw_legs
+from benchmarks.planning.legs import FORECASTS, PICTURES, TestLeg, draw_legs
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
 from localizer.features import load_extractor
@@ -38,7 +38,7 @@ _BYTES = 96 * 2**20
 
 
 @dataclass(frozen=True)
-class Picture:
+class RegisteredFrame:
     """One picture of the other visit, registered. error_m: of the position, at most `WORST_M`;
     sigma_m: as the registration tells it, one axis.
     """
@@ -49,7 +49,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Flown:
+class FlownLeg:
     """A leg: what was forecast at `FORECASTS` places, and what `PICTURES` pictures gave."""
 
     world: str
@@ -60,7 +60,7 @@ class Flown:
     figures: tuple[Figures, ...]
     rivals: tuple[float, ...]
     textures: tuple[float, ...]
-    pictures: tuple[Picture, ...]
+    pictures: tuple[RegisteredFrame, ...]
 
 
 class LegFlyer:
@@ -85,7 +85,7 @@ class LegFlyer:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def fly(self, world: str, leg: Leg) -> Flown:
+    def fly(self, world: str, leg: TestLeg) -> FlownLeg:
         """Both, of one leg."""
         forecaster = Forecaster(
             self._map, self._extractor, self._optimizer, leg.camera, self._config
@@ -101,7 +101,7 @@ class LegFlyer:
             camera = working_camera(leg.camera, self._config.width)
             live = self._live.render(pose, camera, wait=True)
             pictures.append(self._registered(forecaster, pose, live, look, rng))
-        return Flown(
+        return FlownLeg(
             world, leg.number, leg.condition, leg.height_m, leg.pitch_deg,
             tuple(p.figures for p in places),
             tuple(p.rival.share for p in places),
@@ -116,11 +116,11 @@ class LegFlyer:
         live: RenderedView,
         look: Any,
         rng: np.random.Generator,
-    ) -> Picture:
+    ) -> RegisteredFrame:
         prior = prior_of(pose, rng)
         reference = self._map.render(prior.world_from_camera, live.camera, wait=True)
         if (reference.depth > 0).mean() < LEAST_MAP:
-            return Picture(accepted=False, error_m=WORST_M, sigma_m=WORST_M)
+            return RegisteredFrame(accepted=False, error_m=WORST_M, sigma_m=WORST_M)
         anchors = reference_anchors(
             reference, self._extractor, self._config.anchors, self._config.seed
         )
@@ -128,7 +128,7 @@ class LegFlyer:
         found = self._optimizer.register(query, live.camera, anchors, prior)
         error = found.world_from_camera.distance_to(pose)[0]
         accepted = forecaster.is_accepted(found, prior)
-        return Picture(accepted, float(min(error, WORST_M)), position_sigma_m(found))
+        return RegisteredFrame(accepted, float(min(error, WORST_M)), position_sigma_m(found))
 
 
 def _weathered(live: RenderedView, look: Any, rng: np.random.Generator) -> Image:
@@ -157,7 +157,7 @@ def run_world(assets: FlightAssets, count: int, path: Path, more_time: Callable[
     return len(left)
 
 
-def read(path: Path) -> list[Flown]:
+def read(path: Path) -> list[FlownLeg]:
     """The legs of a file; a line that an interrupt cut short is left out."""
     flown = []
     for line in path.read_text().splitlines():
@@ -167,9 +167,9 @@ def read(path: Path) -> list[Flown]:
             continue
         try:
             row["figures"] = tuple(Figures(**f) for f in row["figures"])
-            row["pictures"] = tuple(Picture(**p) for p in row["pictures"])
+            row["pictures"] = tuple(RegisteredFrame(**p) for p in row["pictures"])
             row["rivals"], row["textures"] = tuple(row["rivals"]), tuple(row["textures"])
-            flown.append(Flown(**row))
+            flown.append(FlownLeg(**row))
         except (KeyError, TypeError) as error:
             raise SequenceError(
                 f"{path}: not a file of this benchmark ({error}): begin anew without it"

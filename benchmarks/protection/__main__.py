@@ -12,15 +12,15 @@ another day under made weather, quito (a real mesh), caliterra (real photos). Ea
 registered with a camera whose focal length, principal point and distortion are off as --lens has
 it: "careful", whose deployment states nothing of it, "calibrated", which states so much, or
 "overstated", which states the least that a calibration ever does. Map shift, lever arm and late
-stamps times speed are added (`draws.py`). The report fits the guardian's budget on the even views
+stamps times speed are added (`draws.py`). The report fits the monitor's budget on the even views
 and says how many errors of the odd ones are within the levels, with the exact 95 % interval; with
 the defaults of every view, too, which is a check where --seed drew other faults than those that the
 defaults were chosen on (0). A run goes on where its file ends.
 
 With --flights (folders of `python -m sitl loop` or `demo`) it counts how many positions lay inside
 the level that they had in flight: those that were injected, and those that were withheld or flown
-in shadow; and what the guardian said, by finding. With --replay their fixes and the vehicle's
-messages go through the guardian of now: what it would tell and withhold, and what the levels are
+in shadow; and what the monitor said, by finding. With --replay their fixes and the vehicle's
+messages go through the monitor of now: what it would tell and withhold, and what the levels are
 made of; with --calibrated as if their deployments had said when they were calibrated, with --lost 6
 as if no fix had come for 6 s after each 20 s: whatever is withheld then is a false alarm.
 """
@@ -39,10 +39,10 @@ from benchmarks.common.named_errors import named_errors
 from benchmarks.protection import flights, replayed
 from benchmarks.protection.draws import LENSES
 from benchmarks.protection.fit import RISKS, Coverage, along_axis, coverage, fitted, halves
-from benchmarks.protection.run import Outcome, run
-from companion.guardian.config import GuardianConfig, ProtectionConfig
+from benchmarks.protection.run import FaultOutcome, run
+from companion.integrity_monitor.config import IntegrityMonitorConfig, ProtectionConfig
 from companion.versions import made_by
-from mavlink_bridge.errors import RecordError
+from mavlink_bridge.errors import TlogError
 
 _COLUMNS = (
     "views, constants, risk", "within HPL", "within VPL", "HPL, VPL median, m", "worst / HPL",
@@ -69,18 +69,18 @@ def parser() -> Parser:
     return p
 
 
-def read(path: Path) -> list[Outcome]:
+def read(path: Path) -> list[FaultOutcome]:
     """The outcomes of a run."""
     rows = json.loads(path.read_text())
     return [_outcome(row) for row in rows]
 
 
-def _outcome(row: dict[str, Any]) -> Outcome:
+def _outcome(row: dict[str, Any]) -> FaultOutcome:
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
-    return Outcome(**given)
+    return FaultOutcome(**given)
 
 
-def report(outcomes: list[Outcome]) -> dict[str, Any]:
+def report(outcomes: list[FaultOutcome]) -> dict[str, Any]:
     """Constants of the even views, coverage of the odd ones: together and by set, and by what is
     configured by default; that of every view, too.
     """
@@ -109,7 +109,7 @@ def report(outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _by_set(outcomes: list[Outcome]) -> dict[str, list[Outcome]]:
+def _by_set(outcomes: list[FaultOutcome]) -> dict[str, list[FaultOutcome]]:
     several = len({o.lens for o in outcomes}) > 1
     named = [(f"{o.set} {o.lens}" if several else o.set, o) for o in outcomes]
     by = {name: [o for other, o in named if other == name] for name, _ in named}
@@ -139,7 +139,7 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
     for folder in folders:
         try:
             flown.append(flights.read_flight(folder))
-        except RecordError as error:
+        except TlogError as error:
             left_out[folder.name] = str(error)
             print(f"left out: {error}")
     found = flights.report(flown) | {"left_out": left_out}
@@ -151,14 +151,14 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
 def replay_flights(
     folders: list[Path], out: Path | None, *, calibrated: bool, lost_s: float
 ) -> None:
-    """Print what the guardian of now makes of flights; what cannot be replayed is named."""
+    """Print what the monitor of now makes of flights; what cannot be replayed is named."""
     protection = ProtectionConfig().of_camera(calibrated=calibrated)
-    config = GuardianConfig(protection=protection)
+    config = IntegrityMonitorConfig(protection=protection)
     flown, left_out = [], {}
     for folder in folders:
         try:
             flown.append(replayed.replay(folder, config, lost_s))
-        except RecordError as error:
+        except TlogError as error:
             left_out[str(folder)] = str(error)
             print(f"left out: {error}")
     found = replayed.report(flown) | {"left_out": left_out, "versions": made_by()}

@@ -19,7 +19,7 @@ SPEED_MPS = 15.0  # uniform up to it
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensSigmas:
     """One standard deviation of what a camera's numbers are off by: focal, share of the focal
     length; principal, per axis, share of the width; k1. stated: what the deployment says of it.
     """
@@ -35,9 +35,9 @@ class Lens:
 # calibrated: what `companion calibrate flight` was off by (0.087 % in fresh draws) and some drift.
 # overstated: the same lens, whose deployment states the least that a calibration ever states.
 LENSES = {
-    "careful": Lens(0.003, 0.002, 0.004, CalibrationSigmas()),
-    "calibrated": Lens(0.001, 0.0011, 0.003, CalibrationSigmas()),
-    "overstated": Lens(
+    "careful": LensSigmas(0.003, 0.002, 0.004, CalibrationSigmas()),
+    "calibrated": LensSigmas(0.001, 0.0011, 0.003, CalibrationSigmas()),
+    "overstated": LensSigmas(
         0.001, 0.0011, 0.003,
         CalibrationSigmas(focal_percent=0.05, principal_percent=0.05, distortion=0.001, stamp_ms=2),
     ),
@@ -45,7 +45,7 @@ LENSES = {
 
 
 @dataclass(frozen=True)
-class Fault:
+class InstallationFault:
     """One installation's errors. focal: share by which the calibration is long; principal: (2,)
     shares of the width; map_m: east, north, up by which the map lies off; arm_m: the lever arm's
     error, boresight included, body axes turned any way; late_s: of the stamps; velocity: east,
@@ -81,14 +81,16 @@ class Fault:
         )
 
 
-def drawn(rng: np.random.Generator, lens: Lens, *, focal: float | None = None) -> Fault:
+def drawn(
+    rng: np.random.Generator, lens: LensSigmas, *, focal: float | None = None
+) -> InstallationFault:
     """A fault. focal: instead of a drawn one."""
     share = float(rng.normal(0.0, lens.focal))
     x, y = (float(p) for p in rng.normal(0.0, lens.principal, 2))
     east, north, up = (float(m) for m in rng.normal(0.0, MAP_M))
     arm = rng.normal(0.0, ARM_M, 3) + np.radians(rng.normal(0.0, BORESIGHT_DEG, 3)) * 0.3
     speed, course = rng.uniform(0.0, SPEED_MPS), rng.uniform(0.0, 2.0 * np.pi)
-    return Fault(
+    return InstallationFault(
         share if focal is None else focal,
         (x, y),
         float(rng.normal(0.0, lens.k1)),

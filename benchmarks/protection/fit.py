@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import beta
 
-from benchmarks.protection.run import Outcome
-from companion.guardian.config import ProtectionConfig
-from companion.guardian.protection import budget
+from benchmarks.protection.run import FaultOutcome
+from companion.integrity_monitor.config import ProtectionConfig
+from companion.integrity_monitor.protection import budget
 
 RISKS = (0.05, 0.01, 1e-3)
 _STARTS = (0.3, 0.005, 0.01)
@@ -28,24 +28,24 @@ class Fitted:
     time_bias_s: float
 
     def config(self, risk: float) -> ProtectionConfig:
-        """As the guardian takes it, whatever the lens."""
+        """As the monitor takes it, whatever the lens."""
         share = self.calibration_share
         return ProtectionConfig(risk=risk, calibrated_share=share, **asdict(self))
 
 
-def halves(outcomes: Sequence[Outcome]) -> tuple[list[Outcome], list[Outcome]]:
+def halves(outcomes: Sequence[FaultOutcome]) -> tuple[list[FaultOutcome], list[FaultOutcome]]:
     """Accepted frames by view, even and odd: no picture is in both."""
     used = [o for o in outcomes if o.accepted]
     return [o for o in used if o.view % 2 == 0], [o for o in used if o.view % 2]
 
 
-def total_m(outcome: Outcome) -> tuple[float, float]:
+def total_m(outcome: FaultOutcome) -> tuple[float, float]:
     """Horizontal and vertical error, all sources together, metres."""
     east, north, up = (a + b for a, b in zip(outcome.error_m, outcome.beside_m, strict=True))
     return float(np.hypot(east, north)), abs(up)
 
 
-def fitted(outcomes: Sequence[Outcome]) -> Fitted:
+def fitted(outcomes: Sequence[FaultOutcome]) -> Fitted:
     """Greatest likelihood: per axis a normal error of the summed variances."""
     squared = np.array([_squares(o) for o in outcomes])
     given = np.array([[o.sigma_m[0] ** 2, o.sigma_m[1] ** 2] for o in outcomes])
@@ -66,7 +66,7 @@ def fitted(outcomes: Sequence[Outcome]) -> Fitted:
     return Fitted(across, up, share, late)
 
 
-def _squares(outcome: Outcome) -> tuple[float, float]:
+def _squares(outcome: FaultOutcome) -> tuple[float, float]:
     horizontal, vertical = total_m(outcome)
     return horizontal**2, vertical**2
 
@@ -88,7 +88,7 @@ class Coverage:
     worst_share: float
 
 
-def coverage(outcomes: Sequence[Outcome], config: ProtectionConfig) -> Coverage:
+def coverage(outcomes: Sequence[FaultOutcome], config: ProtectionConfig) -> Coverage:
     """How often the error is within the level at the configured risk."""
     levels = np.array([_level(o, config) for o in outcomes])
     errors = np.array([total_m(o) for o in outcomes])
@@ -102,7 +102,7 @@ def coverage(outcomes: Sequence[Outcome], config: ProtectionConfig) -> Coverage:
     )  # fmt: skip
 
 
-def _level(o: Outcome, config: ProtectionConfig) -> tuple[float, float]:
+def _level(o: FaultOutcome, config: ProtectionConfig) -> tuple[float, float]:
     """By the budget of its lens, as the flight's table chooses it by the deployment."""
     config = config.of_camera(calibrated=o.lens != "careful")
     return budget(o.sigma_m, o.height_m, (o.speed_mps, 0.0), config)
@@ -115,7 +115,7 @@ def exact_interval(hits: int, count: int) -> tuple[float, float]:
     return low, high
 
 
-def along_axis(outcomes: Sequence[Outcome]) -> tuple[float, float]:
+def along_axis(outcomes: Sequence[FaultOutcome]) -> tuple[float, float]:
     """Of a focal length that is long by `focal`: by how many times focal x depth the position is
     behind along the optical axis, median, and the median of what is left across, same units.
     """

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.protection.fit import exact_interval
-from companion.guardian.findings import RULES, Action
-from mavlink_bridge.errors import RecordError
+from companion.integrity_monitor.alert_rules import RULES, OutputAction
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.case import LoopCase, load_loop_cases
@@ -35,7 +35,7 @@ class Position:
 
 @dataclass(frozen=True)
 class FlownPositions:
-    """Those of one flight. normal: nothing was wrong in it. told: what the guardian found, by name
+    """Those of one flight. normal: nothing was wrong in it. told: what the monitor found, by name
     of the finding, and how often it was said.
     """
 
@@ -46,8 +46,8 @@ class FlownPositions:
 
     @property
     def was_withheld(self) -> bool:
-        """Whether the guardian withheld positions."""
-        return any(r.name in self.told for r in RULES if r.action is not Action.NONE)
+        """Whether the monitor withheld positions."""
+        return any(r.name in self.told for r in RULES if r.action is not OutputAction.NONE)
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ def read_flight(folder: Path) -> FlownPositions:
     case = _case(folder)
     if case is not None and any(case.wrong.map_shift_m):
         # The world camera films a shifted ground there: its poses are no truth.
-        raise RecordError(f"{folder}: the map was shifted, and frames.csv with it")
+        raise TlogError(f"{folder}: the map was shifted, and frames.csv with it")
     try:
         truth = _truth(folder / "frames.csv")
         rows = [
             row for path in sorted(folder.glob("companion*/estimates.csv")) for row in _rows(path)
         ]
     except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise RecordError(f"{folder}: not a flight's record: {error}") from error
+        raise TlogError(f"{folder}: not a flight's record: {error}") from error
     sent = _sent(folder / "flight.tlog")
     found = [position for row in rows if (position := _position(row, truth, sent)) is not None]
     normal = case.is_normal if case is not None else True
@@ -200,7 +200,7 @@ def _truth(path: Path) -> np.ndarray:
 
 
 def _told(folder: Path) -> dict[str, int]:
-    """How often each finding of the guardian was said, by the companion's events."""
+    """How often each finding of the monitor was said, by the companion's events."""
     rows = [row for path in sorted(folder.glob("companion*/events.csv")) for row in _rows(path)]
     said = {rule.name: sum(rule.is_line(row["text"]) for row in rows) for rule in RULES}
     return {name: count for name, count in said.items() if count}

@@ -37,7 +37,7 @@ _GRAZING = 0.1  # of a ray's unit length downwards, below which it meets the gro
 
 
 @dataclass(frozen=True)
-class Told:
+class FlightPositions:
     """The positions of a flight. errors: (N, 2) east and north; covariances: (N, 2, 2) without the
     map's share; shares: (N, 2, 2) of a map in patches of one metre.
     """
@@ -56,7 +56,7 @@ class Told:
         return float(np.mean(nees <= _CHI2_95)), float(likelihood.mean()), float(sigma)
 
 
-def read_told(folder: Path, recorded_m: float) -> Told:
+def read_told(folder: Path, recorded_m: float) -> FlightPositions:
     """A flight's folder. recorded_m: the length with which its bounds were told."""
     config = load_config(folder / "companion.yaml")
     try:
@@ -81,7 +81,7 @@ def read_told(folder: Path, recorded_m: float) -> Told:
         shares.append(share)
     if not errors:
         raise RecordError(f"{folder}: no accepted position above {_LOW_M:g} m")
-    return Told(folder.name, np.array(errors), np.array(covariances), np.array(shares))
+    return FlightPositions(folder.name, np.array(errors), np.array(covariances), np.array(shares))
 
 
 def _told(record: Path) -> list[tuple[int, Pose, Array]]:
@@ -118,7 +118,7 @@ def _share(unit: CalibrationSigmas, pose: Pose, camera: Camera, ground_m: float)
     return calibration_covariance(unit, points, pose, camera, None, still)[:2, :2]
 
 
-def table(flights: Sequence[Told], lengths_m: Sequence[float]) -> list[list[str]]:
+def table(flights: Sequence[FlightPositions], lengths_m: Sequence[float]) -> list[list[str]]:
     """A row for each flight and length, and for all flights together: each counts alike."""
     rows = []
     for name, some in [*((f.name, [f]) for f in flights), ("all", list(flights))]:

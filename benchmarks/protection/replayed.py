@@ -1,4 +1,4 @@
-"""Recorded flights through the guardian of now: what it would tell and withhold.
+"""Recorded flights through the monitor of now: what it would tell and withhold.
 
 The fixes are those of estimates.csv, handed over when they came; the vehicle is the flight.tlog.
 The pictures are not recorded, so the checks of them, and of the calibration, do not run.
@@ -18,14 +18,14 @@ import numpy as np
 
 from companion.conversions import camera_on_body
 from companion.flight.injection import JumpPolicy
-from companion.guardian.config import GuardianConfig
-from companion.guardian.findings import RULES
-from companion.guardian.monitor import Limits, Monitor
-from companion.guardian.protection import budget
+from companion.integrity_monitor.alert_rules import RULES
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.protection import budget
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import euler_from_matrix, matrix_from_quaternion
 from localizer.types import TrackingState
-from mavlink_bridge.errors import RecordError
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from mavlink_bridge.messages import (
     Attitude,
@@ -52,7 +52,7 @@ class Replayed:
 
     flight: str
     fixes: int
-    withheld: int
+    held: int
     widened: int
     told: dict[str, int]
     hpl_m: float
@@ -98,20 +98,22 @@ class _Recorded:
         return None  # the calibration watch does not run
 
 
-def replay(folder: Path, config: GuardianConfig | None = None, lost_s: float = 0.0) -> Replayed:
+def replay(
+    folder: Path, config: IntegrityMonitorConfig | None = None, lost_s: float = 0.0
+) -> Replayed:
     """A folder of `python -m sitl loop` or `demo`. RecordError says why it cannot be replayed.
 
     lost_s: so long after each `_LOST_EVERY_S` no fix came, and the next one announces itself.
     """
-    config = config or GuardianConfig()
+    config = config or IntegrityMonitorConfig()
     try:
         arrivals, since_utc_ns = _fixes(folder)
     except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise RecordError(f"{folder}: not a flight's record: {error!r}") from error
+        raise TlogError(f"{folder}: not a flight's record: {error!r}") from error
     if not arrivals:
-        raise RecordError(f"{folder}: no estimate in it has a protection level")
+        raise TlogError(f"{folder}: no estimate in it has a protection level")
     arrivals = _without(arrivals, lost_s)
-    vehicle, monitor = _Recorded(), Monitor(config, Limits())
+    vehicle, monitor = _Recorded(), IntegrityChecks(config, IntegrityLimits())
     told: Counter[str] = Counter()
     levels, parts = [], []
     waiting, step_ns = iter(arrivals), None
@@ -141,10 +143,10 @@ def replay(folder: Path, config: GuardianConfig | None = None, lost_s: float = 0
 
 def report(flights: Sequence[Replayed]) -> dict[str, Any]:
     """Each flight's, and all together."""
-    fixes, withheld = sum(f.fixes for f in flights), sum(f.withheld for f in flights)
+    fixes, held = sum(f.fixes for f in flights), sum(f.held for f in flights)
     rows = [_row(f) for f in flights]
-    quiet = sum(not f.told and not f.withheld for f in flights)
-    rows.append((f"{len(flights)} flights, {quiet} quiet", str(fixes), str(withheld), "", "", ""))
+    quiet = sum(not f.told and not f.held for f in flights)
+    rows.append((f"{len(flights)} flights, {quiet} quiet", str(fixes), str(held), "", "", ""))
     return {"replayed": [asdict(f) for f in flights], "columns": _COLUMNS, "rows": rows}
 
 
@@ -161,7 +163,9 @@ def _counted(
     )  # fmt: skip
 
 
-def _parts(fix: VisionFix, state: VehicleState, config: GuardianConfig) -> tuple[float, ...]:
+def _parts(
+    fix: VisionFix, state: VehicleState, config: IntegrityMonitorConfig
+) -> tuple[float, ...]:
     """What each source alone makes of a level, metres."""
     p = config.protection
     none = p.model_copy(
@@ -186,7 +190,7 @@ def _row(flight: Replayed) -> tuple[str, ...]:
     told = ", ".join(f"{name} {count}" for name, count in flight.told.items())
     shares = ", ".join(f"{100 * share:.0f}" for share in flight.shares.values())
     return (
-        flight.flight, str(flight.fixes), str(flight.withheld), told or "-",
+        flight.flight, str(flight.fixes), str(flight.held), told or "-",
         f"{flight.hpl_m:.2f}", shares,
     )  # fmt: skip
 

@@ -8,8 +8,8 @@ from itertools import groupby
 
 import numpy as np
 
-from benchmarks.basin.views import View
-from benchmarks.protection.draws import LENSES, Fault, drawn
+from benchmarks.basin.views import BasinView
+from benchmarks.protection.draws import LENSES, InstallationFault, drawn
 from localizer.config import LocalizerConfig
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
@@ -26,7 +26,7 @@ _PASSES = 2  # in flight each reference is rendered where the last frame was fou
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FaultOutcome:
     """One frame with one fault. error_m: east, north, up of the registration alone; beside_m: of
     map, lever arm and time; axis: the true optical axis; sigma_m: by the covariance, worst
     horizontal and vertical; depth_m: of the ground along the axis.
@@ -49,9 +49,9 @@ class Outcome:
 
 
 def run(
-    name: str, views: Sequence[View], draws: int, seed: int, focal: float | None, lens: str,
+    name: str, views: Sequence[BasinView], draws: int, seed: int, focal: float | None, lens: str,
     *, skip: int = 0,
-) -> Iterator[Outcome]:  # fmt: skip
+) -> Iterator[FaultOutcome]:  # fmt: skip
     """Every view from number `skip` on with so many faults; each view's are the same whatever else
     is run.
     """
@@ -76,12 +76,12 @@ def run(
 def _one(
     name: str,
     k: int,
-    view: View,
-    fault: Fault,
+    view: BasinView,
+    fault: InstallationFault,
     localizer: Localizer,
     depth_m: float,
     rng: np.random.Generator,
-) -> Outcome:
+) -> FaultOutcome:
     truth = view.truth
     start = Pose(
         so3_exp(np.radians(rng.normal(0.0, _START_DEG, 3))) @ truth.rotation,
@@ -94,7 +94,7 @@ def _one(
     P = estimate.covariance
     sigma = (float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])), float(np.sqrt(P[2, 2])))
     ax, ay, az = (float(a) for a in truth.rotation[:, 2])
-    return Outcome(
+    return FaultOutcome(
         name, k, view.condition, view.height, depth_m, view.camera.horizontal_fov_deg,
         float(np.hypot(*fault.velocity)), fault.focal, estimate.accepted, sigma,
         (east, north, up), fault.beside_m, (ax, ay, az),

@@ -27,8 +27,8 @@ from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.relocalization.run import (
     COLUMNS,
-    Outcome,
-    Search,
+    ViewOutcome,
+    ViewSearch,
     cells,
     run,
     table,
@@ -60,7 +60,7 @@ def parser() -> Parser:
 def main() -> None:
     args = parser().parse_args()
     if args.report:
-        rows = [Outcome(**row) for path in args.report for row in json.loads(path.read_text())]
+        rows = [ViewOutcome(**row) for path in args.report for row in json.loads(path.read_text())]
         print(table(rows))
         if args.json:
             write_figures(args.json, COLUMNS, cells(rows))
@@ -68,10 +68,10 @@ def main() -> None:
     config = with_threads(LocalizerConfig(), args.threads)
     views = load_views(args.set, args.cache, args.data, args.views)
     kept = json.loads(args.out.read_text()) if args.out and args.out.exists() else []
-    outcomes = [Outcome(**row) for row in kept]
+    outcomes = [ViewOutcome(**row) for row in kept]
     for known in {"known": (True,), "unknown": (False,), "both": (True, False)}[args.heading]:
         done = sum(o.heading_known is known for o in outcomes)
-        asked = Search(args.set, config, known, args.seed, args.on)
+        asked = ViewSearch(args.set, config, known, args.seed, args.on)
         for outcome in run(asked, views, args.first + done):
             outcomes.append(outcome)
             if args.out:  # after each one: an interrupted run keeps what it has

@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.basin.views import View, load_views
+from benchmarks.basin.views import BasinView, load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
-from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, Search, with_threads
+from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, ViewSearch, with_threads
 from localizer.config import LocalizerConfig
 from localizer.evaluation.places import KnownOfPlace
 from localizer.map.cache.cache import TileCache
@@ -66,7 +66,7 @@ class Beside:
 class _Hover:
     """The engine over one view whose camera stands still."""
 
-    def __init__(self, view: View, config: LocalizerConfig) -> None:
+    def __init__(self, view: BasinView, config: LocalizerConfig) -> None:
         self._view, self._sequence, self.accepted = view, 0, 0
         self._localizer = open_localizer(view.map_cache, view.camera, config)
         self.engine = DualThreadEngine(self._localizer, (self._count,), self._prior)
@@ -94,7 +94,9 @@ class _Hover:
         return PosePrior.around(self._view.truth, time_ns=time_ns)
 
 
-def measured(asked: Search, index: int, view: View, relocalizer: Relocalizer) -> Beside | None:
+def measured(
+    asked: ViewSearch, index: int, view: BasinView, relocalizer: Relocalizer
+) -> Beside | None:
     """Both alone and together; None where the engine does not track the view."""
     query = KnownOfPlace(prior=False, heading=asked.heading_known, seed=asked.seed).query(
         Frame(view.query, 1, view.camera, index), view.truth, index
@@ -139,7 +141,7 @@ def _timed(relocalizer: Relocalizer, query: PlaceQuery) -> tuple[Relocalization 
     return relocalizer.find(query), time.perf_counter() - began
 
 
-def _is_right(found: Relocalization | None, view: View) -> bool:
+def _is_right(found: Relocalization | None, view: BasinView) -> bool:
     if found is None:
         return False
     metres, degrees = found.world_from_camera.distance_to(view.truth)
@@ -176,7 +178,7 @@ def table(told: dict[str, object]) -> list[tuple[str, str, str, str]]:
 
 def _run(args: argparse.Namespace) -> list[Beside]:
     config = with_threads(LocalizerConfig(), 1)
-    asked = Search(args.set, config, args.heading == "known", seed=3)
+    asked = ViewSearch(args.set, config, args.heading == "known", seed=3)
     kept: list[Beside] = []
     more_time = deadline(args.minutes)
     with ExitStack() as stack:

@@ -31,7 +31,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import OverviewLevel
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
-from localizer.relocalization.search import View, search
+from localizer.relocalization.search import SearchView, search
 from localizer.relocalization.topview import DOWN
 from localizer.relocalization.types import PlaceQuery
 from localizer.types import Frame
@@ -81,7 +81,7 @@ def costs(
     the finest are left out, as a coarser first stage would.
     """
     c = config.relocalization
-    view = View(query.frame.image, _CAMERA)
+    view = SearchView(query.frame.image, _CAMERA)
     for area in areas:
         levels = [laid_out(x, area) for x in relocalizer.overview.levels[coarser:]]
         correlators = tuple(LevelCorrelator(x, c.spectra_mib * 2**20) for x in levels)

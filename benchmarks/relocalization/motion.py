@@ -33,7 +33,7 @@ from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import markdown, write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from benchmarks.common.shares import exact_interval
-from benchmarks.odometry.stretches import Plan, Stretch, make_stretch
+from benchmarks.odometry.stretches import StretchPlan, TestStretch, make_stretch
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, with_threads
 
 with needs_torch():
@@ -58,8 +58,8 @@ from localizer.synth.appearance.model import (
     apply_appearance,
     sample_appearance,
 )
-from localizer.tracking.horizon import AttitudePrior
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.attitude_bias import AttitudePrior
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PosePrior, TrackingState
 
@@ -86,7 +86,7 @@ _BYTES = 128 * 2**20
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialOutcome:
     """One trial. searches: frames searched; found_at: number of the first one whose answer was
     within 3 m and 3 degrees, 0 without; wrong: answers that were not; confirmed_s: from the first
     frame to TRACKING, None without; given: poses given out, false: of these; worst_m: the farthest,
@@ -112,7 +112,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Site:
+class TrialSite:
     """What a set's trials share. elsewhere: the flight is not on the map that is searched."""
 
     name: str
@@ -126,10 +126,10 @@ class Site:
     config: LocalizerConfig
 
 
-class Trial:
+class LostTrial:
     """One flight without a place, until it is found and confirmed, or not."""
 
-    def __init__(self, site: Site, index: int, heading_known: bool) -> None:
+    def __init__(self, site: TrialSite, index: int, heading_known: bool) -> None:
         self._site, self._index = site, index
         rng = np.random.default_rng((71, index))
         self._rng = rng
@@ -139,9 +139,9 @@ class Trial:
         self.height_m = float(np.exp(rng.uniform(np.log(55), np.log(150))))
         half = (site.half_m, site.half_m)
         speed = float(rng.uniform(5, 12))
-        plan = Plan(_FRAMES * _FRAME_S, 1 / _FRAME_S, speed, self.height_m, half)
+        plan = StretchPlan(_FRAMES * _FRAME_S, 1 / _FRAME_S, speed, self.height_m, half)
         ground = ground_height(site.seen, np.array([*rng.uniform(-1, 1, 2) * 0.5 * half[0], 0.0]))
-        self._way: Stretch = make_stretch(plan, self.condition, 5_000 + index, ground)
+        self._way: TestStretch = make_stretch(plan, self.condition, 5_000 + index, ground)
         self._look: Appearance = sample_appearance(rng, self.condition)
         self._off = np.radians(rng.normal(0, [_TILT_DEG, _TILT_DEG, _HEADING_DEG]))
         self.region, self.inertial = index % 2 == 0, index // 2 % 2 == 0
@@ -150,11 +150,11 @@ class Trial:
         off = _REGION_OFF_M * rng.random() * np.array([np.cos(angle), np.sin(angle)])
         self._centre: Array = self._way.poses[0].translation[:2] + off
 
-    def run(self) -> Outcome:
+    def run(self) -> TrialOutcome:
         """Search, try, confirm."""
         began = time.process_time()
         site, camera = self._site, self._camera
-        sensors = OtherSensors(self._rotation, self._displacement)
+        sensors = AuxiliarySensors(self._rotation, self._displacement)
         localizer = Localizer(
             site.known, site.extractor, site.optimizer, camera, site.config, sensors
         )
@@ -164,7 +164,7 @@ class Trial:
         k, proposed, left = 0, False, _AFTER
         while k < len(self._way.poses) - _SEARCH_FRAMES and left:
             frame = self._frame(k)
-            if localizer.tracker.standing.wants_prior and not proposed:
+            if localizer.tracker.track_status.wants_prior and not proposed:
                 if searches == SEARCHED:
                     break
                 searches += 1
@@ -192,11 +192,11 @@ class Trial:
             if estimate.accepted:
                 far, _ = estimate.world_from_camera.distance_to(self._way.poses[k])
                 errors.append(float("inf") if site.elsewhere else far)
-            if localizer.tracker.standing.state is TrackingState.TRACKING:
+            if localizer.tracker.track_status.state is TrackingState.TRACKING:
                 confirmed_s = k * _FRAME_S if confirmed_s is None else confirmed_s
                 left -= 1
             k += 1
-        return Outcome(
+        return TrialOutcome(
             site.name, self._index, self.condition, self._known.heading, self.region,
             self.inertial, self.height_m, searches, found_at, wrong, confirmed_s, len(errors),
             sum(e > _FALSE_M for e in errors), min(max(errors), 1e6) if errors else None,
@@ -231,7 +231,7 @@ class Trial:
         return Frame(image, round((k + 1) * _FRAME_S * 1e9), self._camera, k)
 
 
-def open_site(name: str, folder: Path, config: LocalizerConfig, stack: ExitStack) -> Site:
+def open_site(name: str, folder: Path, config: LocalizerConfig, stack: ExitStack) -> TrialSite:
     """The set's map and world, with one relocalizer and one tracker's parts for all trials."""
     searched, seen, half_m = SETS[name]
     opened = open_relocalizer(TileCache.open(folder / searched), config)
@@ -247,16 +247,16 @@ def open_site(name: str, folder: Path, config: LocalizerConfig, stack: ExitStack
     extractor = DetailExtractor(load_extractor(config.model, threads=1))
     optimizer = JNGO(config.registration, threads=1)
     elsewhere = name == "elsewhere"
-    return Site(
+    return TrialSite(
         name, half_m, elsewhere, renderer(seen), renderer(searched), relocalizer, extractor,
         optimizer, config,
     )  # fmt: skip
 
 
 def run(
-    site: Site, kept: list[Outcome], first: int, trials: int, heading_known: bool,
-    more_time: Callable[[], bool], save: Callable[[list[Outcome]], None],
-) -> list[Outcome]:  # fmt: skip
+    site: TrialSite, kept: list[TrialOutcome], first: int, trials: int, heading_known: bool,
+    more_time: Callable[[], bool], save: Callable[[list[TrialOutcome]], None],
+) -> list[TrialOutcome]:  # fmt: skip
     """The trials from number `first` on that `kept` lacks, as long as there is time."""
     done = {(o.set, o.trial, o.heading_known) for o in kept}
     for index in range(first, first + trials):
@@ -264,7 +264,7 @@ def run(
             continue
         if not more_time():
             break
-        kept.append(Trial(site, index, heading_known).run())
+        kept.append(LostTrial(site, index, heading_known).run())
         save(kept)
     return kept
 
@@ -275,7 +275,7 @@ def share(hits: int, count: int) -> dict[str, float]:
     return {"hits": hits, "count": count, "low": low, "high": high}
 
 
-def shares(outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
+def shares(outcomes: Sequence[TrialOutcome]) -> list[dict[str, object]]:
     """One row for each set, heading and light (day, or all), and one for all trials."""
     rows: list[dict[str, object]] = []
     groups = [(o.set, o.heading_known) for o in outcomes]
@@ -346,15 +346,15 @@ def main() -> None:
     p.add_argument("--json", type=output, help="the table's rows")
     args = p.parse_args()
     if args.report:
-        kept = [Outcome(**row) for path in args.report for row in json.loads(path.read_text())]
+        kept = [TrialOutcome(**row) for path in args.report for row in json.loads(path.read_text())]
     else:
         if args.folder is None:
             p.error("FOLDER is missing")
         kept = []
         if args.out and args.out.exists():
-            kept = [Outcome(**row) for row in json.loads(args.out.read_text())]
+            kept = [TrialOutcome(**row) for row in json.loads(args.out.read_text())]
 
-        def save(outcomes: list[Outcome]) -> None:
+        def save(outcomes: list[TrialOutcome]) -> None:
             if args.out:  # after each one: an interrupted run keeps what it has
                 args.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.basin.views import View
+from benchmarks.basin.views import BasinView
 from benchmarks.common.figures import markdown
 from benchmarks.common.shares import exact_interval
 from localizer.config import LocalizerConfig
@@ -25,7 +25,7 @@ RIGHT_M, RIGHT_DEG = 3.0, 3.0
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ViewOutcome:
     """One view. rank: of the first candidate that shows the place, -1 without; found: accepted and
     right; false: accepted and not right; area_km2: of the map; cpu_s, wall_s: of the whole search.
     """
@@ -46,7 +46,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Search:
+class ViewSearch:
     """What is asked. name: of the views' set; on: another place's map, where no view is."""
 
     name: str
@@ -56,7 +56,7 @@ class Search:
     on: Path | None = None
 
 
-def run(asked: Search, views: Sequence[View], first: int) -> Iterator[Outcome]:
+def run(asked: ViewSearch, views: Sequence[BasinView], first: int) -> Iterator[ViewOutcome]:
     """Every view from number `first` on, on the whole map of its own place or of another."""
     known = KnownOfPlace(prior=False, heading=asked.heading_known, seed=asked.seed)
     maps: dict[Path, OpenRelocalizer] = {}
@@ -75,8 +75,8 @@ def run(asked: Search, views: Sequence[View], first: int) -> Iterator[Outcome]:
 
 
 def _one(
-    asked: Search, view: View, opened: OpenRelocalizer, known: KnownOfPlace, k: int
-) -> Outcome:
+    asked: ViewSearch, view: BasinView, opened: OpenRelocalizer, known: KnownOfPlace, k: int
+) -> ViewOutcome:
     relocalizer = opened.relocalizer
     truth = view.truth
     if asked.on is not None:  # as high above that map's ground as it was above its own
@@ -95,7 +95,7 @@ def _one(
             metres, degrees = found.world_from_camera.distance_to(view.truth)
             right, error = metres <= RIGHT_M and degrees <= RIGHT_DEG, metres
     name = asked.name if asked.on is None else f"{asked.name}, not on this map"
-    return Outcome(
+    return ViewOutcome(
         name, known.heading, view.condition, view.height, relocalizer.overview.area_km2,
         rank, right, found is not None and not right, error,
         None if found is None else found.quality,
@@ -103,7 +103,7 @@ def _one(
     )  # fmt: skip
 
 
-def _rank(candidates: Sequence[PlaceCandidate], view: View) -> int:
+def _rank(candidates: Sequence[PlaceCandidate], view: BasinView) -> int:
     """Of the first candidate that looks at the ground within `NEAR_M` of what the view shows; -1
     without. What lies ahead is found, and the camera follows with its heading's error.
     """
@@ -126,7 +126,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def cells(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
+def cells(outcomes: Sequence[ViewOutcome]) -> list[tuple[str, ...]]:
     """One line per condition and for all, each with the exact interval."""
     rows = []
     for name, known in dict.fromkeys((o.set, o.heading_known) for o in outcomes):
@@ -137,7 +137,7 @@ def cells(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> tuple[str, ...]:
+def _row(name: str, known: bool, condition: str, some: Sequence[ViewOutcome]) -> tuple[str, ...]:
     n, hits = len(some), sum(o.found for o in some)
     low, high = exact_interval(hits, n)
     cpu, confirm, wall = (
@@ -151,7 +151,7 @@ def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> tup
     )  # fmt: skip
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def table(outcomes: Sequence[ViewOutcome]) -> str:
     """As Markdown has it."""
     return markdown(COLUMNS, cells(outcomes))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.shares import exact_interval
-from benchmarks.site.kept import Table
+from benchmarks.site.kept import PrintedTable
 from companion.errors import ReportError
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.report import markdown, read_rows
@@ -42,7 +42,7 @@ _THROUGHPUT = (
 
 def tables_of(
     paths: Sequence[Path], title: str, only: Sequence[str] = ()
-) -> tuple[Table, Table | None]:
+) -> tuple[PrintedTable, PrintedTable | None]:
     """The table of one result, and what was needed beside what was found where the report says.
 
     paths: several files of one form; title: of a row that has no name of its own, behind the names
@@ -62,12 +62,12 @@ def tables_of(
     return _picked(table, only), None
 
 
-def _picked(table: Table, only: Sequence[str]) -> Table:
+def _picked(table: PrintedTable, only: Sequence[str]) -> PrintedTable:
     rows = tuple(row for row in table.rows if not only or row[0] in only)
-    return Table(table.columns, rows)
+    return PrintedTable(table.columns, rows)
 
 
-def _form(data: Any) -> Callable[[list[Any], str], Table]:
+def _form(data: Any) -> Callable[[list[Any], str], PrintedTable]:
     marks = data if isinstance(data, dict) else data[0]
     for mark, made in (
         ("columns", _figures), ("recall_1", _sequence), ("begin_ns", _followed),
@@ -79,12 +79,12 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
     raise KeyError("none of the marks of a form")
 
 
-def _figures(data: list[Any], _title: str) -> Table:
+def _figures(data: list[Any], _title: str) -> PrintedTable:
     rows = (tuple(map(str, row)) for one in data for row in one["rows"])
-    return Table(tuple(data[0]["columns"]), tuple(rows))
+    return PrintedTable(tuple(data[0]["columns"]), tuple(rows))
 
 
-def _throughput(data: list[Any], _title: str) -> Table:
+def _throughput(data: list[Any], _title: str) -> PrintedTable:
     """Without the stages, which are of another shape."""
     rows = tuple(
         (
@@ -96,24 +96,26 @@ def _throughput(data: list[Any], _title: str) -> Table:
         )
         for part in data for one in part["rows"] if "stage_ms" not in one
     )  # fmt: skip
-    return Table(_THROUGHPUT, rows)
+    return PrintedTable(_THROUGHPUT, rows)
 
 
-def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> Table:
+def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> PrintedTable:
     rows = [row for path in paths for row in read_rows(path) if not only or row.name in only]
     table = _of_markdown(markdown(rows))
     if not title:
         return table
-    return Table(table.columns, tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows))
+    return PrintedTable(
+        table.columns, tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows)
+    )
 
 
-def _of_markdown(text: str) -> Table:
+def _of_markdown(text: str) -> PrintedTable:
     lines = [line for line in text.splitlines() if line.startswith("|")]
     cells = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines]
-    return Table(cells[0], tuple(cells[2:]))
+    return PrintedTable(cells[0], tuple(cells[2:]))
 
 
-def _flight(report: dict[str, Any], title: str) -> tuple[Table, Table]:
+def _flight(report: dict[str, Any], title: str) -> tuple[PrintedTable, PrintedTable]:
     localizer, latency = report["localizer"], report["stages_ms"]["latency"]
     ekf = report.get("ekf_in_map_m") or report["ekf_horizontal_m"]
     row = (
@@ -128,10 +130,10 @@ def _flight(report: dict[str, Any], title: str) -> tuple[Table, Table]:
         f"{localizer['fps']:.1f}",
         f"{latency['median']:.0f} / {latency['p95']:.0f}",
     )
-    return Table(_FLIGHT, (row,)), _criteria(report["criteria"])
+    return PrintedTable(_FLIGHT, (row,)), _criteria(report["criteria"])
 
 
-def _criteria(criteria: Sequence[dict[str, Any]]) -> Table:
+def _criteria(criteria: Sequence[dict[str, Any]]) -> PrintedTable:
     rows = []
     for one in criteria:
         enough = one["value"] >= one["limit"] if one["at_least"] else one["value"] <= one["limit"]
@@ -141,10 +143,10 @@ def _criteria(criteria: Sequence[dict[str, Any]]) -> Table:
         digits = 2 if enough or round(one["value"], 2) != round(one["limit"], 2) else 3
         found, needed = (_number(one[key], one["unit"], digits) for key in ("value", "limit"))
         rows.append((one["name"], found, f"{sign} {needed}", held))
-    return Table(("figure", "found", "needed", "held"), tuple(rows))
+    return PrintedTable(("figure", "found", "needed", "held"), tuple(rows))
 
 
-def _sequence(data: list[Any], title: str) -> Table:
+def _sequence(data: list[Any], title: str) -> PrintedTable:
     one = data[0]
     row = (
         title,
@@ -155,10 +157,10 @@ def _sequence(data: list[Any], title: str) -> Table:
         f"{one['completeness']:.1f}",
         f"{one['fps']:.1f}",
     )
-    return Table(_SEQUENCE, (row,))
+    return PrintedTable(_SEQUENCE, (row,))
 
 
-def _suite(data: list[Any], _title: str) -> Table:
+def _suite(data: list[Any], _title: str) -> PrintedTable:
     rows = []
     for one in (row for part in data for row in part):
         broken = "; ".join(f["what"] for f in one["findings"] or () if not f["ok"])
@@ -166,11 +168,11 @@ def _suite(data: list[Any], _title: str) -> Table:
         told = " ".join(filter(None, (verdict, broken, one["error"].split("\n")[0])))
         measured = " / ".join(f"{m:.2f}" for m in one["measured"] or ())
         rows.append((one["scenario"], one["title"], one["vehicle"], measured, told))
-    return Table(_SUITE, tuple(sorted(rows)))
+    return PrintedTable(_SUITE, tuple(sorted(rows)))
 
 
-def _followed(data: list[Any], _title: str) -> Table:
-    return Table(_FOLLOWED, tuple(_pursuit(row) for part in data for row in part))
+def _followed(data: list[Any], _title: str) -> PrintedTable:
+    return PrintedTable(_FOLLOWED, tuple(_pursuit(row) for part in data for row in part))
 
 
 def _pursuit(row: dict[str, Any]) -> tuple[str, ...]:
@@ -188,7 +190,7 @@ def _pursuit(row: dict[str, Any]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _integrity(data: list[Any], _title: str) -> Table:
+def _integrity(data: list[Any], _title: str) -> PrintedTable:
     rows = (
         (one["set"], one["acceptance"], *(_rate(one[k]) for k in ("false", "false_far", "lost")))
         for part in data
@@ -196,7 +198,7 @@ def _integrity(data: list[Any], _title: str) -> Table:
         if one["acceptance"].endswith("ours on trial")
         or (one["set"].startswith("all") and one["acceptance"] in _ACCEPTANCES)
     )
-    return Table(_INTEGRITY, tuple(rows))
+    return PrintedTable(_INTEGRITY, tuple(rows))
 
 
 def _rate(rate: dict[str, float]) -> str:
@@ -205,7 +207,7 @@ def _rate(rate: dict[str, float]) -> str:
     return f"{rate['hits']} of {rate['count']}, {share:.2f} {interval}"
 
 
-def _places(data: list[Any], _title: str) -> Table:
+def _places(data: list[Any], _title: str) -> PrintedTable:
     outcomes = [one for part in data for one in part]
     rows = []
     for name, known in dict.fromkeys((o["set"], o["heading_known"]) for o in outcomes):
@@ -215,7 +217,7 @@ def _places(data: list[Any], _title: str) -> Table:
         mine = [o for o in outcomes if o["heading_known"] is known]
         if len({o["set"] for o in mine}) > 1:
             rows.append(_place("together", known, mine))
-    return Table(_PLACES, tuple(rows))
+    return PrintedTable(_PLACES, tuple(rows))
 
 
 def _place(name: str, known: bool, mine: Sequence[dict[str, Any]]) -> tuple[str, ...]:

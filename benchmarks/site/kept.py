@@ -21,7 +21,7 @@ _MARK = re.compile(r"<!-- kept ([\w\- ]+) -->\n.*?<!-- end -->", re.S)
 
 
 @dataclass(frozen=True)
-class Table:
+class PrintedTable:
     """Cells as they are printed."""
 
     columns: tuple[str, ...]
@@ -37,8 +37,8 @@ class Kept:
     date: str
     machine: str
     source: str
-    table: Table
-    criteria: Table | None = None
+    table: PrintedTable
+    criteria: PrintedTable | None = None
 
 
 def load(path: Path) -> Kept:
@@ -86,5 +86,5 @@ def with_tables(text: str, folder: Path) -> str:
     return _MARK.sub(made, text)
 
 
-def _table(data: dict[str, Any]) -> Table:
-    return Table(tuple(data["columns"]), tuple(tuple(row) for row in data["rows"]))
+def _table(data: dict[str, Any]) -> PrintedTable:
+    return PrintedTable(tuple(data["columns"]), tuple(tuple(row) for row in data["rows"]))

@@ -20,15 +20,15 @@ import numpy as np
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.targets.flights import (
+    FlightStep,
     PoseErrors,
-    Step,
     Thing,
     heights_of,
     sightings,
     standing,
     steps,
 )
-from benchmarks.targets.report import Sample, rows
+from benchmarks.targets.report import FixSample, rows
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
@@ -64,8 +64,12 @@ class _Before:
 
 
 def measure(
-    thing: Thing, flown: list[Step], seen: MapSurface, known: MapSurface, args: argparse.Namespace
-) -> tuple[list[Sample], int, int]:
+    thing: Thing,
+    flown: list[FlightStep],
+    seen: MapSurface,
+    known: MapSurface,
+    args: argparse.Namespace,
+) -> tuple[list[FixSample], int, int]:
     """The thing's fixes, how many sightings gave none, and how many there were."""
     rng = np.random.default_rng([args.draw, len(thing.name), hash_of(thing.name)])
     samples, refused, count = [], 0, 0
@@ -98,14 +102,14 @@ def hash_of(name: str) -> int:
     return int.from_bytes(name.encode(), "little") % (1 << 31)
 
 
-def _sample(thing: Thing, k: int, looked_s: float, fix: TargetFix) -> Sample:
+def _sample(thing: Thing, k: int, looked_s: float, fix: TargetFix) -> FixSample:
     error = fix.position_world - thing.positions[k]
     velocity_error, velocity_nees = float("nan"), float("nan")
     if fix.velocity is not None and fix.velocity_covariance is not None:
         off: Array = (fix.velocity - thing.velocities[k])[:2]
         velocity_error = float(np.linalg.norm(off))
         velocity_nees = float(off @ np.linalg.solve(fix.velocity_covariance[:2, :2], off))
-    return Sample(
+    return FixSample(
         thing.name, thing.kind, looked_s, float(np.linalg.norm(error)),
         float(error @ np.linalg.solve(fix.covariance, error)),
         float(np.sqrt(np.trace(fix.covariance))), fix.elsewhere,
@@ -133,7 +137,7 @@ def fly(args: argparse.Namespace) -> list[dict[str, object]]:
         positions = np.array([car.position_at(t) for t in times])
         velocities = np.array([car.velocity_at(t) for t in times])
         things.append(Thing(car.name, "car", positions, velocities))
-    samples: list[Sample] = []
+    samples: list[FixSample] = []
     refused = count = 0
     found: list[dict[str, object]] = []
     for thing in things:

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.targets.flights import PoseErrors, Step, heights_of, steps
+from benchmarks.targets.flights import FlightStep, PoseErrors, heights_of, steps
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.targets.locate import RayCaster, ray_in_world
@@ -39,7 +39,7 @@ _RING = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
 
 
 @dataclass(frozen=True)
-class Told:
+class FirstPosition:
     """A click's first place. sigma_m: root of the trace; middle: the map shows one smooth surface
     about it; why: it was refused.
     """
@@ -54,7 +54,9 @@ class Told:
     why: str = ""
 
 
-def clicked(step: Step, known: RayCaster, seen: RayCaster, rng: np.random.Generator) -> Told | None:
+def clicked(
+    step: FlightStep, known: RayCaster, seen: RayCaster, rng: np.random.Generator
+) -> FirstPosition | None:
     """One click into a frame; None where there is nothing today."""
     camera = step.true.camera
     size = np.array([camera.width, camera.height])
@@ -69,15 +71,15 @@ def clicked(step: Step, known: RayCaster, seen: RayCaster, rng: np.random.Genera
     at, middle = (float(pixel[0]), float(pixel[1])), _is_middle(step, pixel, distance, known)
     if fix is None:
         nan = float("nan")
-        return Told(at, distance, nan, nan, nan, nan, middle, track.refusal)
+        return FirstPosition(at, distance, nan, nan, nan, nan, middle, track.refusal)
     off = fix.position_world - (eye + distance * ray)
-    return Told(
+    return FirstPosition(
         at, distance, float(np.linalg.norm(off)), float(np.sqrt(np.trace(fix.covariance))),
         float(off @ np.linalg.solve(fix.covariance, off)), fix.elsewhere, middle,
     )  # fmt: skip
 
 
-def _is_middle(step: Step, pixel: np.ndarray, distance: float, known: RayCaster) -> bool:
+def _is_middle(step: FlightStep, pixel: np.ndarray, distance: float, known: RayCaster) -> bool:
     """Whether the map's surface goes on smoothly for 3 m to all sides."""
     around = [pixel, *(pixel + _RING_M * step.true.camera.fx / distance * _RING)]
     eye = step.true.world_from_camera.translation
@@ -89,7 +91,7 @@ def _is_middle(step: Step, pixel: np.ndarray, distance: float, known: RayCaster)
     return bool(np.abs(middle @ np.linalg.svd(middle)[2][2]).max() <= _MIDDLE_M)
 
 
-def row(kind: str, told: Sequence[Told]) -> dict[str, object]:
+def row(kind: str, told: Sequence[FirstPosition]) -> dict[str, object]:
     """One line of figures."""
     kept = [t for t in told if not t.why]
     errors, sigmas = np.array([t.error_m for t in kept]), np.array([t.sigma_m for t in kept])
@@ -109,7 +111,7 @@ def row(kind: str, told: Sequence[Told]) -> dict[str, object]:
     }
 
 
-def measure(args: argparse.Namespace) -> tuple[list[Told], list[dict[str, object]]]:
+def measure(args: argparse.Namespace) -> tuple[list[FirstPosition], list[dict[str, object]]]:
     """All clicks of one world, and their figures."""
     assets, scenario = prepare(args.seed, size_m=args.size), load_scenario(args.scenario)
     scenario = heights_of(scenario, args.height)

@@ -34,7 +34,7 @@ class PoseErrors:
 
 
 @dataclass(frozen=True)
-class Step:
+class FlightStep:
     """One frame: the pose as it is, and the estimate that is told of it."""
 
     true: PoseEstimate
@@ -59,7 +59,7 @@ def heights_of(scenario: Scenario, height_m: float) -> Scenario:
 
 def steps(
     path: list[tuple[int, Pose]], camera: Camera, errors: PoseErrors, rng: np.random.Generator
-) -> list[Step]:
+) -> list[FlightStep]:
     """Every pose of the path with what a localizer tells of it."""
     sigma = np.repeat([errors.position_m, np.radians(errors.rotation_deg)], 3)
     wander, last_ns = rng.normal(0, sigma), path[0][0]
@@ -74,12 +74,12 @@ def steps(
             pose, np.diag(sigma**2), 1.0, TrackingState.TRACKING, RegistrationStatus.OK, True,
             time_ns, 0, camera,
         )  # fmt: skip
-        made.append(Step(true, replace(true, world_from_camera=told)))
+        made.append(FlightStep(true, replace(true, world_from_camera=told)))
     return made
 
 
 def standing(
-    flown: list[Step], cast: RayCaster, count: int, rng: np.random.Generator
+    flown: list[FlightStep], cast: RayCaster, count: int, rng: np.random.Generator
 ) -> Iterator[Thing]:
     """`count` places on plain surfaces and as many at edges, spread over the way."""
     wanted = {"flat": count, "edge": count}
@@ -107,7 +107,7 @@ def standing(
 
 def sightings(
     thing: Thing,
-    flown: list[Step],
+    flown: list[FlightStep],
     cast: RayCaster,
     noise_px: float,
     rng: np.random.Generator,

@@ -22,7 +22,7 @@ from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from companion.config import TargetConfig
 from companion.targets.detections import clicked_name
-from companion.targets.population import Click, Population, Target
+from companion.targets.target_manager import Click, TargetEstimate, TargetManager
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
@@ -107,10 +107,10 @@ def follow(args: argparse.Namespace) -> dict[str, object]:
     end_ns = begin_ns + round((_BEFORE_S + args.seconds) * 1e9)
     track = camera_track(chase, begin_ns - 10**9, end_ns + 10**9, rng)
     streamer = TileStreamer(TileCache.open(assets.live_cache))
-    told: list[Target] = []
+    told: list[TargetEstimate] = []
     texts: list[str] = []
     gone: list[str] = []
-    population = Population(
+    population = TargetManager(
         TargetConfig(), MapSurface(cache).cast, told.append, gone.append,
         lambda _, text: texts.append(text),
     )  # fmt: skip
@@ -164,7 +164,7 @@ def _click(chase: Chase, kept: list[PoseEstimate], time_ns: int, rng: np.random.
     return Click(1, seen, (float(u), float(v)), (), extent)
 
 
-def _fix(target: Target) -> FollowedFix:
+def _fix(target: TargetEstimate) -> FollowedFix:
     fix = target.fix
     return FollowedFix(
         fix.exposure_time_ns, fix.position_world, fix.covariance, fix.velocity,

@@ -23,7 +23,7 @@ from benchmarks.common.named_errors import named_errors
 from companion.offline.replay import FlightRecord, image_path, load_record
 from companion.targets.detections import clicked_name
 from companion.targets.history import PoseHistory
-from companion.targets.population import Click, Population, Target
+from companion.targets.target_manager import Click, TargetEstimate, TargetManager
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
@@ -47,9 +47,9 @@ def refollow(folder: Path) -> dict[str, Any]:
     chase = make_chase(
         assets.world, cache.frame, begin_ns - round(LEAD_S * 1e9), LEAD_S, int(row["draw"])
     )
-    told: list[Target] = []
+    told: list[TargetEstimate] = []
     texts: list[str] = []
-    population = Population(
+    population = TargetManager(
         record.config.targets, MapSurface(cache).cast, told.append, lambda _: None,
         lambda _, text: texts.append(text),
     )  # fmt: skip
@@ -78,7 +78,7 @@ def _click(targets: Path) -> tuple[int, tuple[float, float]]:
 
 
 def _fly(
-    record: FlightRecord, population: Population, click: tuple[int, tuple[float, float]]
+    record: FlightRecord, population: TargetManager, click: tuple[int, tuple[float, float]]
 ) -> None:
     """Pictures and click in the order in which they came."""
     frame_ns, pixel = click
@@ -117,7 +117,7 @@ def _covariances(folder: Path) -> dict[int, Array]:
     return found
 
 
-def _fix(target: Target) -> FollowedFix:
+def _fix(target: TargetEstimate) -> FollowedFix:
     fix = target.fix
     return FollowedFix(
         fix.exposure_time_ns, fix.position_world, fix.covariance, fix.velocity,

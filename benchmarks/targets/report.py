@@ -11,7 +11,7 @@ _CHI2_95 = {2: 5.991, 3: 7.815}
 
 
 @dataclass(frozen=True)
-class Sample:
+class FixSample:
     """One reported fix. horizontal_m: of error_m; looked_s: since the target was first seen;
     elsewhere: as it was told.
     """
@@ -29,7 +29,7 @@ class Sample:
     horizontal_m: float
 
 
-def rows(samples: Iterable[Sample], refused: int, seen: int) -> list[dict[str, object]]:
+def rows(samples: Iterable[FixSample], refused: int, seen: int) -> list[dict[str, object]]:
     """One line for each kind and span of looking, and what of all sightings was not reported."""
     kept, found = list(samples), []
     spans: dict[str, Callable[[float], bool]] = {
@@ -44,7 +44,7 @@ def rows(samples: Iterable[Sample], refused: int, seen: int) -> list[dict[str, o
     return found
 
 
-def _row(chosen: list[Sample]) -> dict[str, object]:
+def _row(chosen: list[FixSample]) -> dict[str, object]:
     errors = np.array([s.error_m for s in chosen])
     nees = np.array([s.nees for s in chosen])
     by_thing: dict[str, list[float]] = {}

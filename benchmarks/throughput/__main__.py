@@ -31,7 +31,7 @@ from localizer.evaluation.sequences import load_sequence
 from localizer.tracking.opening import MapStack
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import record_scenario
-from sitl.demo.scenario import CameraSpec, Leg, Scenario
+from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 
 
 def scenario(rate_hz: float = 30.0) -> Scenario:
@@ -40,8 +40,8 @@ def scenario(rate_hz: float = 30.0) -> Scenario:
         takeoff_height_m=100,
         speed_m_s=10,
         legs=(
-            Leg(east_m=0, north_m=35, height_m=100, gimbal_pitch_deg=-75),
-            Leg(east_m=40, north_m=35, height_m=105, gimbal_pitch_deg=-65),
+            ScenarioLeg(east_m=0, north_m=35, height_m=100, gimbal_pitch_deg=-75),
+            ScenarioLeg(east_m=40, north_m=35, height_m=105, gimbal_pitch_deg=-65),
         ),
         camera=CameraSpec(rate_hz=rate_hz),
         cars=10,

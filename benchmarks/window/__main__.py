@@ -59,7 +59,7 @@ PLAIN, LEVEL = "", ", level"
 
 
 @dataclass(frozen=True)
-class Flown:
+class WindowFlight:
     """One place's frames: where they were, and what the registrations of each say: `PLAIN`, or
     with roll and pitch heard, `LEVEL`.
     """
@@ -69,7 +69,7 @@ class Flown:
     votes: dict[str, list[Vote]]
 
 
-class Registrar:
+class FrameRegistrar:
     """Registers frames as the product does. tilt_deg: None hears no roll and pitch."""
 
     def __init__(self, tilt_deg: float | None = None) -> None:
@@ -80,11 +80,11 @@ class Registrar:
 
     def flown(
         self, place: int, frames: Iterator[SequenceFrame], beginnings: Sequence[str]
-    ) -> dict[str, Flown]:
+    ) -> dict[str, WindowFlight]:
         """Every frame of a sequence, by beginning."""
         kinds = (PLAIN,) if self._tilt is None else (PLAIN, LEVEL)
         off = np.random.default_rng((place, 72)).normal(0.0, self._tilt or 0.0, 3) * (1, 1, 0)
-        flights = {b: Flown(place, [], {kind: [] for kind in kinds}) for b in beginnings}
+        flights = {b: WindowFlight(place, [], {kind: [] for kind in kinds}) for b in beginnings}
         for k, frame in enumerate(frames):
             query = self._extractor.extract(frame.query)
             for begins, flight in flights.items():
@@ -111,7 +111,9 @@ class Registrar:
         return Vote(found.world_from_camera, found.covariance, trust)
 
 
-def windowed(flown: Flown, kind: str, motion: str, frames: int, *, robust: bool) -> list[Pose]:
+def windowed(
+    flown: WindowFlight, kind: str, motion: str, frames: int, *, robust: bool
+) -> list[Pose]:
     """The window's pose of every frame."""
     steps = MOTIONS[motion](flown.truths, INTERVAL_S, np.random.default_rng(flown.place))
     window = Window(frames, robust=robust)
@@ -119,7 +121,7 @@ def windowed(flown: Flown, kind: str, motion: str, frames: int, *, robust: bool)
     return [window.add(vote, step) for vote, step in pairs]
 
 
-def errors(flown: Flown, windows: list[int], motions: Sequence[str]) -> Errors:
+def errors(flown: WindowFlight, windows: list[int], motions: Sequence[str]) -> Errors:
     """Errors of single frames and of every window, by (motion, kind, frames)."""
 
     def against(poses: list[Pose]) -> list[Error]:
@@ -156,7 +158,7 @@ def main() -> None:
                    help="real textures")  # fmt: skip
     p.add_argument("--json", type=output, help="the table, for the documentation")
     args = p.parse_args()
-    registrar = Registrar(args.tilt)
+    registrar = FrameRegistrar(args.tilt)
     table: list[tuple[str, ...]] = []
     for name in args.sets:
         places: dict[str, list[Errors]] = {begins: [] for begins in args.beginnings}

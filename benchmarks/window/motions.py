@@ -16,7 +16,7 @@ _JITTER_DEG = 0.2  # of its attitude and the gimbal's angles, from frame to fram
 
 
 @dataclass(frozen=True)
-class Step:
+class MotionStep:
     """The motion from one frame to the next.
 
     move: a pose of the earlier camera to one of the later; lever: the way (3,) in the earlier
@@ -35,7 +35,9 @@ class Step:
         return self.move(pose), spread @ covariance @ spread.T + self.noise
 
 
-def by_odometry(truths: Sequence[Pose], _interval_s: float, rng: np.random.Generator) -> list[Step]:
+def by_odometry(
+    truths: Sequence[Pose], _interval_s: float, rng: np.random.Generator
+) -> list[MotionStep]:
     """Frame to frame in camera axes: an error of scale that stays, and a walk."""
     scale = 1.0 + rng.normal(0.0, _SCALE, 3)
     steps = []
@@ -46,12 +48,14 @@ def by_odometry(truths: Sequence[Pose], _interval_s: float, rng: np.random.Gener
         measured = Pose(turn @ true.rotation, way)
         sigma_m = _STEP_M + _SCALE * float(np.linalg.norm(way))
         steps.append(
-            Step(lambda pose, m=measured: pose @ m, way, _noise(sigma_m, _STEP_DEG))  # type: ignore[misc]
+            MotionStep(lambda pose, m=measured: pose @ m, way, _noise(sigma_m, _STEP_DEG))  # type: ignore[misc]
         )
     return steps
 
 
-def by_autopilot(truths: Sequence[Pose], interval_s: float, rng: np.random.Generator) -> list[Step]:
+def by_autopilot(
+    truths: Sequence[Pose], interval_s: float, rng: np.random.Generator
+) -> list[MotionStep]:
     """Velocity and attitude in world axes: a velocity that stays wrong, and jitter."""
     wrong = rng.normal(0.0, _VELOCITY_MPS, 3)
     seen = [so3_exp(np.radians(rng.normal(0.0, _JITTER_DEG, 3))) @ t.rotation for t in truths]
@@ -61,7 +65,9 @@ def by_autopilot(truths: Sequence[Pose], interval_s: float, rng: np.random.Gener
         way = way + wrong * interval_s + rng.normal(0.0, _WALK_M, 3)
         turn = turns @ turned.T
         noise = _noise(_WALK_M + _VELOCITY_MPS * interval_s, 1.4 * _JITTER_DEG)
-        steps.append(Step(lambda pose, w=way, t=turn: _shifted(pose, w, t), np.zeros(3), noise))  # type: ignore[misc]
+        steps.append(
+            MotionStep(lambda pose, w=way, t=turn: _shifted(pose, w, t), np.zeros(3), noise)
+        )  # type: ignore[misc]
     return steps
 
 

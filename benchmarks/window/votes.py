@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.window.motions import Step
+from benchmarks.window.motions import MotionStep
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 
 _BOX = (16.0, np.radians(12.0))  # sides: metres, radians
@@ -30,7 +30,7 @@ class Vote:
     covariance: Array
     trust: float
 
-    def carried(self, step: Step) -> Vote:
+    def carried(self, step: MotionStep) -> Vote:
         """The vote for the next frame."""
         return Vote(*step.carry(self.pose, self.covariance), self.trust)
 
@@ -42,7 +42,7 @@ class Window:
         self._frames, self._robust = frames, robust
         self._votes: list[Vote] = []
 
-    def add(self, vote: Vote, step: Step | None) -> Pose:
+    def add(self, vote: Vote, step: MotionStep | None) -> Pose:
         """The window's pose of this frame; step: the motion since the last, None of the first."""
         if step is not None:
             self._votes = [v.carried(step) for v in self._votes]

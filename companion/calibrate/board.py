@@ -26,7 +26,7 @@ _POINTS_PER_MM = 72.0 / 25.4
 
 
 @dataclass(frozen=True)
-class Sheet:
+class BoardPage:
     """A page with the board in its middle, millimetres."""
 
     width_mm: float
@@ -34,7 +34,7 @@ class Sheet:
     square_mm: float
 
     @classmethod
-    def of(cls, paper: Paper) -> Sheet:
+    def of(cls, paper: Paper) -> BoardPage:
         """The largest board that leaves a printer's margins."""
         return cls(*_SHEETS_MM[paper])
 
@@ -51,12 +51,12 @@ def board_picture(dots: int = _DOTS_PER_SQUARE) -> Image:
     return np.asarray(picture, np.uint8)
 
 
-def write_sheet(path: Path, paper: Paper) -> Sheet:
+def write_sheet(path: Path, paper: Paper) -> BoardPage:
     """A PDF or PNG, by the name's ending; `ReportError` for another or where it cannot be written.
 
     Printed at 100 %, a square has the side that the sheet says: a ruler tells.
     """
-    sheet = Sheet.of(paper)
+    sheet = BoardPage.of(paper)
     endings = {".pdf": _pdf, ".png": _png}
     if path.suffix.lower() not in endings:
         raise ReportError(f"{path}: a board is printed from .pdf or .png")
@@ -68,7 +68,7 @@ def write_sheet(path: Path, paper: Paper) -> Sheet:
     return sheet
 
 
-def _pdf(sheet: Sheet) -> bytes:
+def _pdf(sheet: BoardPage) -> bytes:
     """One page, the board an image that is placed by millimetres (PDF 1.4)."""
     picture = board_picture(_DOTS_PER_SQUARE // 4)
     rows, columns = picture.shape
@@ -107,7 +107,7 @@ def _pdf(sheet: Sheet) -> bytes:
     return bytes(out)
 
 
-def _png(sheet: Sheet) -> bytes:
+def _png(sheet: BoardPage) -> bytes:
     """A white page with its dots per metre (pHYs), so that it prints at true scale."""
     dots = _DOTS_PER_SQUARE
     per_mm = dots / sheet.square_mm

@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from companion.calibrate import unknowns as u
+from companion.calibrate.autopilot_window import AutopilotWindow, at
 from companion.calibrate.pictures import Parts
-from companion.calibrate.said import Said, at
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 
 
 @dataclass(frozen=True)
-class Sighted:
+class CalibrationFrame:
     """One picture with what was said about it. time_ns: its stamp."""
 
     time_ns: int
     pose: Pose
     parts: Parts
-    said: Said
+    window: AutopilotWindow
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Guess:
         return Guess(self.shared + shared, turned, self.places + frames[:, :3])
 
 
-class Evidence:
+class CalibrationProblem:
     """The observations of K frames with N parts in all, about a deployment's numbers.
 
     camera, mount (3, 3), arm_m (3,): the deployment's.
     """
 
     def __init__(
-        self, frames: Sequence[Sighted], camera: Camera, mount: Array, arm_m: Array
+        self, frames: Sequence[CalibrationFrame], camera: Camera, mount: Array, arm_m: Array
     ) -> None:
         self.times_s = np.array([(f.time_ns - frames[0].time_ns) * 1e-9 for f in frames])
         counts = [len(f.parts.points) for f in frames]
@@ -65,10 +65,10 @@ class Evidence:
         information = np.concatenate([f.parts.information for f in frames])
         self._root = np.linalg.cholesky(information).transpose(0, 2, 1)
         self._camera, self._mount, self.arm_m = camera, mount, arm_m
-        self._housing = np.array([f.said.camera for f in frames])
-        self._body = np.array([f.said.body for f in frames])
-        self._place = np.array([f.said.place for f in frames])
-        self.placed: NDArray[np.bool_] = np.array([f.said.has_place for f in frames])
+        self._housing = np.array([f.window.camera for f in frames])
+        self._body = np.array([f.window.body for f in frames])
+        self._place = np.array([f.window.place for f in frames])
+        self.placed: NDArray[np.bool_] = np.array([f.window.has_place for f in frames])
         heights = self._place[:, self._place.shape[1] // 2, 2]
         self._ground_m = float(np.nanmin(heights)) if self.placed.any() else 0.0
         self._start = Guess(
@@ -114,8 +114,8 @@ class Evidence:
         late_s = float(guess.shared[u.LATE])
         heading = so3_exp([0.0, 0.0, -guess.shared[u.HEADING]])  # clockwise from north, in ENU
         mount = self._mount @ so3_exp(guess.shared[u.MOUNT]) @ GIMBAL_FROM_CAMERA
-        said = heading @ at(self._housing, -late_s) @ mount
-        off = np.swapaxes(said, 1, 2) @ guess.rotations
+        window = heading @ at(self._housing, -late_s) @ mount
+        off = np.swapaxes(window, 1, 2) @ guess.rotations
         turned: Array = Rotation.from_matrix(off).as_rotvec()
         return turned
 
@@ -125,9 +125,9 @@ class Evidence:
         place = at(self._place, -late_s)
         arm = at(self._body, -late_s) @ (self.arm_m + s[u.ARM])
         climbed = (place[:, 2] - self._ground_m) * s[u.CLIMB]
-        said = place + arm + s[u.SHIFT]
-        said[:, 2] += climbed
-        off: Array = guess.places - said
+        window = place + arm + s[u.SHIFT]
+        window[:, 2] += climbed
+        off: Array = guess.places - window
         return off
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.evidence import Evidence, Guess, Sighted, changed_camera
+from companion.calibrate.autopilot_window import REACH_S, AutopilotWindow, autopilot_window_at
+from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, Guess, changed_camera
 from companion.calibrate.pictures import PictureReader
-from companion.calibrate.said import REACH_S, Said, what_was_said
 from companion.calibrate.solve import Solution, solve
 from companion.config import CompanionConfig, FeedConfig
 from companion.errors import RecordError, StreamDecodeError
@@ -84,7 +84,7 @@ class _Picture:
 
     recorded: RecordedEstimate
     path: Path
-    said: Said
+    window: AutopilotWindow
     pose: Pose
 
 
@@ -127,7 +127,7 @@ def calibrate(
             pictures, sighted = _sighted(
                 pictures, reader, believed, late_s, partial(_tell, progress, begun, total)
             )
-            evidence = Evidence(sighted, camera, mount, arm_m)
+            evidence = CalibrationProblem(sighted, camera, mount, arm_m)
             if guess is None:
                 still = np.arange(u.COUNT) < u.OPTICS.stop
                 before_px = solve(evidence, fixed=still).pixel_sigma
@@ -184,16 +184,16 @@ def _chosen(
     for index in picked:
         estimate = good[index]
         autopilot.advance(estimate.exposure_time_ns + _LATER_NS)
-        said = what_was_said(autopilot, estimate.exposure_time_ns, frame, geoid_m, mount)
-        if said is None or not _unzoomed(config.camera, autopilot, estimate.exposure_time_ns):
+        window = autopilot_window_at(autopilot, estimate.exposure_time_ns, frame, geoid_m, mount)
+        if window is None or not _unzoomed(config.camera, autopilot, estimate.exposure_time_ns):
             continue
         state = autopilot.state()
         if not trusted or not gnss_healthy(state, estimate.exposure_time_ns + _LATER_NS):
-            said = replace(said, place=np.full_like(said.place, np.nan))
-        elif said.has_place:
+            window = replace(window, place=np.full_like(window.place, np.nan))
+        elif window.has_place:
             accuracies_m.append(state.gps_h_accuracy_m)
         path = image_path(record.folder, estimate)
-        pictures.append(_Picture(estimate, path, said, estimate.world_from_camera))
+        pictures.append(_Picture(estimate, path, window, estimate.world_from_camera))
     if len(pictures) < _LEAST_FRAMES:
         raise RecordError(
             f"{tlog}: attitude and gimbal are known at {len(pictures)} of {len(picked)} pictures; "
@@ -234,27 +234,27 @@ def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
     did not say. Errors that last all flight do not average out: the sigma of their mean is the mean
     of their sigmas.
     """
-    said = [max(_GNSS_BIAS_M, a) for a in accuracies_m if a is not None]
-    return float(np.mean(said)) if said else _GNSS_BIAS_M
+    window = [max(_GNSS_BIAS_M, a) for a in accuracies_m if a is not None]
+    return float(np.mean(window)) if window else _GNSS_BIAS_M
 
 
 def _sighted(
     pictures: list[_Picture], reader: PictureReader, camera: Camera, late_s: float,
     progress: Callable[[int], None],
-) -> tuple[list[_Picture], list[Sighted]]:  # fmt: skip
+) -> tuple[list[_Picture], list[CalibrationFrame]]:  # fmt: skip
     kept, sighted = [], []
     for number, picture in enumerate(pictures):
         progress(number + 1)
         if (image := _read(picture)) is None:
             continue
         stamp_ns = picture.recorded.exposure_time_ns
-        rate, velocity = picture.said.motion(-late_s)
+        rate, velocity = picture.window.motion(-late_s)
         sweep = Sweep.of(rate, velocity, camera.readout_ms) if camera.readout_ms > 0 else None
         frame = Frame(image, stamp_ns, camera, 0)
         parts = reader.read(frame, picture.pose, sweep)
         if parts is not None:
             kept.append(picture)
-            sighted.append(Sighted(stamp_ns, picture.pose, parts, picture.said))
+            sighted.append(CalibrationFrame(stamp_ns, picture.pose, parts, picture.window))
     if len(sighted) < _LEAST_FRAMES:
         raise RecordError(
             f"only {len(sighted)} of {len(pictures)} pictures can be laid on the map again: is it "
@@ -263,7 +263,7 @@ def _sighted(
     return kept, sighted
 
 
-def _notes(evidence: Evidence, config: CompanionConfig) -> tuple[str, ...]:
+def _notes(evidence: CalibrationProblem, config: CompanionConfig) -> tuple[str, ...]:
     notes = []
     share = float(evidence.placed.mean())
     if config.bridge.mode in _OURS:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from companion.calibrate.views import View
+from companion.calibrate.views import BoardView
 from companion.errors import RecordError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -20,7 +20,7 @@ _HONEST = 2.0  # a board is not flat, and its corners do not err independently
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensEstimate:
     """The camera with one sigma of fx, fy, cx, cy, k1, k2, p1, p2, k3 (9,); rms_px: of the corners;
     views: used, of how many.
     """
@@ -31,7 +31,7 @@ class Lens:
     views: tuple[int, int]
 
 
-def solve_lens(views: Sequence[View], width: int, height: int) -> Lens:
+def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstimate:
     """By OpenCV's bundle adjustment (Zhang 2000). `RecordError` with fewer than eight views."""
     if len(views) < _LEAST_VIEWS:
         raise RecordError(
@@ -52,7 +52,7 @@ def solve_lens(views: Sequence[View], width: int, height: int) -> Lens:
         width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]),
         (float(d[0]), float(d[1]), float(d[2]), float(d[3]), float(d[4])),
     )  # fmt: skip
-    return Lens(camera, _HONEST * fitted.sigmas, fitted.rms, (len(used), len(views)))
+    return LensEstimate(camera, _HONEST * fitted.sigmas, fitted.rms, (len(used), len(views)))
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class _Fit:
     rms: float
 
 
-def _fit(views: Sequence[View], size: tuple[int, int], *, with_k3: bool) -> _Fit:
+def _fit(views: Sequence[BoardView], size: tuple[int, int], *, with_k3: bool) -> _Fit:
     objects = [v.objects.astype(np.float32) for v in views]
     # Corners count from the picture's edge here, so the principal point does, too.
     pixels = [v.pixels.astype(np.float32) for v in views]

@@ -14,12 +14,12 @@ import yaml
 from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import changed_camera
 from companion.calibrate.flight import Calibrated
-from companion.calibrate.lens import Lens
+from companion.calibrate.lens import LensEstimate
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.settings_file import read_settings, validated
 from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
-from mavlink_bridge.whole_file import replace_whole
+from mavlink_bridge.atomic_file import replace_file
 
 _LEAST = {"focal_percent": 0.05, "principal_percent": 0.05, "distortion": 0.001, "stamp_ms": 2.0}
 _JITTER_MS = 2.0  # of stamps, from picture to picture, which the mean does not show
@@ -28,7 +28,7 @@ _SHARE = 0.25  # of a combination's longest part: smaller ones are not named
 
 
 @dataclass(frozen=True)
-class Change:
+class SettingChange:
     """One setting: its key in the file, and its values."""
 
     key: tuple[str, ...]
@@ -36,46 +36,50 @@ class Change:
     after: Any
 
 
-def changes(config: CompanionConfig, found: Calibrated) -> tuple[Change, ...]:
+def changes(config: CompanionConfig, found: Calibrated) -> tuple[SettingChange, ...]:
     """All settings that the flight's numbers replace, together: they were found together."""
     s, told = found.shared, config.camera.model
     camera = changed_camera(found.camera, s)
     size = told.camera().resized(found.camera.width, found.camera.height)
     camera = camera if size == told.camera() else camera.resized(told.width, told.height)
     made = [
-        Change(("camera", "model", name), getattr(told, name), round(getattr(camera, name), 3))
+        SettingChange(
+            ("camera", "model", name), getattr(told, name), round(getattr(camera, name), 3)
+        )
         for name in ("fx", "fy", "cx", "cy")
     ]
     made.append(
-        Change(
+        SettingChange(
             ("camera", "model", "distortion"),
             list(told.distortion), [round(k, 5) for k in camera.distortion],
         )
     )  # fmt: skip
     feed = config.camera.settings
-    late_ms = feed.stamps_late_ms + 1e3 * float(s[u.LATE])
+    late_ms = feed.time_offset_ms + 1e3 * float(s[u.LATE])
     made.append(
-        Change(("camera", "settings", "stamps_late_ms"), feed.stamps_late_ms, round(late_ms, 1))
+        SettingChange(
+            ("camera", "settings", "time_offset_ms"), feed.time_offset_ms, round(late_ms, 1)
+        )
     )
     made += _mounting(config, found)
     arm = [round(float(x), 3) for x in found.arm_m + s[u.ARM]]
-    made.append(Change(("camera", "lever_arm_m"), list(config.camera.lever_arm_m), arm))
+    made.append(SettingChange(("camera", "lever_arm_m"), list(config.camera.lever_arm_m), arm))
     made += _sigmas(config, found)
     return tuple(c for c in made if c.before != c.after)
 
 
-def _mounting(config: CompanionConfig, found: Calibrated) -> list[Change]:
+def _mounting(config: CompanionConfig, found: Calibrated) -> list[SettingChange]:
     mount = found.mount @ so3_exp(found.shared[u.MOUNT])
     angles = np.degrees(euler_from_matrix(mount))
     c = config.bridge.camera
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     return [
-        Change(("bridge", "camera", name), getattr(c, name), round(float(angle), 3))
+        SettingChange(("bridge", "camera", name), getattr(c, name), round(float(angle), 3))
         for name, angle in zip(names, angles, strict=True)
     ]
 
 
-def _sigmas(config: CompanionConfig, found: Calibrated) -> list[Change]:
+def _sigmas(config: CompanionConfig, found: Calibrated) -> list[SettingChange]:
     """What the localizer may now believe of its camera."""
     sigma = found.sigmas
     told = config.localizer.calibration
@@ -86,7 +90,7 @@ def _sigmas(config: CompanionConfig, found: Calibrated) -> list[Change]:
         "stamp_ms": float(np.hypot(1e3 * sigma[u.LATE], _JITTER_MS)),
     }
     return [
-        Change(
+        SettingChange(
             ("localizer", "calibration", name), getattr(told, name),
             round(max(float(value), _LEAST[name]), 4),
         )
@@ -94,7 +98,7 @@ def _sigmas(config: CompanionConfig, found: Calibrated) -> list[Change]:
     ]  # fmt: skip
 
 
-def lens_changes(config: CompanionConfig | None, lens: Lens) -> tuple[Change, ...]:
+def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[SettingChange, ...]:
     """What a board changes; config: None where there is no deployment yet."""
     model = None if config is None else config.camera.model
     told = None if config is None else config.localizer.calibration
@@ -105,7 +109,9 @@ def lens_changes(config: CompanionConfig | None, lens: Lens) -> tuple[Change, ..
         "distortion": [round(k, 5) for k in c.distortion],
     }  # fmt: skip
     made = [
-        Change(("camera", "model", name), None if model is None else getattr(model, name), value)
+        SettingChange(
+            ("camera", "model", name), None if model is None else getattr(model, name), value
+        )
         for name, value in values.items()
     ]
     sigmas = {
@@ -114,7 +120,7 @@ def lens_changes(config: CompanionConfig | None, lens: Lens) -> tuple[Change, ..
         "distortion": float(lens.sigmas[4]),
     }
     made += [
-        Change(
+        SettingChange(
             ("localizer", "calibration", name), None if told is None else getattr(told, name),
             round(max(value, _LEAST[name]), 4),
         )
@@ -123,14 +129,14 @@ def lens_changes(config: CompanionConfig | None, lens: Lens) -> tuple[Change, ..
     return tuple(made)
 
 
-def changed(config: CompanionConfig, wanted: tuple[Change, ...]) -> CompanionConfig:
+def changed(config: CompanionConfig, wanted: tuple[SettingChange, ...]) -> CompanionConfig:
     """The deployment with its changes. `SettingsError` where the result is none."""
     document = config.model_dump()
     _apply(document, wanted)
     return validated(CompanionConfig, document)
 
 
-def _apply(document: dict[str, Any], wanted: tuple[Change, ...]) -> None:
+def _apply(document: dict[str, Any], wanted: tuple[SettingChange, ...]) -> None:
     for change in wanted:
         at = document
         for name in change.key[:-1]:
@@ -140,7 +146,7 @@ def _apply(document: dict[str, Any], wanted: tuple[Change, ...]) -> None:
         at[change.key[-1]] = change.after
 
 
-def require_flown_with(path: Path, wanted: tuple[Change, ...]) -> None:
+def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
     """`ConfigError` where a deployment file is another than the flight's: differences from one
     mounting, written over another's, would be neither's. What was written already may stand there.
     """
@@ -157,14 +163,14 @@ def require_flown_with(path: Path, wanted: tuple[Change, ...]) -> None:
             )
 
 
-def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
+def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -> Path:
     """Replace the deployment file, if the result is one; the old one stays beside it under the name
     that is returned. Both may be read by whom the old one might.
     """
     document = read_settings(path, ConfigError)
     _apply(document, wanted)
     today = datetime.now(timezone.utc).date().isoformat()
-    _apply(document, (Change(("camera", "calibrated"), None, today),))
+    _apply(document, (SettingChange(("camera", "calibrated"), None, today),))
     parse_config(document, f"{path}, as it would be written (nothing was changed)")
     number, kept = 1, path.with_name(f"{path.name}.before-calibration")
     while kept.exists():
@@ -173,8 +179,8 @@ def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
-        replace_whole(kept, path.read_bytes().decode("utf-8"), mode)
-        replace_whole(path, f"# {heading}\n# Before it: {kept.name}\n\n{text}", mode)
+        replace_file(kept, path.read_bytes().decode("utf-8"), mode)
+        replace_file(path, f"# {heading}\n# Before it: {kept.name}\n\n{text}", mode)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
     return kept

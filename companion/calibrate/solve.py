@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.alike import PictureNormals, pictures_part
-from companion.calibrate.evidence import Evidence, Guess
+from companion.calibrate.evidence import CalibrationProblem, Guess
+from companion.calibrate.spatial_correlation import ImageNormalEquations, pictures_part
 from companion.calibrate.wander import AttitudeWander, Wander
 from localizer.geometry.pose import Array
 
@@ -56,7 +56,7 @@ class _Noise:
     place: Wander
 
 
-def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solution:
+def solve(evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None) -> Solution:
     """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value."""
     guess = evidence.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
@@ -92,7 +92,7 @@ def _prior(still: NDArray[np.bool_]) -> Array:
     return prior
 
 
-def _noise(evidence: Evidence, guess: Guess, before: _Noise) -> _Noise:
+def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise:
     off = evidence.pixels(guess)
     squares = (off**2).sum(axis=1)
     sigma = float(np.sqrt(np.median(squares) / (2.0 * np.log(2.0))))
@@ -108,7 +108,7 @@ def _noise(evidence: Evidence, guess: Guess, before: _Noise) -> _Noise:
     return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
 
 
-def _as_told(evidence: Evidence, guess: Guess, noise: _Noise) -> _Noise:
+def _as_told(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> _Noise:
     """Of the covariance that is told: places stray further than they do from picture to picture."""
     placed = evidence.placed
     if not placed.any():
@@ -118,7 +118,7 @@ def _as_told(evidence: Evidence, guess: Guess, noise: _Noise) -> _Noise:
 
 
 def _normal(
-    evidence: Evidence, guess: Guess, noise: _Noise, still: NDArray[np.bool_]
+    evidence: CalibrationProblem, guess: Guess, noise: _Noise, still: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,)."""
     K = len(evidence.times_s)
@@ -157,15 +157,15 @@ def _derivatives(
     return value, by_frame, by_shared
 
 
-def _pictures(evidence: Evidence, guess: Guess, noise: _Noise) -> PictureNormals:
+def _pictures(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> ImageNormalEquations:
     optics = range(*u.OPTICS.indices(u.COUNT))
     value, by_frame, by_shared = _derivatives(evidence.pixels, guess, optics)
     weight = noise.weight / (noise.pixel_sigma**2 * _ALIKE)
     by_optics = by_shared[..., u.OPTICS]
-    return PictureNormals.of(evidence.owner, weight, value, by_frame, by_optics)
+    return ImageNormalEquations.of(evidence.owner, weight, value, by_frame, by_optics)
 
 
-def _add_pictures(pictures: PictureNormals, H: Array, g: Array) -> None:
+def _add_pictures(pictures: ImageNormalEquations, H: Array, g: Array) -> None:
     S, of = u.COUNT, u.OPTICS
     H[of, of] += pictures.shared.sum(axis=0)
     g[of] += pictures.shared_pull.sum(axis=0)
@@ -179,7 +179,7 @@ def _add_pictures(pictures: PictureNormals, H: Array, g: Array) -> None:
 
 def _add_wander(
     function: Callable[[Guess], Array], name: str, wander: Wander | AttitudeWander,
-    evidence: Evidence, guess: Guess, H: Array, g: Array,
+    evidence: CalibrationProblem, guess: Guess, H: Array, g: Array,
 ) -> None:  # fmt: skip
     """One account of the autopilot's: each value less what is left of the one before it."""
     used = evidence.placed if name == "places" else np.ones(len(guess.places), bool)

@@ -27,7 +27,7 @@ _DOWN = ("top", "upper half", "lower half", "bottom")
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """The board in one picture. objects: (N, 3), in squares; pixels: (N, 2), centres at + 0.5;
     signature: (5,) place, size and tilt, one each being a large change.
     """
@@ -46,7 +46,7 @@ class BoardViews:
         self._detector = cv2.aruco.CharucoDetector(self._board)
         self._guess = Camera.from_fov(width, height, 65.0)  # tells a tilt to some degrees
         self._last: tuple[Array, Array] | None = None
-        self.views: list[View] = []
+        self.views: list[BoardView] = []
 
     def take(self, image: Image) -> str:
         """A picture (H, W, 3); what became of it, in words."""
@@ -111,7 +111,7 @@ class BoardViews:
     def _share(self, pixels: Array) -> float:
         return float((np.ptp(pixels, axis=0) / self._size).max())
 
-    def _view(self, objects: Array, pixels: Array) -> View | None:
+    def _view(self, objects: Array, pixels: Array) -> BoardView | None:
         K = self._guess.K
         if np.linalg.matrix_rank(objects[:, :2] - objects[0, :2], tol=1e-6) < 2:
             return None
@@ -122,7 +122,7 @@ class BoardViews:
         normal = normal if normal[2] > 0 else -normal
         tilt = np.degrees(np.arctan2(normal[:2], normal[2])) / 90.0
         middle = pixels.mean(axis=0) / self._size
-        return View(objects, pixels, np.array([*middle, np.log(self._share(pixels)), *tilt]))
+        return BoardView(objects, pixels, np.array([*middle, np.log(self._share(pixels)), *tilt]))
 
 
 def _side_px(ids: Array, pixels: Array) -> float:

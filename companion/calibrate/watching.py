@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.calibrate.views import BoardViews, View
+from companion.calibrate.views import BoardView, BoardViews
 from companion.setup.asking import first_picture
 from companion.sources import SourceSettings, open_source
 from localizer.geometry.camera import Camera
@@ -21,7 +21,7 @@ _QUIET_PICTURES = 30  # of the same word, after which it is said again
 class Filmed:
     """What was seen. missing: what was not."""
 
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     missing: tuple[str, ...]
     width: int
     height: int

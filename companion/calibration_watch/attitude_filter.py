@@ -9,7 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration_watch.sighting import Evidence, Figure, Sighting
+from companion.calibration_watch.observation import (
+    AutopilotObservation,
+    CalibrationEstimate,
+    CalibrationObservation,
+)
 from localizer.geometry.pose import so3_log
 
 Array = NDArray[np.float64]
@@ -32,12 +36,12 @@ class AttitudeFilter:
         self._outliers = 0
 
     @property
-    def boresight_rad(self) -> tuple[Figure, Figure, Figure]:
+    def boresight_rad(self) -> tuple[CalibrationEstimate, CalibrationEstimate, CalibrationEstimate]:
         """By which the camera is off in yaw (about the vertical), pitch and roll."""
         return self._figure(0), self._figure(1), self._figure(2)
 
     @property
-    def late_s(self) -> Figure:
+    def late_s(self) -> CalibrationEstimate:
         """By how much pictures are stamped late, s."""
         return self._figure(_LATE)
 
@@ -45,7 +49,9 @@ class AttitudeFilter:
         """How late pictures are is not known."""
         self._forget([_LATE])
 
-    def take(self, seen: Sighting, known: Evidence, seconds: float) -> None:
+    def take(
+        self, seen: CalibrationObservation, known: AutopilotObservation, seconds: float
+    ) -> None:
         """A sighting so many seconds after the one before."""
         self._cov = self._cov + np.diag(np.square(_WALKS) * min(seconds, 10.0))
         if known.ned_from_camera is None or known.turn is None:
@@ -78,8 +84,8 @@ class AttitudeFilter:
             self._cov[i, :] = self._cov[:, i] = 0.0
             self._cov[i, i] = _SIGMAS[i] ** 2
 
-    def _figure(self, at: int) -> Figure:
-        return Figure(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
+    def _figure(self, at: int) -> CalibrationEstimate:
+        return CalibrationEstimate(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
 
 
 def level_axes(ned_from_camera: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from companion.calibration_watch.sighting import Sighting
+from companion.calibration_watch.observation import CalibrationObservation
 from mavlink_bridge.messages import VehicleState
 
 UNKNOWN_HEIGHT_M = 120.0  # most may fly no higher
@@ -23,9 +23,9 @@ class GroundView:
 
     def __init__(self, horizontal_fov_deg: float) -> None:
         self._fov_deg = horizontal_fov_deg
-        self._newest: Sighting | None = None
+        self._newest: CalibrationObservation | None = None
 
-    def add(self, sighting: Sighting) -> None:
+    def add(self, sighting: CalibrationObservation) -> None:
         """A registered picture that was accepted against the map."""
         self._newest = sighting
 

@@ -13,7 +13,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration_watch.sighting import Evidence, Figure, Sighting
+from companion.calibration_watch.observation import (
+    AutopilotObservation,
+    CalibrationEstimate,
+    CalibrationObservation,
+)
 
 Array = NDArray[np.float64]
 
@@ -46,12 +50,12 @@ class PositionFilter:
         self._zeros: dict[int, float] = {}
 
     @property
-    def focal(self) -> Figure:
+    def focal(self) -> CalibrationEstimate:
         """Share by which the focal length is long."""
         return self._figure(_F)
 
     @property
-    def late_s(self) -> Figure:
+    def late_s(self) -> CalibrationEstimate:
         """By how much pictures are stamped late, s."""
         return self._figure(_T)
 
@@ -84,7 +88,13 @@ class PositionFilter:
         self._x[_V : _V + 2] += faster
         self._cov = transition @ self._cov @ transition.T + noise
 
-    def take(self, place: Array, seen: Sighting, known: Evidence, climb_mps: float) -> None:
+    def take(
+        self,
+        place: Array,
+        seen: CalibrationObservation,
+        known: AutopilotObservation,
+        climb_mps: float,
+    ) -> None:
         """A sighting at `place` (2,), north and east of a fixed point, m."""
         axis = seen.ned_from_camera[:, 2]
         behind = seen.depth_m * axis  # by which a share of 1 would put the camera back
@@ -118,7 +128,13 @@ class PositionFilter:
             self._loosen(_F, 1, keep=True)
             self._contradicted = 0
 
-    def _heights(self, seen: Sighting, known: Evidence, down_m: float, climb_mps: float) -> bool:
+    def _heights(
+        self,
+        seen: CalibrationObservation,
+        known: AutopilotObservation,
+        down_m: float,
+        climb_mps: float,
+    ) -> bool:
         """Vision's height is `focal x down_m` too large, and behind a climb by what it is late.
         Returns whether the other heights agree with what is known.
         """
@@ -161,5 +177,5 @@ class PositionFilter:
             self._cov[i, i] = _SIGMAS[i] ** 2
             self._x[i] = self._x[i] if keep else 0.0
 
-    def _figure(self, at: int) -> Figure:
-        return Figure(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
+    def _figure(self, at: int) -> CalibrationEstimate:
+        return CalibrationEstimate(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))

@@ -13,8 +13,12 @@ from numpy.typing import NDArray
 
 from companion.calibration_watch.attitude_filter import AXES, AttitudeFilter
 from companion.calibration_watch.config import CalibrationLimits
+from companion.calibration_watch.observation import (
+    AutopilotObservation,
+    CalibrationEstimate,
+    CalibrationObservation,
+)
 from companion.calibration_watch.position_filter import PositionFilter
-from companion.calibration_watch.sighting import Evidence, Figure, Sighting
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.pose import matrix_from_quaternion, so3_log
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
@@ -33,7 +37,7 @@ _SPEAKS_AGAINST = 1.5  # sigmas between two accounts of one lateness, of which o
 _KEEPS_NS, _KEPT = 1_000_000_000, 20  # what was known at earlier times
 
 
-class Moved(Protocol):
+class InertialState(Protocol):
     """The IMU's free integral at a time; velocity, position: (2,), north and east, m/s, m."""
 
     @property
@@ -49,7 +53,7 @@ class Moved(Protocol):
         """m."""
 
 
-class Track(Protocol):
+class InertialPath(Protocol):
     """The IMU, integrated on its own. restarts counts the gaps."""
 
     @property
@@ -60,11 +64,11 @@ class Track(Protocol):
     def newest_ns(self) -> int:
         """Until when it reaches."""
 
-    def at(self, time_ns: int) -> Moved | None:
+    def at(self, time_ns: int) -> InertialState | None:
         """The integral at a time."""
 
 
-class Vehicle(Protocol):
+class CalibrationTelemetry(Protocol):
     """What is asked of the vehicle; the bridge is one."""
 
     def state(self) -> VehicleState:
@@ -86,9 +90,9 @@ class CalibrationFigures:
     two accounts; boresight_deg: the worst angle, about `axis`.
     """
 
-    focal: Figure
-    late_s: Figure
-    boresight_deg: Figure
+    focal: CalibrationEstimate
+    late_s: CalibrationEstimate
+    boresight_deg: CalibrationEstimate
     axis: str
 
 
@@ -107,8 +111,8 @@ class CalibrationWatch:
     def __init__(self, limits: CalibrationLimits) -> None:
         self._limits = limits
         self._position, self._attitude = PositionFilter(), AttitudeFilter()
-        self._waiting: deque[Sighting] = deque(maxlen=_QUEUE)
-        self._last: Moved | None = None
+        self._waiting: deque[CalibrationObservation] = deque(maxlen=_QUEUE)
+        self._last: InertialState | None = None
         self._last_ns = 0
         self._restarts = 0
         self._anchor: tuple[float, float] | None = None
@@ -119,7 +123,7 @@ class CalibrationWatch:
         self._kept: deque[_Known] = deque(maxlen=_KEPT)
         self._doubted_ns: int | None = None
 
-    def add(self, sighting: Sighting) -> None:
+    def add(self, sighting: CalibrationObservation) -> None:
         """A registered picture that was accepted against the map."""
         if self._limits.enabled:
             self._waiting.append(sighting)
@@ -142,7 +146,7 @@ class CalibrationWatch:
         """From a time on the stamps may be others: what was known of them before says nothing."""
         self._doubted_ns = since_ns
 
-    def step(self, now_ns: int, vehicle: Vehicle, track: Track) -> None:
+    def step(self, now_ns: int, vehicle: CalibrationTelemetry, track: InertialPath) -> None:
         """Take in what has come; a few times a second."""
         if not self._limits.enabled:
             return
@@ -164,7 +168,7 @@ class CalibrationWatch:
         # An EKF that follows late positions turns its own heading away (5 degrees in 8 s at 10 m/s,
         # ArduPilot): then nobody can tell whether the camera is off, or the EKF.
         sigma = math.inf if not self._on_gnss and _tells(late) else math.degrees(angle.sigma)
-        boresight = Figure(math.degrees(angle.value), sigma)
+        boresight = CalibrationEstimate(math.degrees(angle.value), sigma)
         return CalibrationFigures(self._position.focal, late, boresight, AXES[worst])
 
     def known_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
@@ -172,14 +176,14 @@ class CalibrationWatch:
         focal_m = abs(self._position.focal.value) * self._depth_m if focal else 0.0
         return focal_m + (abs(self._lateness().value) * speed_mps if time else 0.0)
 
-    def _lateness(self) -> Figure:
+    def _lateness(self) -> CalibrationEstimate:
         """The way over ground counts; the turns of the camera only where they say the same.
 
         A gimbal's angles may be late themselves. A camera without gimbal turns with the autopilot's
         own attitude: there the surer account counts, if the other does not speak against it.
         """
         if self._doubted_ns is not None:
-            return Figure(0.0, math.inf)
+            return CalibrationEstimate(0.0, math.inf)
         way, turns = self._position.late_s, self._attitude.late_s
         if not self._fixed:
             return _fused(way, turns) if _tells(way) and _agree(way, turns) else way
@@ -188,9 +192,17 @@ class CalibrationWatch:
         # The autopilot's own attitude may lag, too: then the turns are sure of a time that the way
         # over ground does not have, long before the way is sure of its own.
         contradicted = other.is_within(limit) or not _agree(surer, other, _SPEAKS_AGAINST)
-        return Figure(0.0, math.inf) if surer.exceeds(limit) and contradicted else surer
+        return (
+            CalibrationEstimate(0.0, math.inf) if surer.exceeds(limit) and contradicted else surer
+        )
 
-    def _take(self, seen: Sighting, state: VehicleState, vehicle: Vehicle, track: Track) -> None:
+    def _take(
+        self,
+        seen: CalibrationObservation,
+        state: VehicleState,
+        vehicle: CalibrationTelemetry,
+        track: InertialPath,
+    ) -> None:
         gap_s = (seen.time_ns - self._last_ns) * 1e-9
         self._last_ns = seen.time_ns
         self._depth_m = seen.depth_m
@@ -222,7 +234,9 @@ class CalibrationWatch:
         climb = -(state.local_velocity_ned or (0.0, 0.0, 0.0))[2]
         self._position.take(place, seen, known, climb)
 
-    def _evidence(self, seen: Sighting, state: VehicleState, vehicle: Vehicle) -> Evidence:
+    def _evidence(
+        self, seen: CalibrationObservation, state: VehicleState, vehicle: CalibrationTelemetry
+    ) -> AutopilotObservation:
         t = seen.time_ns
         reported = [vehicle.gimbal_at(t + dt) for dt in (0, -_RATE_NS, _RATE_NS)]
         self._fixed = reported[0] is not None and reported[0].source == "fixed"
@@ -230,7 +244,7 @@ class CalibrationWatch:
         turn = None
         if before is not None and after is not None:
             turn = so3_log(after @ before.T) * (1e9 / (2 * _RATE_NS))
-        return Evidence(
+        return AutopilotObservation(
             now,
             turn,
             _gnss_offset(seen, state, vehicle.gnss_place_at(t)),
@@ -257,19 +271,19 @@ class _History:
         return float(np.interp(time_ns, times, values))
 
 
-def _tells(figure: Figure) -> bool:
+def _tells(figure: CalibrationEstimate) -> bool:
     """Whether it says anything but zero."""
     return abs(figure.value) > 2.0 * figure.sigma
 
 
-def _agree(a: Figure, b: Figure, sigmas: float = 3.0) -> bool:
+def _agree(a: CalibrationEstimate, b: CalibrationEstimate, sigmas: float = 3.0) -> bool:
     return abs(a.value - b.value) < sigmas * math.hypot(a.sigma, b.sigma)
 
 
-def _fused(a: Figure, b: Figure) -> Figure:
+def _fused(a: CalibrationEstimate, b: CalibrationEstimate) -> CalibrationEstimate:
     """Both accounts, each by its variance."""
     wa, wb = 1.0 / a.sigma**2, 1.0 / b.sigma**2
-    return Figure((wa * a.value + wb * b.value) / (wa + wb), 1.0 / math.sqrt(wa + wb))
+    return CalibrationEstimate((wa * a.value + wb * b.value) / (wa + wb), 1.0 / math.sqrt(wa + wb))
 
 
 def _camera(gimbal: GimbalAttitude | None) -> Array | None:
@@ -279,7 +293,7 @@ def _camera(gimbal: GimbalAttitude | None) -> Array | None:
 
 
 def _gnss_offset(
-    seen: Sighting, state: VehicleState, place: tuple[float, ...] | None
+    seen: CalibrationObservation, state: VehicleState, place: tuple[float, ...] | None
 ) -> tuple[float, float] | None:
     """North and east of the EKF from the sighting, if the EKF is where the receiver is."""
     if place is None or state.gps_latitude_deg is None or state.gps_longitude_deg is None:

@@ -19,7 +19,7 @@ from companion.settings_file import SettingsError, validated
 from companion.terminal.console_log import console_log
 
 if TYPE_CHECKING:
-    from companion.console.server import Site
+    from companion.console.server import ConsoleSite
 
 _NICE = 10  # below what flies, which starts it
 _LOWEST = 19
@@ -51,14 +51,14 @@ def console_command(
     from companion.console.flight_source import FlightSource
     from companion.console.records import Records
     from companion.console.security import read_token
-    from companion.console.server import Site
+    from companion.console.server import ConsoleSite
     from companion.live.protocol import socket_path
 
     record = None if settings.record is None else settings.record.folder
     source = FlightSource(socket_path(settings.map, record, meeting))
     records = Records(None if record is None else record.parent)
     token = read_token(given.token_file)
-    serve(Site(given, source, settings.map, records, config.absolute(), token))
+    serve(ConsoleSite(given, source, settings.map, records, config.absolute(), token))
 
 
 def require_extra() -> None:
@@ -70,7 +70,7 @@ def require_extra() -> None:
         raise ConfigError(f"install pilot-companion[console] for the console: {error}") from error
 
 
-def serve(site: Site) -> None:
+def serve(site: ConsoleSite) -> None:
     """Serve until interrupted. The address is printed once it can be opened."""
     from companion.console.serving import Server
 

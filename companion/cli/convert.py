@@ -19,7 +19,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
 
 
-class Source(str, Enum):
+class InputFormat(str, Enum):
     """What is read."""
 
     POSES = "poses"
@@ -30,7 +30,7 @@ class Source(str, Enum):
     RECORD = "record"
 
 
-class Target(str, Enum):
+class OutputFormat(str, Enum):
     """What is written."""
 
     POSES = "poses"
@@ -52,8 +52,8 @@ def convert_command(
         Path, typer.Argument(help="a file; a folder for photos and for the record of a flight")
     ],
     out: Annotated[Path, typer.Argument(help="file to write; a folder of sidecars for photos")],
-    of: Annotated[Source, typer.Option("--from", help="format of the source")],
-    to: Annotated[Target, typer.Option("--to", help="format of the result")],
+    of: Annotated[InputFormat, typer.Option("--from", help="format of the source")],
+    to: Annotated[OutputFormat, typer.Option("--to", help="format of the result")],
     map_cache: Annotated[
         Path | None, typer.Option("--map", help="tile cache whose ENU frame is meant")
     ] = None,
@@ -72,7 +72,7 @@ def convert_command(
     ] = None,
 ) -> None:
     """Convert camera poses: pose lines, TUM, COLMAP, photos' tags, autopilot angles, records."""
-    from companion.convert.formats import READERS, WRITERS, Place
+    from companion.convert.formats import READERS, WRITERS, MapReference
     from companion.convert.photos import Heights
 
     frame, separation = _frame(map_cache, origin)
@@ -83,9 +83,9 @@ def convert_command(
         if heights is HeightDatum.AMSL and separation is None:
             raise ConfigError("--heights amsl needs --geoid-separation or --map")
         above = Heights(heights.value, separation or 0.0)
-    place = Place(frame, above)
+    place = MapReference(frame, above)
     with shown_work(Console(stderr=True), f"converting {source}"):
-        poses = _dated(READERS[of.value](source, place), times, needed=to is Target.TUM)
+        poses = _dated(READERS[of.value](source, place), times, needed=to is OutputFormat.TUM)
         with writing(out):
             WRITERS[to.value](out, poses, place)
     typer.echo(f"{out}: {len(poses)} poses")

@@ -21,7 +21,7 @@ from rich.text import Text
 from companion.config import load_config
 from companion.terminal.steps import shown_steps, shown_work
 from companion.versions import made_by
-from mavlink_bridge.preflight.doctor import Diagnosis, Finding
+from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 
 def doctor_command(
@@ -95,7 +95,7 @@ def print_diagnosis(console: Console, diagnosis: Diagnosis, left_out: Sequence[s
         console.print(f"{name}: not examined", style="yellow", highlight=False)
 
 
-def _mark(finding: Finding) -> str:
+def _mark(finding: DoctorFinding) -> str:
     if finding.ok:
         return "[green]ok[/]"
     return "[red]wrong[/]" if finding.required else "[yellow]advice[/]"

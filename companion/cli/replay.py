@@ -79,7 +79,7 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
     require_extra()
     from companion.console.records import Records
     from companion.console.replay_source import ReplaySource
-    from companion.console.server import Site
+    from companion.console.server import ConsoleSite
     from companion.reporting.pictures import map_pictures
     from companion.reporting.record import read_record
 
@@ -101,4 +101,4 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
             say(note)
         records = Records(record.absolute().parent)
         say(f"serving {config.url} until Ctrl-C")
-        serve(Site(config, source, map_path, records, replay=True))
+        serve(ConsoleSite(config, source, map_path, records, replay=True))

@@ -38,7 +38,7 @@ def run_command(
     ] = False,
     standby: Annotated[bool, typer.Option(hidden=True)] = False,
     pulse: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,
-    again: Annotated[bool, typer.Option("--again", hidden=True)] = False,
+    restart: Annotated[bool, typer.Option("--restart", "--again", hidden=True)] = False,
     kept: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
@@ -62,7 +62,7 @@ def run_command(
     settings = settings.model_copy(update={"localizer": localizer})
     from companion.flight.standby import ready
 
-    companion = ready(settings, standby=standby, pulse=pulse, again=again, lost_settings=lost)
+    companion = ready(settings, standby=standby, pulse=pulse, restart=restart, lost_settings=lost)
     if companion is None:
         return
 
@@ -88,7 +88,7 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     from companion.supervision.processes import FlightProcess
     from companion.supervision.service_manager import ServiceManager
     from companion.supervision.supervisor import Supervisor, mark_dead
-    from mavlink_bridge.vehicle.last_words import say_without_bridge
+    from mavlink_bridge.vehicle.crash_notifier import say_without_bridge
 
     command = [sys.executable, "-m", "companion", "run", *arguments]
     record = settings.record
@@ -101,8 +101,8 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     def spawn(standby: bool) -> FlightProcess:
         if not next(begun):
             return FlightProcess(command, standby=standby)
-        again = [*command, f"--kept={kept}", "--again"]
-        return FlightProcess(again, standby=standby, hands_on=(kept,))
+        restart = [*command, f"--kept={kept}", "--restart"]
+        return FlightProcess(restart, standby=standby, hands_on=(kept,))
 
     supervisor = Supervisor(
         spawn,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.console.source import Newest
-from companion.live.protocol import Decoder, LinkError, Message, encode
+from companion.live.protocol import LinkError, Message, MessageDecoder, encode
 from companion.live.shared import Arrivals
 
 _log = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ class FlightSource:
 
     async def _read(self, connection: socket.socket, arrivals: Arrivals) -> None:
         """What came until now is taken whole; of it the newest is shown."""
-        loop, decoder = asyncio.get_running_loop(), Decoder()
+        loop, decoder = asyncio.get_running_loop(), MessageDecoder()
         readable = asyncio.Event()
         loop.add_reader(connection, readable.set)
         try:

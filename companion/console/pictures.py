@@ -30,7 +30,7 @@ WIDTHS_PX = (480, 640, 800, 960)  # of the pictures that pages get, so that they
 
 
 @dataclass(frozen=True)
-class View:
+class ReferenceImage:
     """The reference view: rgb (h, w, 3), depth (h, w) m along the axis, 0 where nothing is."""
 
     rgb: np.ndarray
@@ -40,7 +40,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Picture:
+class OverlayFrame:
     """A frame with its pose and reference; both None while nothing is localized. camera: of the
     image as it was sent.
     """
@@ -48,10 +48,10 @@ class Picture:
     image: np.ndarray
     camera: Camera
     pose: Pose | None
-    view: View | None
+    view: ReferenceImage | None
 
 
-def unpack(message: Message) -> Picture:
+def unpack(message: Message) -> OverlayFrame:
     """The arrays of a frame's message."""
     head, body = message.head, message.body
     width, height = head["image"]
@@ -66,8 +66,10 @@ def unpack(message: Message) -> Picture:
         n = seen.width * seen.height
         rgb = np.frombuffer(body, np.uint8, 3 * n, size).reshape(seen.height, seen.width, 3)
         depth = np.frombuffer(body, np.float32, n, size + 3 * n)
-        view = View(rgb, depth.reshape(seen.height, seen.width), seen, _pose(shown["pose"]))
-    return Picture(image, camera, pose, view)
+        view = ReferenceImage(
+            rgb, depth.reshape(seen.height, seen.width), seen, _pose(shown["pose"])
+        )
+    return OverlayFrame(image, camera, pose, view)
 
 
 def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]) -> bytes:
@@ -100,7 +102,7 @@ def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]
     return struct.pack("<I", len(text)) + text + b"".join(parts)
 
 
-def narrowed(picture: Picture, width_px: int) -> Picture:
+def narrowed(picture: OverlayFrame, width_px: int) -> OverlayFrame:
     """No wider than that: what a screen cannot show is neither sent nor drawn."""
     camera = picture.camera
     if camera.width <= width_px:
@@ -116,7 +118,7 @@ def utc_ms(monotonic_ns: int) -> float:
     return time.time() * 1e3 - (time.monotonic_ns() - monotonic_ns) * 1e-6
 
 
-def edges(picture: Picture) -> np.ndarray:
+def edges(picture: OverlayFrame) -> np.ndarray:
     """Where the map's edges lie in the picture at the estimated pose: (n, 2) uint16 pixels."""
     nothing = np.empty((0, 2), np.uint16)
     view = picture.view
@@ -134,7 +136,7 @@ def edges(picture: Picture) -> np.ndarray:
     return np.asarray(pixels[inside], np.uint16)
 
 
-def map_at_pose(picture: Picture) -> np.ndarray | None:
+def map_at_pose(picture: OverlayFrame) -> np.ndarray | None:
     """The map as the camera saw it from the estimated pose, distortion included, half size.
 
     For each pixel the ray is followed to the depth that the reference has where it passes; the
@@ -177,7 +179,7 @@ def _between_knots(at: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.asarray(cv2.remap(at, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def footprint(picture: Picture) -> list[list[float]]:
+def footprint(picture: OverlayFrame) -> list[list[float]]:
     """The corners of what the reference sees, (east, north) m; those in the sky are left out."""
     view = picture.view
     if view is None:
@@ -192,7 +194,7 @@ def footprint(picture: Picture) -> list[list[float]]:
     return [[float(e), float(n)] for e, n, _ in points]
 
 
-def _world(view: View, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def _world(view: ReferenceImage, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
     rays = view.camera.rays(np.stack([u, v], axis=-1))
     return np.asarray(view.pose.apply(rays * depth[:, None].astype(np.float64)))
 

@@ -1,4 +1,4 @@
-"""The page's server: Starlette behind `security.Guarded`, fed by a `Source`."""
+"""The page's server: Starlette behind `security.Guarded`, fed by a `ConsoleSource`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from companion.console.examination import Examination
 from companion.console.pictures import WIDTHS_PX, page_message
 from companion.console.records import Records, archive
 from companion.console.security import REPORT_POLICY, Guarded
-from companion.console.source import Source, sample_of
+from companion.console.source import ConsoleSource, sample_of
 from companion.console.tiles import TileName, TopTiles
 from companion.errors import CompanionError
 from companion.live.config import ConsoleConfig
@@ -41,13 +41,13 @@ Answer = Callable[[Request], Awaitable[Response]]
 
 
 @dataclass(frozen=True)
-class Site:
+class ConsoleSite:
     """What the server serves. deployment: the file, None in a replay; token: needed of everybody,
     None on loopback without one.
     """
 
     config: ConsoleConfig
-    source: Source
+    source: ConsoleSource
     map_path: Path
     records: Records
     deployment: Path | None = None
@@ -62,7 +62,7 @@ class RefusedError(CompanionError):
 class Pages:
     """The pages that are open, and the pictures that they share."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: ConsoleSource) -> None:
         self._source = source
         self._open: dict[int, dict[str, Any]] = {}
         self._made: dict[tuple[bool, int], tuple[int, bytes]] = {}
@@ -160,7 +160,7 @@ def _width_px(wished: Any) -> int:
 class Views:
     """One method an address. Errors that have a name become one line."""
 
-    def __init__(self, site: Site) -> None:
+    def __init__(self, site: ConsoleSite) -> None:
         self._site = site
         self._tiles: TopTiles | None = None
         self._examination = None if site.deployment is None else Examination(site.deployment)
@@ -302,7 +302,7 @@ class Views:
             raise RefusedError("not while the vehicle is armed")
 
 
-def make_application(site: Site) -> Guarded:
+def make_application(site: ConsoleSite) -> Guarded:
     """The whole site."""
     views, pages = Views(site), Pages(site.source)
 

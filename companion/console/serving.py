@@ -14,7 +14,7 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from companion.console.server import Site, make_application
+from companion.console.server import ConsoleSite, make_application
 
 REQUEST_S = 10.0  # from the connection, or from a request's first byte, to its last
 MOST_WAITING = 32  # connections without a whole request: one more, and the oldest goes
@@ -77,7 +77,7 @@ class HurriedProtocol(H11Protocol):
 class Server(uvicorn.Server):
     """The site's server. told: called once the page can be opened."""
 
-    def __init__(self, site: Site, told: Callable[[], None]) -> None:
+    def __init__(self, site: ConsoleSite, told: Callable[[], None]) -> None:
         config = site.config
         super().__init__(
             uvicorn.Config(

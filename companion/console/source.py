@@ -52,7 +52,7 @@ class Newest:
         return bool(vehicle.get("armed")) if vehicle.get("connected") else None
 
 
-class Source(Protocol):
+class ConsoleSource(Protocol):
     """A flight, or a record."""
 
     @property
@@ -86,7 +86,7 @@ def sample_of(state: dict[str, Any]) -> dict[str, Any]:
     """One second of the plots: t in seconds of UTC; what is not known is None."""
     estimate = state.get("estimate") or {}
     health = state.get("health") or {}
-    guardian = health.get("guardian") or {}
+    integrity_monitor = health.get("guardian") or {}
     machine = state.get("machine") or {}
     vehicle = state.get("vehicle") or {}
     stages = estimate.get("stages_ms") or {}
@@ -94,7 +94,7 @@ def sample_of(state: dict[str, Any]) -> dict[str, Any]:
     return {
         "t": (state.get("utc_ns") or 0) * 1e-9,
         "sigma_m": estimate.get("sigma_m") if accepted else None,
-        "hpl_m": guardian.get("hpl_m"),
+        "hpl_m": integrity_monitor.get("hpl_m"),
         "residual_m": state.get("gnss_residual_m"),
         "quality": estimate.get("quality"),
         "rate_hz": health.get("rate_hz"),

@@ -39,7 +39,7 @@ _IMAGES_TXT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 
 @dataclass(frozen=True)
-class Place:
+class MapReference:
     """What is known of the map. heights: of photos' tags, None if not known."""
 
     map_frame: LocalFrame | None
@@ -55,32 +55,32 @@ class Place:
         return self.map_frame
 
 
-Reader = Callable[[Path, Place], tuple[StampedPose, ...]]
-Writer = Callable[[Path, Sequence[StampedPose], Place], None]
+Reader = Callable[[Path, MapReference], tuple[StampedPose, ...]]
+Writer = Callable[[Path, Sequence[StampedPose], MapReference], None]
 
 
-def _read_poses(path: Path, place: Place) -> tuple[StampedPose, ...]:
+def _read_poses(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     return tuple(
         StampedPose(row.name, world_from_camera(row, place.frame)) for row in read_poses(path)
     )
 
 
-def _write_poses(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+def _write_poses(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
     for pose in poses:
         if not pose.name or pose.name.split() != [pose.name]:
             raise PoseFileError(f"{path}: a pose line cannot hold the name {pose.name!r}")
     write_poses(path, (pose_row(p.name, p.world_from_camera, place.frame) for p in poses))
 
 
-def _read_tum(path: Path, place: Place) -> tuple[StampedPose, ...]:
+def _read_tum(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     return read_tum(path)
 
 
-def _write_tum(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+def _write_tum(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
     write_tum(path, poses)
 
 
-def _read_colmap(path: Path, place: Place) -> tuple[StampedPose, ...]:
+def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     """Poses of an ``images.txt``: camera from world, two lines an image, the second of points."""
     rows = [
         (number, line)
@@ -108,7 +108,7 @@ def _parse_colmap(line: str, where: str) -> StampedPose:
     return StampedPose(parts[9].strip(), Pose(matrix_from_quaternion(q), t).inverse)
 
 
-def _write_colmap(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+def _write_colmap(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
     lines = [f"# {_IMAGES_TXT}\n# world: the map's ENU frame, metres; no points\n"]
     for number, pose in enumerate(poses, start=1):
         inverse = pose.world_from_camera.inverse
@@ -118,7 +118,7 @@ def _write_colmap(path: Path, poses: Sequence[StampedPose], place: Place) -> Non
     path.write_text("".join(lines), encoding="utf-8")
 
 
-def _read_autopilot(path: Path, place: Place) -> tuple[StampedPose, ...]:
+def _read_autopilot(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     poses = []
     for number, row in enumerate(csv.DictReader(_lines(path)), start=2):
         angles = _autopilot_row(row, f"{path}:{number}")
@@ -149,7 +149,7 @@ def _autopilot_row(row: dict[str, Any], where: str) -> AutopilotAngles:
         ) from error
 
 
-def _write_autopilot(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+def _write_autopilot(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(AUTOPILOT_COLUMNS)
@@ -168,7 +168,7 @@ def _flat(angles: Iterable[Angles]) -> Iterable[float]:
         yield from (a.roll_deg, a.pitch_deg, a.yaw_deg)
 
 
-def _read_record(path: Path, place: Place) -> tuple[StampedPose, ...]:
+def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     """The accepted estimates of a flight's record (its folder, or its ``estimates.csv``)."""
     from companion.offline.replay import read_estimates
 
@@ -180,11 +180,11 @@ def _read_record(path: Path, place: Place) -> tuple[StampedPose, ...]:
     )
 
 
-def _read_photos(path: Path, place: Place) -> tuple[StampedPose, ...]:
+def _read_photos(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     return read_photos(path, place.frame, place.heights)
 
 
-def _write_photos(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+def _write_photos(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
     write_sidecars(path, poses, place.frame, place.heights)
 
 

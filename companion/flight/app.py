@@ -1,7 +1,7 @@
 """The companion process: the table of parts made, started, and stopped in order.
 
 Data flows one way: feed -> engine -> (bridge, targets, recorder), over the channels of
-`companion.flight.channels`. What runs stands in `companion.flight.table`.
+`companion.flight.channels`. What runs stands in `companion.flight.component_table`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from contextlib import ExitStack
 from typing import Any
 
 from companion.config import CompanionConfig
+from companion.flight.component_table import COMPONENTS
+from companion.flight.components import Assembly, Component
 from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
-from companion.flight.parts import Assembly, Part
 from companion.flight.recorder import RecordKeeper
-from companion.flight.table import PARTS
-from companion.guardian.guardian import Guardian
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.redaction import redacted
-from companion.supervision.again import without_lost_disks
 from companion.supervision.pulse import Pulse
+from companion.supervision.restart import without_lost_disks
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack
 from mavlink_bridge.bridge import Bridge
@@ -45,13 +45,13 @@ class Companion:
     def __init__(
         self,
         config: CompanionConfig,
-        parts: Sequence[Part[Any]] = PARTS,
+        parts: Sequence[Component[Any]] = COMPONENTS,
         pulse: int | None = None,
         *,
-        again: bool = False,
+        restart: bool = False,
         lost_settings: str = "",
     ) -> None:
-        self._config, self._again = config, again
+        self._config, self._restart = config, restart
         self._lost_settings = lost_settings
         self._parts = Assembly(config, parts)
         self._pulse = pulse
@@ -81,7 +81,7 @@ class Companion:
         sys.setswitchinterval(_SWITCH_S)
         self._parts.channels.events.subscribe(_log_event)
         lost = ""
-        if self._again:
+        if self._restart:
             self._parts.config, lost = without_lost_disks(self._config)
         with self._up as up:
             try:
@@ -98,24 +98,24 @@ class Companion:
             try:
                 feed = self._fly(up, lost)
             except BaseException:
-                self._parts.leave()
+                self._parts.hand_over()
                 raise
             if feed.error is not None and not self._is_stopping:
-                self._parts.leave()
+                self._parts.hand_over()
         if feed.error is not None:
             raise feed.error
 
     def _fly(self, up: ExitStack, lost: str) -> Feed:
         """From the start of the parts to the end of the feed, or to the order to stop."""
         self._parts.start(up)
-        guardian = self._parts.get(Guardian)
-        if guardian is not None:
-            guardian.watch(self._untold_turns)
+        integrity_monitor = self._parts.get(IntegrityMonitor)
+        if integrity_monitor is not None:
+            integrity_monitor.watch(self._untold_turns)
         if self._pulse is not None:
             pulse = Pulse(self._turns, self._pulse)
             pulse.start()
             # First of all: what comes down takes no turns.
-            up.push(lambda error, *_: pulse.stop(in_order=self._is_in_order(error)))
+            up.push(lambda error, *_: pulse.stop(clean_shutdown=self._is_clean_shutdown(error)))
         self._tell_what_runs(lost)
         feed = self._parts[Feed]
         # In slices: signals are handled between them.
@@ -140,23 +140,25 @@ class Companion:
         for undo in self._parts.abandonments:
             undo()
 
-    def _is_in_order(self, error: type[BaseException] | None) -> bool:
+    def _is_clean_shutdown(self, error: type[BaseException] | None) -> bool:
         """Whether `run` comes to an end as it should. error: what ends it, or None."""
         return error is None and self._parts[Feed].error is None
 
     def _turns(self) -> dict[str, int]:
         """When each thread without which no position comes began its newest turn, ns, by name."""
-        parts, turns = self._parts, self._parts[DualThreadEngine].turns()
-        turns |= {"feed": parts[Feed].turn_ns, **parts[Bridge].turns()}
-        health, guardian = parts.get(HealthMonitor), parts.get(Guardian)
-        turns |= {} if health is None else {"health": health.turn_ns}
-        return turns | ({} if guardian is None else {"guardian": guardian.turn_ns})
+        parts, last_ticks_ns = self._parts, self._parts[DualThreadEngine].last_ticks_ns()
+        last_ticks_ns |= {"feed": parts[Feed].last_tick_ns, **parts[Bridge].last_ticks_ns()}
+        health, integrity_monitor = parts.get(HealthMonitor), parts.get(IntegrityMonitor)
+        last_ticks_ns |= {} if health is None else {"health": health.last_tick_ns}
+        return last_ticks_ns | (
+            {} if integrity_monitor is None else {"guardian": integrity_monitor.last_tick_ns}
+        )
 
     def _untold_turns(self) -> dict[str, int]:
         """The turns of what nobody else tells of. What hangs on a frame's way, health tells."""
         health = self._parts.get(HealthMonitor)
         ends = self._is_stopping or self._parts[Feed].ended.is_set()
-        return {} if health is None or ends else {"health": health.turn_ns}
+        return {} if health is None or ends else {"health": health.last_tick_ns}
 
     def _tell_what_runs(self, lost: str) -> None:
         events = self._parts.channels.events

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, ParamSpec
 
-from companion.targets.population import Target
+from companion.targets.target_manager import TargetEstimate
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.messages import TrackRequest
 
@@ -48,7 +48,7 @@ class Channels:
     """Every frame of the camera, on the feed's thread."""
     estimates: Channel[[PoseEstimate, ReferenceBundle]] = field(default_factory=Channel)
     """Every estimate, accepted or not, with its reference view, on the localization thread."""
-    targets: Channel[[Target]] = field(default_factory=Channel)
+    targets: Channel[[TargetEstimate]] = field(default_factory=Channel)
     """Every located target, on the targets' thread."""
     gone: Channel[[str]] = field(default_factory=Channel)
     """The name of every target that ended, on the targets' thread."""

@@ -39,7 +39,7 @@ class Feed:
         joined(self._thread)
 
     @property
-    def turn_ns(self) -> int:
+    def last_tick_ns(self) -> int:
         """Since when a frame is being handed on, CLOCK_MONOTONIC; now while the next is awaited."""
         taken_ns = self._taken_ns
         return time.monotonic_ns() if taken_ns is None else taken_ns

@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.ending import joined
 from companion.flight.search import NOT_READY
-from companion.guardian.guardian import Guardian
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.sources import StreamState
 from companion.writing import NewestFile
 from localizer.tracking.engine_health import EngineHealth
@@ -55,15 +55,15 @@ _OF_STATE = {
 
 
 @dataclass(frozen=True)
-class Besides:
+class HealthInputs:
     """What else may say how well it goes: is the record complete, the autopilot's own idea of its
-    position's sigma in metres, the guardian, nodes of the map that cannot be read, the map's shift,
+    position's sigma in metres, the monitor, nodes of the map that cannot be read, the map's shift,
     counts of targets, why a lost place cannot be searched.
     """
 
     is_recorded: Callable[[], bool] = lambda: True
     position_sigma_m: Callable[[], float | None] = lambda: None
-    guardian: Guardian | None = None
+    integrity_monitor: IntegrityMonitor | None = None
     unreadable_nodes: Callable[[], int] = lambda: 0
     map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None
     targets: Callable[[], dict[str, int]] = dict
@@ -80,18 +80,18 @@ class HealthMonitor:
         feed_state: Callable[[], StreamState],
         event: Callable[[str, str], None],
         record_folder: Path | None,
-        besides: Besides | None = None,
+        inputs: HealthInputs | None = None,
     ) -> None:
-        besides = besides or Besides()
+        inputs = inputs or HealthInputs()
         self._engine_health = engine_health
         self._bridge = bridge
         self._feed_state = feed_state
-        self._is_recorded = besides.is_recorded
-        self._position_sigma_m = besides.position_sigma_m
-        self._guardian = besides.guardian
-        self._unreadable_nodes = besides.unreadable_nodes
-        self._map_shift, self._targets = besides.map_shift, besides.targets
-        self._search_lacks = besides.search_lacks
+        self._is_recorded = inputs.is_recorded
+        self._position_sigma_m = inputs.position_sigma_m
+        self._integrity_monitor = inputs.integrity_monitor
+        self._unreadable_nodes = inputs.unreadable_nodes
+        self._map_shift, self._targets = inputs.map_shift, inputs.targets
+        self._search_lacks = inputs.search_lacks
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
@@ -99,7 +99,7 @@ class HealthMonitor:
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._came: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._failures = 0
-        self.turn_ns = time.monotonic_ns()
+        self.last_tick_ns = time.monotonic_ns()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
@@ -108,7 +108,9 @@ class HealthMonitor:
         """Start watching."""
         if self._file is not None:
             self._file.start()
-        self.turn_ns = time.monotonic_ns()  # since it was made, kernels were compiled for a minute
+        self.last_tick_ns = (
+            time.monotonic_ns()
+        )  # since it was made, kernels were compiled for a minute
         self._thread.start()
 
     def stop(self) -> None:
@@ -129,7 +131,7 @@ class HealthMonitor:
     def _run(self) -> None:
         while True:
             stopping = self._stop.wait(_PERIOD_S)
-            self.turn_ns = time.monotonic_ns()
+            self.last_tick_ns = time.monotonic_ns()
             try:
                 self._report()
             except Exception:  # or the heartbeats would go on with the last level for ever
@@ -142,7 +144,7 @@ class HealthMonitor:
     def _report(self) -> None:
         level, text = self.assess()
         # The bridge logs and records what it tells; a silent vehicle it tells by itself, and what
-        # keeps positions from the EKF; the guardian tells what it withholds.
+        # keeps positions from the EKF; the monitor tells what it withholds.
         if self._ended:
             if self._stop.is_set():
                 self._bridge.say(_NOTICE, "PiLoT: ending, nothing is injected any more")
@@ -179,15 +181,15 @@ class HealthMonitor:
         level, text = _OF_STATE[estimate.state]
         if estimate.state is TrackingState.BRIDGING:
             level, text = _bridging(estimate)
-        trouble = self._bridge.trouble
-        if level is HealthLevel.OK and trouble:
-            level, text = HealthLevel.DEGRADED, _NOT_USED + trouble
+        injection_fault = self._bridge.injection_fault
+        if level is HealthLevel.OK and injection_fault:
+            level, text = HealthLevel.DEGRADED, _NOT_USED + injection_fault
         if level is HealthLevel.OK and (lacks := self._lacks(engine)) not in ("", NOT_READY):
             level, text = HealthLevel.DEGRADED, f"tracking, but {lacks}"
         overload = self._overload(engine)
         if overload and level is HealthLevel.OK:
             level, text = HealthLevel.DEGRADED, overload
-        withheld = self._guardian.reason if self._guardian is not None else ""
+        withheld = self._integrity_monitor.reason if self._integrity_monitor is not None else ""
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):
@@ -251,11 +253,11 @@ class HealthMonitor:
 
     def _guardian_report(self) -> dict[str, Any] | None:
         """Standing findings with their figures, and the newest protection level."""
-        if self._guardian is None:
+        if self._integrity_monitor is None:
             return None
-        level = self._guardian.level
+        level = self._integrity_monitor.level
         return {
-            "findings": self._guardian.standing(),
+            "findings": self._integrity_monitor.standing(),
             "hpl_m": None if level is None else level.horizontal_m,
             "vpl_m": None if level is None else level.vertical_m,
         }

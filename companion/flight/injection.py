@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from companion.conversions import Installation, vision_fix
-from companion.guardian.findings import UNJUDGED, Latch, Reading
+from companion.conversions import CameraExtrinsics, vision_fix
+from companion.integrity_monitor.alert_rules import UNJUDGED, AlertDebouncer, CheckResult
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.injection.fix_queue import PendingJump
@@ -66,12 +66,12 @@ class FixInjection:
     take, and a fix's age counts.
     """
 
-    def __init__(self, bridge: Bridge, installation: Installation) -> None:
+    def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:
         self._bridge = bridge
-        self._installation = installation
+        self._extrinsics = extrinsics
         self._jump = JumpPolicy()
         self._judges: tuple[Judge, ...] = ()
-        self._unjudged = Latch(UNJUDGED)
+        self._unjudged = AlertDebouncer(UNJUDGED)
 
     def add_judge(self, judge: Judge) -> None:
         """Have `judge` asked about every fix from now on, after those that are there already."""
@@ -85,7 +85,7 @@ class FixInjection:
         time_ns = estimate.exposure_time_ns
         fix: VisionFix | None = vision_fix(
             estimate,
-            self._installation,
+            self._extrinsics,
             self._bridge.attitude_at(time_ns),
             self._bridge.gimbal_at(time_ns),
             reset=self._jump.is_due,
@@ -105,7 +105,7 @@ class FixInjection:
             if not self._unjudged.raised:
                 _log.exception("a fix could not be judged")
             failed, fix = True, None
-        text = self._unjudged.update(estimate.exposure_time_ns, Reading(failed))
+        text = self._unjudged.update(estimate.exposure_time_ns, CheckResult(failed))
         if text is not None:
             self._bridge.say(_ERROR if self._unjudged.raised else _NOTICE, text)
         return fix

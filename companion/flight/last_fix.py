@@ -21,15 +21,15 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import PriorConfig
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.ending import joined
 from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from mavlink_bridge.atomic_file import read_small_file, replace_file
 from mavlink_bridge.link.clock import boot_id
 from mavlink_bridge.messages import Origin, VehicleState
-from mavlink_bridge.whole_file import read_whole, replace_whole
 
 _log = logging.getLogger(__name__)
 _WRITE_S = 0.5
@@ -88,7 +88,7 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
         if status.st_uid != os.geteuid() or status.st_mode & 0o022:
             _log.warning("%s may be written by others: ignored", path)
             return None
-        row = json.loads(read_whole(path))
+        row = json.loads(read_small_file(path))
         north, east, down = (float(v) for v in row["local_ned"])
         since, origin = row.get("autopilot_ns"), row.get("origin")
         counted = None if origin is None else tuple(float(v) for v in origin)
@@ -135,13 +135,13 @@ class FixMemory:
         path: Path | None,
         config: PriorConfig,
         autopilot: AutopilotPose,
-        installation: Installation,
+        extrinsics: CameraExtrinsics,
         local_at: LocalAt,
         trusted: Callable[[], bool] = lambda: True,
         state: Callable[[], VehicleState] = VehicleState,
     ) -> None:
         self._path, self._config = path, config
-        self._autopilot, self._installation = autopilot, installation
+        self._autopilot, self._extrinsics = autopilot, extrinsics
         self._local_at, self._trusted, self._state = local_at, trusted, state
         self._boot = boot_id()
         self._before = None if path is None else read_last_fix(path, self._boot)
@@ -154,7 +154,7 @@ class FixMemory:
         """Start keeping."""
         self._thread.start()
 
-    def leave(self) -> None:
+    def hand_over(self) -> None:
         """What follows is no end in order: the next process goes on from what is kept."""
         self._leaves = True
 
@@ -193,7 +193,7 @@ class FixMemory:
         if float(np.linalg.norm(way)) > _FASTEST_MPS * age_s + 1.0:
             self._before = None
             return None
-        begun = self._installation.frame.enu_from_geodetic(
+        begun = self._extrinsics.frame.enu_from_geodetic(
             last.latitude_deg, last.longitude_deg, last.height_m
         )
         sigma_m = math.hypot(max(last.sigma_m, _LEAST_SIGMA_M), drift_sigma_m(age_s))
@@ -222,7 +222,7 @@ class FixMemory:
         local = self._local_at(estimate.exposure_time_ns)
         if local is None:
             return
-        place = self._installation.frame.position(estimate.world_from_camera.translation)
+        place = self._extrinsics.frame.position(estimate.world_from_camera.translation)
         state, time_ns = self._state(), estimate.exposure_time_ns
         offset_ns = state.clock_offset_ns
         row = LastFix(
@@ -231,4 +231,4 @@ class FixMemory:
             (local[0], local[1], local[2]), None if offset_ns is None else time_ns - offset_ns,
             _place(state.origin),
         )  # fmt: skip
-        replace_whole(path, json.dumps(asdict(row)))
+        replace_file(path, json.dumps(asdict(row)))

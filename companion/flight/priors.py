@@ -12,11 +12,11 @@ from typing import Protocol
 import numpy as np
 
 from companion.config import PriorConfig
-from companion.conversions import Installation, camera_rotation, vehicle_prior
+from companion.conversions import CameraExtrinsics, camera_rotation, vehicle_prior
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.tracking.engine import PriorProvider
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
@@ -40,7 +40,7 @@ _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
 _BESIDE_M, _REPORT_S = 3.0, 0.5  # of the receiver: an EKF farther off follows something else
 
 
-class Autopilot(Protocol):
+class AutopilotSource(Protocol):
     """What is asked of the autopilot: the bridge in flight, a record's messages afterwards."""
 
     def state(self) -> VehicleState:
@@ -66,7 +66,7 @@ def drift_sigma_m(seconds: float) -> float:
     return min(_DRIFT_SPEED_M_S * t + _DRIFT_ACCELERATION_M_S2 * t * t, _LARGEST_SIGMA_M)
 
 
-def local_about(autopilot: Autopilot, time_ns: int) -> tuple[float, ...] | None:
+def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] | None:
     """The EKF's position (north, east, down), m, at a time; a little ahead of its newest report by
     its velocity: a picture is often newer than that (10 Hz).
     """
@@ -149,13 +149,13 @@ class AutopilotPose:
 
     def __init__(
         self,
-        autopilot: Autopilot,
-        installation: Installation,
+        autopilot: AutopilotSource,
+        extrinsics: CameraExtrinsics,
         config: PriorConfig,
         on_gnss: Callable[[], bool | None] = lambda: True,
     ) -> None:
         self._autopilot, self._on_gnss = autopilot, on_gnss
-        self._installation = installation
+        self._extrinsics = extrinsics
         self._config = config
         self.belief = PositionBelief(config)
 
@@ -174,9 +174,9 @@ class AutopilotPose:
         return self._believed(self._autopilot.state(), time.monotonic_ns()).sigma_m
 
     @property
-    def sensors(self) -> OtherSensors:
+    def sensors(self) -> AuxiliarySensors:
         """These accounts, as the localizer asks for them."""
-        return OtherSensors(
+        return AuxiliarySensors(
             self.rotation, self.displacement, lambda _time_ns: self.height_m, self.clearance_m
         )
 
@@ -188,8 +188,8 @@ class AutopilotPose:
         altitude_m = self._autopilot.state().altitude_amsl_m
         if altitude_m is None or not math.isfinite(altitude_m):
             return None
-        origin_m = self._installation.frame.origin.height_m
-        return altitude_m + self._installation.geoid_separation_m - origin_m
+        origin_m = self._extrinsics.frame.origin.height_m
+        return altitude_m + self._extrinsics.geoid_separation_m - origin_m
 
     def clearance_m(self, time_ns: int) -> float | None:
         """The vehicle's height above what lies below it, by its rangefinder; None without a reading
@@ -225,7 +225,7 @@ class AutopilotPose:
             state,
             self._autopilot.attitude_at(time_ns),
             self._autopilot.gimbal_at(time_ns),
-            self._installation,
+            self._extrinsics,
             (belief.sigma_m, float(np.radians(self._config.rotation_sigma_deg))),
             time_ns,
         )

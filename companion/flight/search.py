@@ -63,7 +63,7 @@ class Hint:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class RelocalizationHypothesis:
     """A place that was found, with the query that it answers, and where the camera could have been
     then by its IMU; None where nobody knows.
     """
@@ -166,7 +166,7 @@ class PlaceSearch:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
-        self._sighting: Sighting | None = None  # too old to be given out
+        self._sighting: RelocalizationHypothesis | None = None  # too old to be given out
         self._cache, self._config = cache, config
         self._autopilot, self._event, self._reach = autopilot, event, reach
         self._in_reach = 0  # searches since the whole map was searched
@@ -227,7 +227,7 @@ class PlaceSearch:
             return None
         seconds = self._clock() - began
         if followed is None and seconds * _speed_sigma(velocity) > _STALE_M:
-            self._sighting = Sighting(query, found, about)
+            self._sighting = RelocalizationHypothesis(query, found, about)
             self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
             return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")

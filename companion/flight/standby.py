@@ -18,7 +18,7 @@ def ready(
     *,
     standby: bool,
     pulse: int | None,
-    again: bool = False,
+    restart: bool = False,
     lost_settings: str = "",
 ) -> Companion | None:
     """The flight process: at once, or once a standby is released; None of one that never is.
@@ -26,7 +26,9 @@ def ready(
     pulse, again, lost_settings: see `Companion`; a standby flies after another died, and so always
     again.
     """
-    companion = Companion(config, pulse=pulse, again=again or standby, lost_settings=lost_settings)
+    companion = Companion(
+        config, pulse=pulse, restart=restart or standby, lost_settings=lost_settings
+    )
     return _stand_by(companion) if standby else companion
 
 

@@ -23,7 +23,7 @@ _LONGEST_TRACK = 3600
 
 
 @dataclass
-class _Target:
+class _TargetRows:
     """What the rows of one target say. track: (longitude, latitude, height) while it moved."""
 
     name: str
@@ -80,12 +80,12 @@ def write_target_files(folder: Path) -> int:
     return len(targets)
 
 
-def _read(path: Path) -> Iterator[_Target]:
-    targets: dict[str, _Target] = {}
+def _read(path: Path) -> Iterator[_TargetRows]:
+    targets: dict[str, _TargetRows] = {}
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         for row in csv.DictReader(line.replace("\0", "") for line in file):
             name = row.get("target_id") or ""
-            target = targets.get(name) or _Target(name)
+            target = targets.get(name) or _TargetRows(name)
             try:
                 target.add(row)
             except (KeyError, TypeError, ValueError):
@@ -110,7 +110,7 @@ def _utc(time_ns: int, offset_ns: int | None) -> str | None:
     return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
 
 
-def _properties(target: _Target, offset_ns: int | None) -> dict[str, Any]:
+def _properties(target: _TargetRows, offset_ns: int | None) -> dict[str, Any]:
     speed = course = None
     if target.velocity is not None:
         east, north = target.velocity
@@ -129,7 +129,7 @@ def _properties(target: _Target, offset_ns: int | None) -> dict[str, Any]:
     }
 
 
-def _feature(target: _Target, offset_ns: int | None) -> dict[str, Any]:
+def _feature(target: _TargetRows, offset_ns: int | None) -> dict[str, Any]:
     """A point at the newest place; of a target that moved, with its line. Ellipsoidal heights."""
     point: dict[str, Any] = {"type": "Point", "coordinates": list(target.place)}
     geometry = point
@@ -144,7 +144,7 @@ def _feature(target: _Target, offset_ns: int | None) -> dict[str, Any]:
     }
 
 
-def _kml(targets: list[_Target], offset_ns: int | None) -> ElementTree.Element:
+def _kml(targets: list[_TargetRows], offset_ns: int | None) -> ElementTree.Element:
     """Marks on the ground: KML's heights are above a geoid that the viewer chooses."""
     root = ElementTree.Element("kml", xmlns=_KML)
     document = ElementTree.SubElement(root, "Document")

@@ -20,7 +20,7 @@ _OFFSET_DEG = 0.075  # the largest corner offset that tags 26 to 33 hold
 
 
 @dataclass(frozen=True)
-class Scene:
+class KlvContext:
     """What all pictures of a flight share. geoid_m: ellipsoid below sea level is negative."""
 
     frame: LocalFrame
@@ -32,7 +32,7 @@ class Scene:
 
 def picture_fields(
     estimate: PoseEstimate,
-    scene: Scene,
+    scene: KlvContext,
     ned_from_body: Array | None = None,
     target: TargetFix | None = None,
 ) -> dict[int, float | str]:
@@ -81,7 +81,7 @@ def _attitude(ned_from_body: Array, ned_from_camera: Array) -> dict[int, float |
     return fields
 
 
-def _footprint(estimate: PoseEstimate, scene: Scene) -> dict[int, float | str]:
+def _footprint(estimate: PoseEstimate, scene: KlvContext) -> dict[int, float | str]:
     """The centre with its range, and the corners (left above, right above, right below, left
     below).
     """
@@ -110,7 +110,7 @@ def _footprint(estimate: PoseEstimate, scene: Scene) -> dict[int, float | str]:
 
 
 def _seen(
-    estimate: PoseEstimate, pixel: tuple[float, float], scene: Scene
+    estimate: PoseEstimate, pixel: tuple[float, float], scene: KlvContext
 ) -> tuple[Geodetic | None, float]:
     eye, direction = ray_in_world(estimate, pixel)
     distance = float(scene.cast(eye, direction[None]).distances[0])
@@ -119,7 +119,7 @@ def _seen(
     return scene.frame.position(eye + distance * direction), distance
 
 
-def _target(target: TargetFix, scene: Scene) -> dict[int, float | str]:
+def _target(target: TargetFix, scene: KlvContext) -> dict[int, float | str]:
     place = scene.frame.position(target.position_world)
     P = target.covariance
     return {

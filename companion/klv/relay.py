@@ -20,9 +20,9 @@ from companion.config import KlvConfig
 from companion.ending import joined
 from companion.errors import StreamError
 from companion.klv.local_set import encode
-from companion.klv.metadata import Scene, picture_fields
+from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.transport import TransportWriter
-from companion.targets.population import Target
+from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import Array
 from localizer.types import PoseEstimate, TargetFix
 
@@ -33,7 +33,7 @@ _TARGET_NS = 1_000_000_000  # a target that was seen so near to a picture is the
 
 
 @dataclass(frozen=True)
-class _Item:
+class _RelayItem:
     """A packet, or a new connection's writer; arrival_ns: CLOCK_MONOTONIC."""
 
     arrival_ns: int
@@ -51,7 +51,7 @@ class KlvRelay:
     def __init__(
         self,
         config: KlvConfig,
-        scene: Scene,
+        scene: KlvContext,
         attitude: Callable[[int], Array | None],
         utc_minus_monotonic_ns: int,
     ) -> None:
@@ -59,11 +59,11 @@ class KlvRelay:
         self._scene = scene
         self._attitude = attitude
         self._utc_ns = utc_minus_monotonic_ns
-        self._items: deque[_Item] = deque()
+        self._items: deque[_RelayItem] = deque()
         self._exposures: dict[Fraction, int] = {}
         self._estimates: dict[int, PoseEstimate] = {}
         self._newest_ns = 0
-        self._targets: dict[int, Target] = {}
+        self._targets: dict[int, TargetEstimate] = {}
         self._writer: TransportWriter | None = None
         self._condition = threading.Condition()
         self._stopping = False
@@ -88,11 +88,11 @@ class KlvRelay:
         except StreamError as error:
             self._fail(error)
             return
-        self._put(_Item(time.monotonic_ns(), writer=writer))
+        self._put(_RelayItem(time.monotonic_ns(), writer=writer))
 
     def packet(self, packet: av.Packet) -> None:
         """Take a packet. Never blocks."""
-        self._put(_Item(time.monotonic_ns(), packet=packet))
+        self._put(_RelayItem(time.monotonic_ns(), packet=packet))
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
         """Note when a packet's picture was taken. Never blocks."""
@@ -111,14 +111,14 @@ class KlvRelay:
                     self._estimates.pop(next(iter(self._estimates)))
             self._condition.notify()
 
-    def add_target(self, target: Target) -> None:
+    def add_target(self, target: TargetEstimate) -> None:
         """Note a located target. Never blocks."""
         with self._condition:
             self._targets[target.fix.exposure_time_ns] = target
             while len(self._targets) > _KEPT:
                 self._targets.pop(next(iter(self._targets)))
 
-    def _put(self, item: _Item) -> None:
+    def _put(self, item: _RelayItem) -> None:
         with self._condition:
             if len(self._items) >= _QUEUE and item.packet is not None:
                 self.dropped += 1
@@ -141,7 +141,7 @@ class KlvRelay:
                 self._fail(error)
         self._close()
 
-    def _wait_for(self, item: _Item) -> PoseEstimate | None:
+    def _wait_for(self, item: _RelayItem) -> PoseEstimate | None:
         """The estimate of a packet's picture; None if there is none in time. Holds the lock."""
         if item.packet is None or item.packet.pts is None:
             return None
@@ -157,7 +157,7 @@ class KlvRelay:
             self._condition.wait(left_ns * 1e-9)
         return None
 
-    def _send(self, item: _Item, estimate: PoseEstimate | None) -> None:
+    def _send(self, item: _RelayItem, estimate: PoseEstimate | None) -> None:
         if item.writer is not None:
             self._close()
             self._writer = item.writer

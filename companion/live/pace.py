@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass
-class Pace:
+class RateLimiter:
     """A mean rate: the next is due a period after the last was due, not after it went. Pictures of
     10 Hz at a pace of 6 Hz else went every 200 ms, 5 a second.
     """

@@ -44,7 +44,7 @@ def encode(head: dict[str, Any], body: bytes = b"") -> bytes:
     return b"".join((_SIZES.pack(len(text), len(body)), text, body))
 
 
-class Decoder:
+class MessageDecoder:
     """Bytes in, messages out."""
 
     def __init__(self, most_head: int = MOST_HEAD, most_body: int = MOST_BODY) -> None:

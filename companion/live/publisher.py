@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.live.orders import OrderError, Orders
-from companion.live.pace import Pace
-from companion.live.protocol import MOST_ORDER, Decoder, LinkError, encode
+from companion.live.pace import RateLimiter
+from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, encode
 from companion.live.shared import SharedMemory
 from companion.live.shown import Shot, Shown
 
@@ -35,7 +35,7 @@ class _Console:
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection
-        self.decoder = Decoder(MOST_ORDER, 0)
+        self.decoder = MessageDecoder(MOST_ORDER, 0)
         self.sending = memoryview(b"")
         self.answers: deque[bytes] = deque(maxlen=_ANSWERS)
         self.told = 0
@@ -76,7 +76,7 @@ class Publisher:
 
     def __init__(self, path: Path, shown: Shown, orders: Orders, frames_hz: float) -> None:
         self.path, self._shown, self._orders = path, shown, orders
-        self._pictures = Pace(1.0 / frames_hz)
+        self._pictures = RateLimiter(1.0 / frames_hz)
         self._consoles: dict[socket.socket, _Console] = {}
         self._selector = selectors.DefaultSelector()
         self._woken, self._waker = socket.socketpair()

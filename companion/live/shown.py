@@ -17,14 +17,14 @@ import cv2
 import numpy as np
 
 from companion.live.machine import MachineLoad
-from companion.targets.population import Target
+from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.vehicle.mission import Waypoint
+from mavlink_bridge.vehicle.mission import MissionWaypoint
 
 _FRAMES = 12  # pictures that wait for their estimate: a second or so
 _WIDEST = 960  # pixels that are sent
@@ -44,7 +44,7 @@ class Instruments:
     shadow: Callable[[], ShadowScore]
     verdict: Callable[[], LoopVerdict | None]
     injecting: Callable[[], bool]
-    mission: Callable[[], tuple[Waypoint, ...]] = tuple
+    mission: Callable[[], tuple[MissionWaypoint, ...]] = tuple
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Shown:
         self._paired: tuple[Frame, PoseEstimate | None, RenderedView | None] | None = None
         self._paired_ns = 0
         self._estimate: PoseEstimate | None = None
-        self._targets: OrderedDict[str, Target] = OrderedDict()
+        self._targets: OrderedDict[str, TargetEstimate] = OrderedDict()
         self._events: deque[tuple[int, int, str, str]] = deque(maxlen=_EVENTS)
         self._count = 0
 
@@ -93,7 +93,7 @@ class Shown:
                 self._paired = (frame, estimate, None if bundle is None else bundle.view)
                 self._paired_ns = time.monotonic_ns()
 
-    def add_target(self, target: Target) -> None:
+    def add_target(self, target: TargetEstimate) -> None:
         """Keep the newest fix of each target."""
         with self._lock:
             self._targets[target.fix.target_id] = target
@@ -228,7 +228,7 @@ class Shown:
         gnss = self._frame.enu_from_geodetic(*place)
         return float(np.hypot(*(estimate.world_from_camera.translation - gnss)[:2]))
 
-    def _target(self, target: Target) -> dict[str, Any]:
+    def _target(self, target: TargetEstimate) -> dict[str, Any]:
         fix = target.fix
         at = self._frame.position(fix.position_world)
         return {

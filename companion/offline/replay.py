@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import CompanionConfig, parse_config
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.errors import RecordError, StreamDecodeError
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME
@@ -218,8 +218,8 @@ def replay(
         cache = stack.cache
         record.flown.require_frame(cache)
         arm = np.array(config.camera.lever_arm_m)
-        installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
-        pose = AutopilotPose(autopilot, installation, config.prior)
+        extrinsics = CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
+        pose = AutopilotPose(autopilot, extrinsics, config.prior)
         localizer = build_localizer(stack, camera, config.localizer, pose.sensors)
         frames, unzoomed = [], 0
         for recorded in record.estimates:
@@ -227,7 +227,7 @@ def replay(
             if not (path := image_path(record.folder, recorded)).is_file():
                 continue
             autopilot.advance(recorded.known_ns)
-            if localizer.tracker.standing.wants_prior:
+            if localizer.tracker.track_status.wants_prior:
                 prior = pose.prior(recorded.exposure_time_ns)
                 if prior is not None:
                     localizer.offer(prior)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.planning.judge import Judged, LegVerdict
+from companion.planning.judge import JudgedSample, LegVerdict
 from companion.planning.survey import Progress, Surveyor, moved
-from companion.planning.way import Sample
+from companion.planning.way import PathSample
 
 _HEIGHT_FACTORS = (0.6, 1.5, 2.2)
 _PITCHES_DEG = (-90.0, -60.0, -45.0)
@@ -23,9 +23,9 @@ _LEGS = 12  # the longest of those that will not do
 
 
 @dataclass(frozen=True)
-class Change:
+class LegAlternative:
     """Fly so much higher, with the gimbal at this pitch, the camera turned from the way by so much
-    (all as in `Sample`). words: for the pilot.
+    (all as in `PathSample`). words: for the pilot.
     """
 
     rise_m: float
@@ -41,7 +41,7 @@ class Instead:
     """
 
     leg: str
-    change: Change
+    change: LegAlternative
     risk: float
     sigma_m: float
     holds: bool
@@ -56,7 +56,7 @@ def instead(
     bad = sorted(
         (v for v in verdicts if not v.holds), key=lambda v: -(1 - v.share) * v.leg.length_m
     )[:_LEGS]
-    tried: list[tuple[LegVerdict, Change, list[Sample]]] = []
+    tried: list[tuple[LegVerdict, LegAlternative, list[PathSample]]] = []
     for verdict in bad:
         worst = sorted((j for j in verdict.judged if not j.holds), key=lambda j: -j.forecast.risk)[
             :_SAMPLES
@@ -79,7 +79,7 @@ def instead(
     return tuple(found[v.leg.name] for v in bad if v.leg.name in found)
 
 
-def changes(worst: Judged, fixed: bool) -> list[Change]:
+def changes(worst: JudgedSample, fixed: bool) -> list[LegAlternative]:
     """What may be tried at a sample; only heights and headings of a fixed camera."""
     sample, ground = worst.sample, worst.forecast.ground_m
     options = []
@@ -89,21 +89,21 @@ def changes(worst: Judged, fixed: bool) -> list[Change]:
         if _LOWEST_M <= height <= _HIGHEST_M:
             rise = height - above
             words = f"{abs(rise):.0f} m {'higher' if rise > 0 else 'lower'}"
-            options.append(Change(rise, sample.pitch_deg, sample.turn_deg, words))
+            options.append(LegAlternative(rise, sample.pitch_deg, sample.turn_deg, words))
     if not fixed:
         options += [
-            Change(0.0, pitch, sample.turn_deg, f"gimbal at {pitch:.0f}°")
+            LegAlternative(0.0, pitch, sample.turn_deg, f"gimbal at {pitch:.0f}°")
             for pitch in _PITCHES_DEG
             if abs(pitch - sample.pitch_deg) >= _LEAST_CHANGE_DEG
         ]
     options += [
-        Change(0.0, sample.pitch_deg, turn, f"camera {turn:.0f}° from the way")
+        LegAlternative(0.0, sample.pitch_deg, turn, f"camera {turn:.0f}° from the way")
         for turn in _TURNS_DEG
     ]
     return options
 
 
-def _option(leg: str, change: Change, results: Sequence[Judged]) -> Instead:
+def _option(leg: str, change: LegAlternative, results: Sequence[JudgedSample]) -> Instead:
     worst = max(results, key=lambda j: (not j.holds, j.forecast.risk))
     return Instead(
         leg, change, worst.forecast.risk, worst.forecast.sigma_m, all(j.holds for j in results)

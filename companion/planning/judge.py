@@ -9,7 +9,7 @@ from enum import Enum
 
 import numpy as np
 
-from companion.planning.way import Leg, Sample
+from companion.planning.way import FlightLeg, PathSample
 from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import RISK_LIMIT
 from localizer.odometry.config import OdometryConfig
@@ -30,7 +30,7 @@ class Reason(Enum):
 
 
 @dataclass(frozen=True)
-class Limits:
+class MissionLimits:
     """sigma_m: of the position, one axis, that the mission can live with; risk: share of pictures
     that may be lost or wrong.
     """
@@ -40,10 +40,10 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedSample:
     """A sample with the worst of its forecasts, over the conditions."""
 
-    sample: Sample
+    sample: PathSample
     forecast: ViewForecast
     reason: Reason
 
@@ -59,8 +59,8 @@ class LegVerdict:
     the leg is flown.
     """
 
-    leg: Leg
-    judged: tuple[Judged, ...]
+    leg: FlightLeg
+    judged: tuple[JudgedSample, ...]
     times: int = 1
 
     @property
@@ -74,7 +74,7 @@ class LegVerdict:
         return float(np.mean([j.holds for j in self.judged]))
 
     @property
-    def worst(self) -> Judged:
+    def worst(self) -> JudgedSample:
         """The sample with the largest risk."""
         return max(self.judged, key=lambda j: (not j.holds, j.forecast.risk))
 
@@ -86,7 +86,7 @@ class LegVerdict:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class VisionGap:
     """A way on which vision is not to be had. begin_m, end_m: of the mission's way; drift_m: sigma
     of the position (horizontal, one axis) after it if odometry carries it; can_bridge: whether
     that stays below the odometry's end.
@@ -104,13 +104,15 @@ class Stretch:
         return self.end_m - self.begin_m
 
 
-def judge(sample: Sample, forecasts: Sequence[ViewForecast], limits: Limits) -> Judged:
+def judge(
+    sample: PathSample, forecasts: Sequence[ViewForecast], limits: MissionLimits
+) -> JudgedSample:
     """The sample under the condition that it fares worst in."""
     worst = max(forecasts, key=lambda f: (_reason(f, limits) is not Reason.NONE, f.risk, f.sigma_m))
-    return Judged(sample, worst, _reason(worst, limits))
+    return JudgedSample(sample, worst, _reason(worst, limits))
 
 
-def _reason(forecast: ViewForecast, limits: Limits) -> Reason:
+def _reason(forecast: ViewForecast, limits: MissionLimits) -> Reason:
     if forecast.ground_m == 0.0:
         return Reason.NO_MAP
     risky = forecast.risk > limits.risk
@@ -125,7 +127,7 @@ def _reason(forecast: ViewForecast, limits: Limits) -> Reason:
 
 def stretches(
     verdicts: Sequence[LegVerdict], speed_m_s: float, odometry: OdometryConfig
-) -> tuple[Stretch, ...]:
+) -> tuple[VisionGap, ...]:
     """What must be bridged, in the order of the way; neighbouring samples are one stretch.
     speed_m_s: where the leg has none.
     """
@@ -146,10 +148,10 @@ def stretches(
 
 def _stretch(
     begin_m: float, end_m: float, seconds: float, off_map: bool, odometry: OdometryConfig
-) -> Stretch:
+) -> VisionGap:
     """off_map: the map has no geometry there, at one place at least."""
     ground = odometry.with_plane if odometry.terrain is None else odometry.with_ground
     growth, length = ground if off_map else odometry.with_map, end_m - begin_m
     drift = math.hypot(growth.horizontal * math.sqrt(length), growth.scale * length)
     can_bridge = drift <= odometry.longest_sigma_m
-    return Stretch(begin_m, end_m, seconds, drift, can_bridge)
+    return VisionGap(begin_m, end_m, seconds, drift, can_bridge)

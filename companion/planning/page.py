@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from companion.planning.judge import LegVerdict, Stretch
-from companion.planning.plan import Plan
+from companion.planning.judge import LegVerdict, VisionGap
+from companion.planning.plan import MissionForecast
 from companion.reporting.layout import data_uri
 from companion.writing import writing
 from localizer.types import Image
@@ -30,7 +30,7 @@ STRETCH_HEADINGS = ("from m", "to m", "length m", "seconds", "drift m", "odometr
 INSTEAD_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
 
 
-def verdict_words(plan: Plan) -> str:
+def verdict_words(plan: MissionForecast) -> str:
     """The answer in a sentence."""
     bad = [v for v in plan.verdicts if not v.holds]
     count, limit = len(plan.verdicts), plan.question.limits.sigma_m
@@ -66,7 +66,7 @@ def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
     )
 
 
-def stretch_row(stretch: Stretch) -> tuple[str, ...]:
+def stretch_row(stretch: VisionGap) -> tuple[str, ...]:
     """A stretch as cells."""
     return (
         f"{stretch.begin_m:.0f}",
@@ -78,7 +78,7 @@ def stretch_row(stretch: Stretch) -> tuple[str, ...]:
     )
 
 
-def instead_rows(plan: Plan) -> list[tuple[str, ...]]:
+def instead_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
     """What would do instead, as cells."""
     return [
         (
@@ -92,7 +92,7 @@ def instead_rows(plan: Plan) -> list[tuple[str, ...]]:
     ]
 
 
-def as_data(plan: Plan) -> dict[str, Any]:
+def as_data(plan: MissionForecast) -> dict[str, Any]:
     """For other programs: what was asked, and every leg, sample and stretch."""
     q = plan.question
     return {
@@ -139,7 +139,7 @@ def as_data(plan: Plan) -> dict[str, Any]:
     }
 
 
-def write_page(plan: Plan, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
+def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
     """Write the page. ReportError where it cannot be written."""
     q = plan.question
     shown = "".join(

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from companion.planning.judge import Judged, LegVerdict
-from companion.planning.plan import Plan
+from companion.planning.judge import JudgedSample, LegVerdict
+from companion.planning.plan import MissionForecast
 from companion.planning.way import Aim, camera_pose
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -31,7 +31,7 @@ _LINE_PX = 7
 
 
 @dataclass(frozen=True)
-class Sheet:
+class MapSquare:
     """A square of the map from above, north up. low: (2,) its south-west corner, east and north, m;
     gsd_m: per pixel.
     """
@@ -46,7 +46,7 @@ class Sheet:
         return np.stack([flat[:, 0], self.rgb.shape[0] - flat[:, 1]], axis=1)
 
 
-def sheet_of(plan: Plan, cache: TileCache) -> Sheet:
+def sheet_of(plan: MissionForecast, cache: TileCache) -> MapSquare:
     """The square about the plan's way, as the map shows it."""
     places = _places(_all(plan))
     low, high = places.min(axis=0), places.max(axis=0)
@@ -60,10 +60,10 @@ def sheet_of(plan: Plan, cache: TileCache) -> Sheet:
             rgb = render_top_view(renderer, centre, _SIDE_PX, gsd, base).rgb
         finally:
             renderer.close()
-    return Sheet(rgb, centre - half, gsd)
+    return MapSquare(rgb, centre - half, gsd)
 
 
-def track_picture(sheet: Sheet, plan: Plan) -> Image:
+def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
     """The way in green (holds), amber (doubtful) and red (will not do), its waypoints numbered."""
     picture = sheet.rgb.copy()
     for verdict in plan.verdicts:
@@ -80,7 +80,9 @@ def track_picture(sheet: Sheet, plan: Plan) -> Image:
     return _with_legend(picture, ("holds", "doubtful", "will not do"))
 
 
-def heat_picture(sheet: Sheet, plan: Plan, cache: TileCache, camera: Camera, aim: Aim) -> Image:
+def heat_picture(
+    sheet: MapSquare, plan: MissionForecast, cache: TileCache, camera: Camera, aim: Aim
+) -> Image:
     """The ground that is seen, coloured by the mean risk of the places that see it."""
     total = np.zeros(sheet.rgb.shape[:2], np.float32)
     count = np.zeros_like(total)
@@ -105,22 +107,22 @@ def heat_picture(sheet: Sheet, plan: Plan, cache: TileCache, camera: Camera, aim
     return _with_legend(picture, ("seen, holds", "doubtful", "seen, will not do"))
 
 
-def colour_of(judged: Judged) -> tuple[int, int, int]:
+def colour_of(judged: JudgedSample) -> tuple[int, int, int]:
     """RGB of a sample."""
     if not judged.holds:
         return _COLOURS[2]
     return _COLOURS[1] if judged.forecast.risk > _DOUBTFUL else _COLOURS[0]
 
 
-def _all(plan: Plan) -> list[Judged]:
+def _all(plan: MissionForecast) -> list[JudgedSample]:
     return [j for v in plan.verdicts for j in v.judged]
 
 
-def _places(judged: Sequence[Judged]) -> Array:
+def _places(judged: Sequence[JudgedSample]) -> Array:
     return np.array([j.sample.position[:2] for j in judged])
 
 
-def _half_step(verdict: LegVerdict, judged: Judged, gsd_m: float) -> Array:
+def _half_step(verdict: LegVerdict, judged: JudgedSample, gsd_m: float) -> Array:
     """Half of the way (2,) that a sample of the leg stands for, pixels."""
     heading = np.radians(judged.sample.heading_deg)
     along = np.array([np.sin(heading), -np.cos(heading)])
@@ -128,7 +130,7 @@ def _half_step(verdict: LegVerdict, judged: Judged, gsd_m: float) -> Array:
     return half
 
 
-def _footprint(judged: Judged, cache: TileCache, camera: Camera, aim: Aim) -> Array | None:
+def _footprint(judged: JudgedSample, cache: TileCache, camera: Camera, aim: Aim) -> Array | None:
     """(N, 2) corners of the ground in view, at most as far as three times its middle."""
     ground = judged.forecast.ground_m
     if ground <= 0:

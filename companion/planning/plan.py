@@ -10,10 +10,10 @@ from pathlib import Path
 from companion.config import CompanionConfig
 from companion.geometry import Mount
 from companion.planning.instead import Instead, instead
-from companion.planning.judge import LegVerdict, Limits, Stretch, stretches
+from companion.planning.judge import LegVerdict, MissionLimits, VisionGap, stretches
 from companion.planning.mission import PlannedMission
 from companion.planning.survey import Progress, surveyor
-from companion.planning.way import Aim, Ground, Leg, legs_of, length_m
+from companion.planning.way import Aim, FlightLeg, MapHeights, legs_of, length_m
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import OdometryConfig
 
@@ -31,7 +31,7 @@ class Question:
 
     mission_file: Path
     conditions: tuple[str, ...] = ("day",)
-    limits: Limits = field(default_factory=Limits)
+    limits: MissionLimits = field(default_factory=MissionLimits)
     spacing_m: float = 25.0
     speed_m_s: float = DEFAULT_SPEED_M_S
     pitch_deg: float = DEFAULT_PITCH_DEG
@@ -39,7 +39,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Plan:
+class MissionForecast:
     """The answer. length_m: of all that is flown; verdicts: of each leg once, however often it is
     flown; not_judged: what of the mission is not in it, by its MAVLink names; notes: what the
     forecast does not know of this mission, as sentences.
@@ -49,7 +49,7 @@ class Plan:
     length_m: float
     speed_m_s: float
     verdicts: tuple[LegVerdict, ...]
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[VisionGap, ...]
     instead: tuple[Instead, ...]
     notes: tuple[str, ...]
     not_judged: tuple[str, ...] = ()
@@ -78,10 +78,10 @@ def make_plan(
     deployment: CompanionConfig,
     question: Question,
     progress: Progress | None = None,
-) -> Plan:
+) -> MissionForecast:
     """Forecast every leg, say what must be bridged, and look for what would do instead."""
     aim = aim_of(deployment, question.pitch_deg)
-    ground = Ground(cache)
+    ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)
     thinned = length_m(_once(legs)) / _MOST_SAMPLES
     if thinned > question.spacing_m:
@@ -102,15 +102,15 @@ def make_plan(
     notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
     unknown = tuple(n.text for n in mission.not_judged if not (aim.fixed and n.gimbal_only))
     length = length_m(legs)
-    return Plan(question, length, speed_m_s, verdicts, bridged, options, notes, unknown)
+    return MissionForecast(question, length, speed_m_s, verdicts, bridged, options, notes, unknown)
 
 
-def _once(legs: Sequence[Leg]) -> list[Leg]:
+def _once(legs: Sequence[FlightLeg]) -> list[FlightLeg]:
     """The legs without those that were flown alike before."""
     return [leg for number, leg in enumerate(legs) if leg.first == number]
 
 
-def _as_flown(legs: Sequence[Leg], verdicts: Sequence[LegVerdict]) -> list[LegVerdict]:
+def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list[LegVerdict]:
     """A verdict for each leg, in the order in which they are flown."""
     of = {verdict.leg.first: verdict for verdict in verdicts}
     return [

@@ -11,8 +11,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 from companion.config import CompanionConfig
-from companion.planning.judge import Judged, Limits, judge
-from companion.planning.way import Aim, Sample, camera_pose
+from companion.planning.judge import JudgedSample, MissionLimits, judge
+from companion.planning.way import Aim, PathSample, camera_pose
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.forecast.forecast import Forecaster
@@ -37,7 +37,7 @@ class Surveyor:
         cache: TileCache,
         aim: Aim,
         conditions: tuple[str, ...],
-        limits: Limits,
+        limits: MissionLimits,
         forecasters: Sequence[Forecaster],
     ) -> None:
         self._cache, self._aim = cache, aim
@@ -47,7 +47,9 @@ class Surveyor:
             self._idle.put(forecaster)
         self._threads = len(forecasters)
 
-    def judged(self, samples: Sequence[Sample], progress: Progress | None = None) -> list[Judged]:
+    def judged(
+        self, samples: Sequence[PathSample], progress: Progress | None = None
+    ) -> list[JudgedSample]:
         """The samples in their order; the same samples give the same."""
         made = []
         with ThreadPoolExecutor(self._threads, "forecast") as pool:
@@ -57,7 +59,7 @@ class Surveyor:
                     progress(done, len(samples))
         return made
 
-    def _one(self, number: int, sample: Sample) -> Judged:
+    def _one(self, number: int, sample: PathSample) -> JudgedSample:
         pose = camera_pose(sample, self._cache, self._aim)
         forecaster = self._idle.get()
         try:
@@ -72,7 +74,7 @@ def surveyor(
     deployment: CompanionConfig,
     aim: Aim,
     conditions: tuple[str, ...],
-    limits: Limits,
+    limits: MissionLimits,
 ) -> Iterator[Surveyor]:
     """A surveyor over an open map, with a thread for each processor that this process may use.
 
@@ -93,7 +95,7 @@ def surveyor(
         yield Surveyor(cache, aim, conditions, limits, forecasters)
 
 
-def moved(sample: Sample, rise_m: float, pitch_deg: float, turn_deg: float) -> Sample:
+def moved(sample: PathSample, rise_m: float, pitch_deg: float, turn_deg: float) -> PathSample:
     """The sample flown higher or lower, looking elsewhere."""
     position = sample.position.copy()
     position[2] += rise_m

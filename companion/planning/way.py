@@ -44,7 +44,7 @@ class Aim:
 
 
 @dataclass(frozen=True)
-class Sample:
+class PathSample:
     """A place on the way. position: (3,) of the vehicle, world metres; way_m: flown until there;
     turn_deg: of the camera to the right of the way.
     """
@@ -57,7 +57,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Leg:
+class FlightLeg:
     """The way between two places. name: of their numbers, "home" and "take-off" too; step_m:
     of the way that each sample stands for; speed_m_s: None where the mission does not say; first:
     index of the first leg that is flown alike, its own where there is none before it.
@@ -66,12 +66,12 @@ class Leg:
     name: str
     length_m: float
     step_m: float
-    samples: tuple[Sample, ...]
+    samples: tuple[PathSample, ...]
     speed_m_s: float | None = None
     first: int = 0
 
 
-class Ground:
+class MapHeights:
     """Heights of the map's surface."""
 
     def __init__(self, cache: TileCache) -> None:
@@ -93,8 +93,8 @@ class Ground:
 
 
 def legs_of(
-    mission: PlannedMission, cache: TileCache, ground: Ground, aim: Aim, spacing_m: float
-) -> tuple[Leg, ...]:
+    mission: PlannedMission, cache: TileCache, ground: MapHeights, aim: Aim, spacing_m: float
+) -> tuple[FlightLeg, ...]:
     """The legs in the order in which they are flown, those to places whose way is not known left
     out; a sample every so many metres.
 
@@ -103,8 +103,8 @@ def legs_of(
     site = _Site(cache, ground, _launch(mission, cache))
     path = [replace(p, after_gap=False) for p in mission.path]
     positions = [site.position(p) for p in path]
-    legs: list[Leg] = []
-    firsts: dict[tuple[Any, ...], Leg] = {}
+    legs: list[FlightLeg] = []
+    firsts: dict[tuple[Any, ...], FlightLeg] = {}
     way_m, leaves = 0.0, np.zeros(3)
     for k, (start, end) in enumerate(itertools.pairwise(path)):
         if mission.path[k + 1].after_gap:
@@ -132,7 +132,7 @@ def legs_of(
     return tuple(legs)
 
 
-def _later(leg: Leg, begun_m: float) -> Leg:
+def _later(leg: FlightLeg, begun_m: float) -> FlightLeg:
     """The leg, flown after so much of the way."""
     samples = tuple(
         replace(s, way_m=begun_m + (k + 0.5) * leg.step_m) for k, s in enumerate(leg.samples)
@@ -140,7 +140,7 @@ def _later(leg: Leg, begun_m: float) -> Leg:
     return replace(leg, samples=samples)
 
 
-def camera_pose(sample: Sample, cache: TileCache, aim: Aim) -> Pose:
+def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
     """The camera's pose (world) of a level vehicle that flies along its way."""
     to_ned = ned_from_world(cache.frame, cache.frame.position(sample.position))
     body = matrix_from_euler(0.0, 0.0, float(np.radians(sample.heading_deg)))
@@ -159,7 +159,7 @@ class _Site:
     """What turns places into positions. launch: (east, north) where heights above home begin."""
 
     cache: TileCache
-    ground: Ground
+    ground: MapHeights
     launch: tuple[float, float]
 
     def position(self, place: MissionPlace | RegionOfInterest) -> Array:
@@ -169,7 +169,7 @@ class _Site:
 
 def _leg(
     name: str, end: MissionPlace, course: Course, site: _Site, aim: Aim, spacing_m: float
-) -> Leg:
+) -> FlightLeg:
     """Its samples, as if it were flown first."""
     count = max(round(course.length_m / spacing_m), 1)
     step_m = course.length_m / count
@@ -178,8 +178,8 @@ def _leg(
     for share in map(float, (np.arange(count) + 0.5) / count):
         position, heading = course.at(share)
         pitch, turn = _look(end.gimbal, aim, position, heading, looked_at)
-        samples.append(Sample(position, share * course.length_m, heading, pitch, turn))
-    return Leg(name, course.length_m, step_m, tuple(samples), end.speed_m_s)
+        samples.append(PathSample(position, share * course.length_m, heading, pitch, turn))
+    return FlightLeg(name, course.length_m, step_m, tuple(samples), end.speed_m_s)
 
 
 def _look(
@@ -223,7 +223,7 @@ def _enu(latitude_deg: float, longitude_deg: float, cache: TileCache) -> tuple[f
 def _position(
     waypoint: MissionPlace | RegionOfInterest,
     cache: TileCache,
-    ground: Ground,
+    ground: MapHeights,
     home: tuple[float, float],
 ) -> Array:
     """World position (3,) of a place."""
@@ -260,6 +260,6 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
     return f"{geo_box(cache.manifest.extent).line()}; it is {away_m:.0f} m away"
 
 
-def length_m(legs: Sequence[Leg]) -> float:
+def length_m(legs: Sequence[FlightLeg]) -> float:
     """Of all legs."""
     return sum(leg.length_m for leg in legs)

@@ -12,8 +12,8 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.preflight.doctor import Finding
-from mavlink_bridge.vehicle.mission import Waypoint
+from mavlink_bridge.preflight.doctor import DoctorFinding
+from mavlink_bridge.vehicle.mission import MissionWaypoint
 
 _STEP_M = 25.0
 _NAME = "mission"
@@ -36,7 +36,7 @@ def covered(cache: TileCache, points: Array) -> np.ndarray:
     return inside
 
 
-def _enu(frame: LocalFrame, waypoints: Sequence[Waypoint]) -> Array:
+def _enu(frame: LocalFrame, waypoints: Sequence[MissionWaypoint]) -> Array:
     """(N, 2) metres about the map's origin."""
     height = frame.origin.height_m
     places = [frame.enu_from_geodetic(w.latitude_deg, w.longitude_deg, height) for w in waypoints]
@@ -52,10 +52,10 @@ def _way(points: Array) -> Array:
     return np.concatenate(parts)
 
 
-def check_mission(cache: TileCache, waypoints: Sequence[Waypoint]) -> Finding:
+def check_mission(cache: TileCache, waypoints: Sequence[MissionWaypoint]) -> DoctorFinding:
     """Advice where the mission leaves the map: vision ends there."""
     if not [w for w in waypoints if w.number > 0]:
-        return Finding(_NAME, "none in the vehicle", _NEEDED, "nothing to check", True, False)
+        return DoctorFinding(_NAME, "none in the vehicle", _NEEDED, "nothing to check", True, False)
     points = _enu(cache.frame, waypoints)
     outside = [w.number for w, inside in zip(waypoints, covered(cache, points), strict=True)
                if not inside]  # fmt: skip
@@ -63,13 +63,13 @@ def check_mission(cache: TileCache, waypoints: Sequence[Waypoint]) -> Finding:
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     found = f"{len(waypoints)} places, {length / 1000:.1f} km"
     if way.all() and not outside:
-        return Finding(
+        return DoctorFinding(
             _NAME, found, _NEEDED, "place and way, not what the camera sees", True, False
         )
     share = 100.0 * float(1.0 - way.mean())
     where = f"; items {_listed(outside)} outside" if outside else "; no item outside"
     why = f"no position by vision on {share:.0f} % of the way: build a larger map or move it"
-    return Finding(_NAME, found + where, _NEEDED, why, False, False)
+    return DoctorFinding(_NAME, found + where, _NEEDED, why, False, False)
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -78,7 +78,7 @@ def _listed(numbers: Sequence[int]) -> str:
     return shown if len(numbers) <= 8 else f"{shown} and {len(numbers) - 8} more"
 
 
-def check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
+def check_origin(origin: OriginConfig, cache: TileCache) -> DoctorFinding:
     """An origin with a wrong digit puts the EKF on another continent or under the ground, and the
     vehicle takes no second one.
     """
@@ -93,10 +93,10 @@ def check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
     why = "the take-off ground, altitude AMSL"
     if away_km > _ORIGIN_KM and _is_swapped(cache, origin.latitude_deg, origin.longitude_deg):
         why = "latitude and longitude are swapped: the other way round they are on the map"
-    return Finding("bridge.origin", found, needed, why, good, True)
+    return DoctorFinding("bridge.origin", found, needed, why, good, True)
 
 
-def check_stand(cache: TileCache, state: VehicleState) -> list[Finding]:
+def check_stand(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
     """Where the vehicle stands by its GNSS, beside the map: a map of another place has heights and
     a geoid of its own, and everything else about it is in order. Empty where it stands on the map,
     or does not know.
@@ -112,7 +112,11 @@ def check_stand(cache: TileCache, state: VehicleState) -> list[Finding]:
     if far and _is_swapped(cache, latitude_deg, longitude_deg):
         why = "the map lies where latitude and longitude are swapped: build it again"
     needed = f"<= {_STAND_KM:g} km"
-    return [Finding("vehicle's place", f"{away_km:.1f} km beside the map", needed, why, False, far)]
+    return [
+        DoctorFinding(
+            "vehicle's place", f"{away_km:.1f} km beside the map", needed, why, False, far
+        )
+    ]
 
 
 def _away_km(cache: TileCache, latitude_deg: float, longitude_deg: float) -> float:

@@ -23,7 +23,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
-from mavlink_bridge.preflight.doctor import Diagnosis, Finding, examine
+from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding, examine
 from mavlink_bridge.preflight.mission import download_mission
 
 _FEED_S = 8.0  # without any picture
@@ -72,7 +72,7 @@ def examine_deployment(
     return Diagnosis(tuple(findings))
 
 
-def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]]:
+def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[DoctorFinding]]:
     try:
         cache = TileCache.open(config.map)
         require_pinned(config.map, config.map_sha256)
@@ -85,14 +85,14 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]
         f"{_extent_km(m.extent, cache.frame):.2f} km from corner to corner "
         f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}"
     )
-    return cache, [Finding("map", found, "a tile cache", "", True, True)]
+    return cache, [DoctorFinding("map", found, "a tile cache", "", True, True)]
 
 
-def _check_mission(config: CompanionConfig, cache: TileCache) -> Finding:
+def _check_mission(config: CompanionConfig, cache: TileCache) -> DoctorFinding:
     try:
         return check_mission(cache, download_mission(config.bridge))
     except BridgeError as error:
-        return Finding("mission", "not read", "inside the map", str(error), False, False)
+        return DoctorFinding("mission", "not read", "inside the map", str(error), False, False)
 
 
 def _extent_km(extent: Iterable[tuple[float, float]], frame: LocalFrame) -> float:
@@ -102,7 +102,7 @@ def _extent_km(extent: Iterable[tuple[float, float]], frame: LocalFrame) -> floa
     return max(distances, default=0.0) / 1000
 
 
-def _check_localizer(config: CompanionConfig, has_map: bool) -> Finding:
+def _check_localizer(config: CompanionConfig, has_map: bool) -> DoctorFinding:
     """Make the localizer as a flight does, with its model, renderer and device."""
     needed = "a feature network"
     try:
@@ -111,10 +111,10 @@ def _check_localizer(config: CompanionConfig, has_map: bool) -> Finding:
     except LocalizerError as error:
         return _failed("localizer", "cannot be made", needed, str(error))
     why = "features without training: fetch the shipped weights again"
-    return Finding("localizer", name, needed, why, "fallback" not in name, False)
+    return DoctorFinding("localizer", name, needed, why, "fallback" not in name, False)
 
 
-def _check_detector(config: CompanionConfig) -> list[Finding]:
+def _check_detector(config: CompanionConfig) -> list[DoctorFinding]:
     """The detection network, which a flight would not start with; nothing where none is named."""
     if config.targets.detector is None:
         return []
@@ -123,7 +123,7 @@ def _check_detector(config: CompanionConfig) -> list[Finding]:
         network = DetectorNetwork(config.targets.detector)
     except DetectorError as error:
         return [_failed("detector", "cannot be made", needed, str(error))]
-    return [Finding("detector", f"{len(network.labels)} classes", needed, "", True, False)]
+    return [DoctorFinding("detector", f"{len(network.labels)} classes", needed, "", True, False)]
 
 
 def _localizer_name(config: CompanionConfig) -> str:
@@ -135,7 +135,7 @@ def _localizer_name(config: CompanionConfig) -> str:
         stack.close()
 
 
-def _check_camera(config: CompanionConfig) -> Finding:
+def _check_camera(config: CompanionConfig) -> DoctorFinding:
     """Read the feed for a few seconds: pictures of the calibrated size, often enough. A feed that
     delivers is read for less time than one that must be called silent.
     """
@@ -175,21 +175,23 @@ def _check_camera(config: CompanionConfig) -> Finding:
     found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"
     needed = f"{camera.width}x{camera.height}, >= {_MIN_RATE_HZ:.0f} Hz"
     if rate < 0.95 * _MIN_RATE_HZ:  # measured over a few seconds
-        return Finding("camera", found, needed, "tracking follows turns by it", False, True)
+        return DoctorFinding("camera", found, needed, "tracking follows turns by it", False, True)
     scaled = seen != camera
     why = "the calibration is scaled: wrong if the camera crops or zooms" if scaled else ""
-    return Finding("camera", found, needed, why, not scaled, False)
+    return DoctorFinding("camera", found, needed, why, not scaled, False)
 
 
-def _check_power() -> Finding:
+def _check_power() -> DoctorFinding:
     try:
         governor = _GOVERNOR.read_text().strip()
     except OSError:
-        return Finding("power mode", "not told by this machine", "performance", "", True, False)
+        return DoctorFinding(
+            "power mode", "not told by this machine", "performance", "", True, False
+        )
     good = governor in ("performance", "schedutil")
     why = "slower clocks make late fixes (Jetson: nvpmodel -m 0, jetson_clocks)"
-    return Finding("power mode", governor, "performance", why, good, False)
+    return DoctorFinding("power mode", governor, "performance", why, good, False)
 
 
-def _failed(name: str, found: str, needed: str, why: str) -> Finding:
-    return Finding(name, found, needed, why, False, True)
+def _failed(name: str, found: str, needed: str, why: str) -> DoctorFinding:
+    return DoctorFinding(name, found, needed, why, False, True)

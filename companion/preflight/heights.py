@@ -10,7 +10,7 @@ from localizer.errors import MapCacheError
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.preflight.doctor import Finding
+from mavlink_bridge.preflight.doctor import DoctorFinding
 
 _FIX_3D = 3
 _GEOID_ADVICE_M, _GEOID_LIMIT_M = 3.0, 10.0  # receivers hold coarse grids of the geoid
@@ -18,7 +18,7 @@ _GROUND_ADVICE_M = 10.0  # height by GNSS is good to a few metres, take-off grou
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above should meet
 
 
-def check_heights(cache: TileCache, state: VehicleState) -> list[Finding]:
+def check_heights(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
     """The geoid separation, if the receiver says both heights, and the ground under the vehicle,
     if it stands over the map.
     """
@@ -37,10 +37,10 @@ def check_heights(cache: TileCache, state: VehicleState) -> list[Finding]:
     return findings
 
 
-def _geoid(cache: TileCache, receiver_m: float) -> Finding:
+def _geoid(cache: TileCache, receiver_m: float) -> DoctorFinding:
     mapped = cache.manifest.geoid_separation_m
     difference = abs(receiver_m - mapped)
-    return Finding(
+    return DoctorFinding(
         "geoid",
         f"{mapped:.1f} m in the map, {receiver_m:.1f} m by GNSS",
         f"within {_GEOID_ADVICE_M:.0f} m",
@@ -65,9 +65,9 @@ def _ground(cache: TileCache, latitude_deg: float, longitude_deg: float) -> floa
     return top - depth - cache.manifest.geoid_separation_m
 
 
-def _take_off(ground_m: float, vehicle_m: float) -> Finding:
+def _take_off(ground_m: float, vehicle_m: float) -> DoctorFinding:
     off = vehicle_m - ground_m
-    return Finding(
+    return DoctorFinding(
         "take-off height",
         f"{vehicle_m:.0f} m AMSL by GNSS, {ground_m:.0f} m in the map",
         f"within {_GROUND_ADVICE_M:.0f} m",

@@ -7,7 +7,7 @@ import socket
 
 from companion.config import CompanionConfig
 from companion.targets.detections import parse_host_port
-from mavlink_bridge.preflight.doctor import Finding
+from mavlink_bridge.preflight.doctor import DoctorFinding
 
 _LONGEST_ARM_M = 2.0  # of most aircraft that carry this
 _WIDEST_DEG = 125.0  # beyond it Brown's model is no lens's
@@ -15,12 +15,12 @@ _STEEP_ENOUGH_DEG = 10.0  # below the horizon, to see ground near by
 _SHORTEST_MS = 1.0  # less is no camera's, no link's and nobody's
 
 
-def check_meanings(config: CompanionConfig) -> list[Finding]:
+def check_meanings(config: CompanionConfig) -> list[DoctorFinding]:
     """Advice for what can be right and seldom is; empty where nothing is odd."""
     return [*_arm(config), *_mount(config), *_lens(config), *_milliseconds(config)]
 
 
-def check_ports(config: CompanionConfig) -> list[Finding]:
+def check_ports(config: CompanionConfig) -> list[DoctorFinding]:
     """Ports that another program has, which a start would be refused for."""
     address = config.targets.detections
     if address is None:
@@ -30,11 +30,11 @@ def check_ports(config: CompanionConfig) -> list[Finding]:
             probe.bind(parse_host_port(address))
     except OSError as error:
         why = f"targets.detections {address}: {error.strerror or error}: another program's?"
-        return [Finding("ports", "in use", "free ports", why, False, True)]
+        return [DoctorFinding("ports", "in use", "free ports", why, False, True)]
     return []
 
 
-def _arm(config: CompanionConfig) -> list[Finding]:
+def _arm(config: CompanionConfig) -> list[DoctorFinding]:
     arm = config.camera.lever_arm_m
     if max(abs(part) for part in arm) <= _LONGEST_ARM_M:
         return []
@@ -43,7 +43,7 @@ def _arm(config: CompanionConfig) -> list[Finding]:
     return [_odd("camera.lever_arm_m", found, f"within {_LONGEST_ARM_M:g} m", why)]
 
 
-def _mount(config: CompanionConfig) -> list[Finding]:
+def _mount(config: CompanionConfig) -> list[DoctorFinding]:
     camera = config.bridge.camera
     pitch = camera.mount_pitch_deg
     if camera.mount != "fixed" or abs(pitch) >= _STEEP_ENOUGH_DEG:
@@ -52,7 +52,7 @@ def _mount(config: CompanionConfig) -> list[Finding]:
     return [_odd("bridge.camera.mount_pitch_deg", f"{pitch:g}", "-10 to -90", why)]
 
 
-def _lens(config: CompanionConfig) -> list[Finding]:
+def _lens(config: CompanionConfig) -> list[DoctorFinding]:
     model = config.camera.model
     wide = math.degrees(2.0 * math.atan(0.5 * model.width / model.fx))
     if wide <= _WIDEST_DEG:
@@ -61,7 +61,7 @@ def _lens(config: CompanionConfig) -> list[Finding]:
     return [_odd("camera.model", f"{wide:.0f} degrees wide", f"<= {_WIDEST_DEG:g}", why)]
 
 
-def _milliseconds(config: CompanionConfig) -> list[Finding]:
+def _milliseconds(config: CompanionConfig) -> list[DoctorFinding]:
     told = {
         "camera.model.readout_ms": config.camera.model.readout_ms,
         "camera.settings.latency_ms": config.camera.settings.latency_ms,
@@ -76,5 +76,5 @@ def _milliseconds(config: CompanionConfig) -> list[Finding]:
     ]
 
 
-def _odd(name: str, found: str, needed: str, why: str) -> Finding:
-    return Finding(name, found, needed, why, False, False)
+def _odd(name: str, found: str, needed: str, why: str) -> DoctorFinding:
+    return DoctorFinding(name, found, needed, why, False, False)

@@ -8,10 +8,10 @@ from pathlib import Path
 from companion.config import CompanionConfig
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.signing import load_key
-from mavlink_bridge.preflight.doctor import Finding
+from mavlink_bridge.preflight.doctor import DoctorFinding
 
 
-def check_places(config: CompanionConfig) -> list[Finding]:
+def check_places(config: CompanionConfig) -> list[DoctorFinding]:
     """Folders of records and signing keys that a start would refuse; empty where none is named."""
     bridge = config.bridge
     written = {"bridge.tlog": bridge.tlog, "bridge.state_file": bridge.state_file}
@@ -33,7 +33,9 @@ def check_places(config: CompanionConfig) -> list[Finding]:
             if path is not None and not path.is_file():
                 faults.append(f"console.{key} {path}: is no file")
     needed = "folders to write to, keys to read"
-    return [Finding("files", "unusable", needed, fault, False, True) for fault in faults if fault]
+    return [
+        DoctorFinding("files", "unusable", needed, fault, False, True) for fault in faults if fault
+    ]
 
 
 def _no_file(key: str, path: Path) -> str:

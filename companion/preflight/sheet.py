@@ -18,7 +18,7 @@ from companion.writing import writing
 from localizer.errors import LocalizerError
 from localizer.geometry.antimeridian import geo_box
 from localizer.map.cache.cache import TileCache
-from mavlink_bridge.preflight.doctor import Diagnosis, Finding
+from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 _OLD_MAP_DAYS, _OLD_SHADOW_DAYS = 730, 7
 WHEN_VISION_ENDS = (
@@ -31,7 +31,7 @@ WHEN_VISION_ENDS = (
 
 
 @dataclass(frozen=True)
-class Row:
+class SheetRow:
     """One line. good: None where it only tells."""
 
     name: str
@@ -40,19 +40,19 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PreflightSheet:
     """The page. fit: by the doctor; parameters: its lines that are not right, and how many are."""
 
     deployment: str
     day: datetime
     fit: bool
-    rows: tuple[Row, ...]
-    findings: tuple[Finding, ...]
+    rows: tuple[SheetRow, ...]
+    findings: tuple[DoctorFinding, ...]
 
 
 def make_sheet(
     path: Path, config: CompanionConfig, diagnosis: Diagnosis, plan: Path | None, now: datetime
-) -> Sheet:
+) -> PreflightSheet:
     """What is known of a deployment now. plan: ``plan.json`` of `companion plan`."""
     rows = (
         _parameters(diagnosis),
@@ -60,22 +60,22 @@ def make_sheet(
         *_map(config, now.date()),
         _shadow(config, now),
         _forecast(plan, config.map),
-        Row("mode", f"{config.bridge.mode}, {config.bridge.injection.message}"),
-        Row("software", str(versions().get("pilot-companion", "not installed"))),
+        SheetRow("mode", f"{config.bridge.mode}, {config.bridge.injection.message}"),
+        SheetRow("software", str(versions().get("pilot-companion", "not installed"))),
     )
-    return Sheet(str(path), now, diagnosis.ok, rows, diagnosis.findings)
+    return PreflightSheet(str(path), now, diagnosis.ok, rows, diagnosis.findings)
 
 
-def _parameters(diagnosis: Diagnosis) -> Row:
+def _parameters(diagnosis: Diagnosis) -> SheetRow:
     if not diagnosis.findings:
-        return Row("parameters and parts", "nothing was examined", False)
+        return SheetRow("parameters and parts", "nothing was examined", False)
     wrong = [f.name for f in diagnosis.findings if not f.ok and f.required]
     advice = [f.name for f in diagnosis.findings if not f.ok and not f.required]
     good = len(diagnosis.findings) - len(wrong) - len(advice)
     parts = [f"{good} of {len(diagnosis.findings)} checks good"]
     parts += [f"wrong: {', '.join(wrong)}"] if wrong else []
     parts += [f"advice: {', '.join(advice)}"] if advice else []
-    return Row("parameters and parts", "; ".join(parts), not wrong)
+    return SheetRow("parameters and parts", "; ".join(parts), not wrong)
 
 
 def _age(day: date, today: date) -> str:
@@ -83,21 +83,21 @@ def _age(day: date, today: date) -> str:
     return "today" if days == 0 else f"{days} days ago"
 
 
-def _calibration(config: CompanionConfig, today: date) -> Row:
+def _calibration(config: CompanionConfig, today: date) -> SheetRow:
     done = config.camera.calibrated
     if done is None:
-        return Row("calibration", "never by `companion calibrate`, or not told", False)
+        return SheetRow("calibration", "never by `companion calibrate`, or not told", False)
     c = config.localizer.calibration
     text = f"{done.isoformat()} ({_age(done, today)}), focal length to {c.focal_percent:g} %, "
     text += f"stamps to {c.stamp_ms:g} ms"
-    return Row("calibration", text, config.camera.is_calibrated(today))
+    return SheetRow("calibration", text, config.camera.is_calibrated(today))
 
 
-def _map(config: CompanionConfig, today: date) -> tuple[Row, ...]:
+def _map(config: CompanionConfig, today: date) -> tuple[SheetRow, ...]:
     try:
         m = TileCache.open(config.map).manifest
     except LocalizerError as error:
-        return (Row("map", str(error), False),)
+        return (SheetRow("map", str(error), False),)
     box = geo_box(m.extent)
     pinned = "pinned by sha256" if config.map_sha256 else "not pinned: any map is flown"
     where = (
@@ -108,18 +108,18 @@ def _map(config: CompanionConfig, today: date) -> tuple[Row, ...]:
     try:
         taken = date.fromisoformat(stated)
     except ValueError:
-        dated = Row("map's imagery", stated or "date not known", False if not stated else None)
+        dated = SheetRow("map's imagery", stated or "date not known", False if not stated else None)
     else:
-        dated = Row("map's imagery", f"{stated} ({_age(taken, today)})",
+        dated = SheetRow("map's imagery", f"{stated} ({_age(taken, today)})",
                     (today - taken).days <= _OLD_MAP_DAYS)  # fmt: skip
-    return Row("map covers", where), dated
+    return SheetRow("map covers", where), dated
 
 
-def _shadow(config: CompanionConfig, now: datetime) -> Row:
+def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:
     """The newest record's score; from beside the record's folder, as `run` numbers them."""
     folder = config.record.folder if config.record is not None else None
     if folder is None:
-        return Row("shadow score", "no record is kept, so none is known", False)
+        return SheetRow("shadow score", "no record is kept, so none is known", False)
     kept = sorted(
         folder.parent.glob(f"{folder.name}*/health.json"), key=lambda p: p.stat().st_mtime
     )
@@ -132,14 +132,16 @@ def _shadow(config: CompanionConfig, now: datetime) -> Row:
             flown = _read(path.with_name("record.json")).get("config")
             other = isinstance(flown, dict) and flown.get("map") != str(config.map)
             text += ", over another map" if other else ""
-            return Row("shadow score", text, shadow.startswith("go") and recent and not other)
-    return Row("shadow score", "none: fly in shadow mode first", False)
+            return SheetRow("shadow score", text, shadow.startswith("go") and recent and not other)
+    return SheetRow("shadow score", "none: fly in shadow mode first", False)
 
 
-def _forecast(plan: Path | None, flown: Path) -> Row:
+def _forecast(plan: Path | None, flown: Path) -> SheetRow:
     """flown: the deployment's map, which must be the one that the forecast was made over."""
     if plan is None:
-        return Row("forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False)
+        return SheetRow(
+            "forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False
+        )
     data = _read(plan)
     legs = data.get("legs")
     if not isinstance(legs, list) or not isinstance(data.get("holds"), bool):
@@ -148,15 +150,15 @@ def _forecast(plan: Path | None, flown: Path) -> Row:
     conditions = ", ".join(map(str, data.get("conditions", ())))
     mission = Path(str(data.get("mission", "a mission without a name"))).name
     if data.get("map_sha256") != _hash(flown):
-        return Row("forecast", f"{mission}: made over another map than {flown}", False)
+        return SheetRow("forecast", f"{mission}: made over another map than {flown}", False)
     if data["holds"] and not bad:
         text = f"{mission}: vision should hold on all {len(legs)} legs ({conditions})"
-        return Row("forecast", text, True)
+        return SheetRow("forecast", text, True)
     text = (
         f"{mission}: vision will not do on {len(bad)} of {len(legs)} legs ({conditions}): "
         f"{', '.join(bad)}"
     )
-    return Row("forecast", text, False)
+    return SheetRow("forecast", text, False)
 
 
 def _hash(cache: Path) -> str:
@@ -174,7 +176,7 @@ def _read(path: Path) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
-def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, Path]:
+def write_sheet(sheet: PreflightSheet, path: Path) -> tuple[Path, Path]:
     """The page as HTML, and as text beside it."""
     text_path = path.with_suffix(".txt")
     with writing(path, "--page"):
@@ -187,15 +189,15 @@ def _mark(good: bool | None) -> str:
     return {True: "ok", False: "LOOK", None: ""}[good]
 
 
-def _title(sheet: Sheet) -> str:
+def _title(sheet: PreflightSheet) -> str:
     return "fit to fly" if sheet.fit else "NOT fit to fly"
 
 
-def _marked(finding: Finding) -> str:
+def _marked(finding: DoctorFinding) -> str:
     return "ok" if finding.ok else "WRONG" if finding.required else "advice"
 
 
-def as_text(sheet: Sheet) -> str:
+def as_text(sheet: PreflightSheet) -> str:
     """For a terminal or a printer; 78 columns but for long findings."""
     lines = [
         f"BEFORE THE FLIGHT: {_title(sheet)}",
@@ -228,7 +230,7 @@ padding-top:.2em}.sign span:first-child{flex:2}
 """
 
 
-def as_html(sheet: Sheet) -> str:
+def as_html(sheet: PreflightSheet) -> str:
     """One page that needs no other file, and prints on one sheet."""
 
     def row(mark: str, *cells: str) -> str:
@@ -253,11 +255,11 @@ def as_html(sheet: Sheet) -> str:
     )
 
 
-def _wrong_first(findings: Sequence[Finding]) -> list[Finding]:
+def _wrong_first(findings: Sequence[DoctorFinding]) -> list[DoctorFinding]:
     return sorted(findings, key=lambda f: (f.ok, not f.required))
 
 
-def _found(finding: Finding) -> str:
+def _found(finding: DoctorFinding) -> str:
     mark = _marked(finding)
     needed = "" if finding.ok else f" (needed: {escape(finding.needed)})"
     words = f"{escape(finding.name)}: {escape(finding.found)}{needed}"

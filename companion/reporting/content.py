@@ -14,7 +14,7 @@ NOTHING = "nothing"  # that went wrong: how the page's headline begins then
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CriterionResult:
     """One target of the flight. value, needed: as text with units; meaning, look: what a miss means
     and where to look.
     """
@@ -33,7 +33,7 @@ RIM = 1.5  # of dark about a track, both sides together
 
 
 @dataclass(frozen=True)
-class Track:
+class MapTrack:
     """A way in the map's frame. points: (N, 2) east, north, m."""
 
     name: str
@@ -43,7 +43,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Mark:
+class MapMark:
     """A place in the map's frame. kind: "target" is one that was located, "truth" where one truly
     is, else an event's; sigma_m: radius of its circle, 0: none.
     """
@@ -66,8 +66,8 @@ class MapSheet:
     east: float
     south: float
     north: float
-    tracks: tuple[Track, ...] = ()
-    marks: tuple[Mark, ...] = ()
+    tracks: tuple[MapTrack, ...] = ()
+    marks: tuple[MapMark, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Event:
+class ReportEvent:
     """Something that happened."""
 
     time_s: float
@@ -125,7 +125,7 @@ class Overlay:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """Rows of text under their headings. bad: numbers of the rows that miss their target; note: how
     the columns are to be read.
     """
@@ -147,15 +147,15 @@ class Report:
     title: str
     subtitle: str
     first: str
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[CriterionResult, ...] = ()
     sheet: MapSheet | None = None
     plots: tuple[Plot, ...] = ()
     stanford: Stanford | None = None
     lanes: tuple[tuple[str, tuple[Span, ...]], ...] = ()
-    events: tuple[Event, ...] = ()
+    events: tuple[ReportEvent, ...] = ()
     overlays: tuple[Overlay, ...] = ()
-    targets: Table | None = None
-    stages: Table | None = None
+    targets: ReportTable | None = None
+    stages: ReportTable | None = None
     abscissa: str = "time, s"
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, Any] = field(default_factory=dict)

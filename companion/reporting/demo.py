@@ -17,14 +17,14 @@ from companion.reporting.content import (
     INNER,
     MIDDLE,
     OUTER,
+    CriterionResult,
     Curve,
+    MapTrack,
     Overlay,
     Plot,
     Report,
     Span,
     Stanford,
-    Track,
-    Verdict,
 )
 from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import (
@@ -75,7 +75,9 @@ def demo_report(folder: Path, say: Say = silent) -> Report:
         tracks = [
             figures.track("truth", _TRUTH, OUTER, vehicle),
             figures.track("autopilot's EKF", _EKF, MIDDLE, vehicle, "ekf_"),
-            Track(vision.name, VISION, INNER, np.where(accepted[:, None], vision.points, np.nan)),
+            MapTrack(
+                vision.name, VISION, INNER, np.where(accepted[:, None], vision.points, np.nan)
+            ),
         ]
         sheet = pictures.sheet(tracks, figures.target_marks(record.targets))
         goodness = np.where(accepted, -errors["3-D"], np.nan)
@@ -134,14 +136,16 @@ def _errors(estimates: Columns, truth: Columns) -> dict[str, np.ndarray]:
     return errors
 
 
-def _verdicts(report: Mapping[str, Any]) -> tuple[Verdict, ...]:
+def _verdicts(report: Mapping[str, Any]) -> tuple[CriterionResult, ...]:
     verdicts = []
     for c in report["criteria"]:
         value, known = c["value"], advice(c["name"])
         missing = value is None or not np.isfinite(value)
         ok = not missing and (value >= c["limit"] if c["at_least"] else value <= c["limit"])
         found, needed = compared(value, c["limit"], c["unit"], at_least=c["at_least"])
-        verdicts.append(Verdict(c["name"], found, needed, bool(ok), known.meaning, known.look))
+        verdicts.append(
+            CriterionResult(c["name"], found, needed, bool(ok), known.meaning, known.look)
+        )
     return tuple(verdicts)
 
 

@@ -9,7 +9,16 @@ import numpy as np
 
 from companion.errors import RecordError, StreamDecodeError
 from companion.offline.tables import read_columns
-from companion.reporting.content import Curve, MapSheet, Overlay, Plot, Report, Span, Track, Verdict
+from companion.reporting.content import (
+    CriterionResult,
+    Curve,
+    MapSheet,
+    MapTrack,
+    Overlay,
+    Plot,
+    Report,
+    Span,
+)
 from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import VISION
 from companion.reporting.verdicts import advice, compared
@@ -58,7 +67,7 @@ def evaluation_report(folder: Path, say: Say = silent) -> Report:
     )
 
 
-def _verdicts(document: dict[str, float]) -> tuple[Verdict, ...]:
+def _verdicts(document: dict[str, float]) -> tuple[CriterionResult, ...]:
     """The same targets as a demo flight's localizer."""
     wanted = (
         ("localizer median", document["median_translation_m"], 1.0, "m", False),
@@ -70,7 +79,7 @@ def _verdicts(document: dict[str, float]) -> tuple[Verdict, ...]:
         ok = value is not None and (value >= limit if at_least else value <= limit)
         known = advice(name)
         found, needed = compared(value, limit, unit, at_least=at_least)
-        verdicts.append(Verdict(name, found, needed, bool(ok), known.meaning, known.look))
+        verdicts.append(CriterionResult(name, found, needed, bool(ok), known.meaning, known.look))
     return tuple(verdicts)
 
 
@@ -109,7 +118,7 @@ def _sheet(
             local.enu_from_geodetic(*(float(x) for x in row))[:2] if k else np.full(2, np.nan)
             for row, k in zip(rows, known, strict=True)
         ]
-        sheet = pictures.sheet([Track("vision (camera)", VISION, 2.5, np.array(points))], ())
+        sheet = pictures.sheet([MapTrack("vision (camera)", VISION, 2.5, np.array(points))], ())
         return sheet, pictures.notes
 
 

@@ -7,7 +7,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from companion.offline.tables import Columns
-from companion.reporting.content import NOTHING, Curve, Event, Mark, Plot, Span, Table, Track
+from companion.reporting.content import (
+    NOTHING,
+    Curve,
+    MapMark,
+    MapTrack,
+    Plot,
+    ReportEvent,
+    ReportTable,
+    Span,
+)
 
 STAGES = ("reference", "extract", "register", "latency")
 _GAP_S = 1.0  # without an estimate: the state before is not carried on over it
@@ -28,10 +37,10 @@ def seconds(time_ns: np.ndarray, start_ns: int) -> np.ndarray:
     return np.asarray((np.asarray(time_ns) - start_ns) * 1e-9, dtype=np.float64)
 
 
-def track(name: str, colour: str, width: float, columns: Columns, prefix: str = "") -> Track:
+def track(name: str, colour: str, width: float, columns: Columns, prefix: str = "") -> MapTrack:
     """The way of a table's positions."""
     points = np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north")])
-    return Track(name, colour, width, points)
+    return MapTrack(name, colour, width, points)
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray, within_ns: int = _NEAR_NS) -> np.ndarray:
@@ -57,16 +66,16 @@ def state_spans(time_s: np.ndarray, states: np.ndarray) -> tuple[Span, ...]:
     return tuple(spans)
 
 
-def events(columns: Columns, start_ns: int) -> tuple[Event, ...]:
+def events(columns: Columns, start_ns: int) -> tuple[ReportEvent, ...]:
     """The record's events, in seconds since the start."""
     if not columns:
         return ()
     times = seconds(columns["time_ns"], start_ns)
     rows = zip(times, columns["level"], columns["text"], strict=True)
-    return tuple(Event(float(t), str(level), str(text)) for t, level, text in rows)
+    return tuple(ReportEvent(float(t), str(level), str(text)) for t, level, text in rows)
 
 
-def stage_table(estimates: Columns) -> Table:
+def stage_table(estimates: Columns) -> ReportTable:
     """Median, 95 % and largest of each stage, over all of the record."""
     rows = []
     for name in STAGES:
@@ -77,7 +86,7 @@ def stage_table(estimates: Columns) -> Table:
             label = LATENCY if name == "latency" else name
             rows.append((label, *(f"{v:.0f}" for v in spread)))
     note = "Over the whole record, from its first estimate to its last, also with GNSS."
-    return Table(("stage", "median", "p95", "max"), tuple(rows), note=note)
+    return ReportTable(("stage", "median", "p95", "max"), tuple(rows), note=note)
 
 
 def stage_plot(estimates: Columns, time_s: np.ndarray, limit_ms: float | None) -> Plot:
@@ -88,7 +97,7 @@ def stage_plot(estimates: Columns, time_s: np.ndarray, limit_ms: float | None) -
 
 
 def first_fault(
-    estimates: Columns, time_s: np.ndarray, happened: Sequence[Event], large_error: str = "",
+    estimates: Columns, time_s: np.ndarray, happened: Sequence[ReportEvent], large_error: str = "",
     since_s: float | None = None,
 ) -> str:  # fmt: skip
     """What went wrong first once the place was known, in words. large_error: the first time that
@@ -110,7 +119,7 @@ def first_fault(
 
 
 def _first_since(
-    begin_s: float, states: np.ndarray, time_s: np.ndarray, happened: Sequence[Event],
+    begin_s: float, states: np.ndarray, time_s: np.ndarray, happened: Sequence[ReportEvent],
     large_error: str,
 ) -> str:  # fmt: skip
     """With its time; empty where nothing did."""
@@ -134,7 +143,7 @@ def _first_since(
     return f"at {t:.1f} s: {text}"
 
 
-def target_marks(targets: Columns) -> tuple[Mark, ...]:
+def target_marks(targets: Columns) -> tuple[MapMark, ...]:
     """Where each target was located last, with its sigma."""
     marks = []
     for name, rows in by_name(targets).items():
@@ -142,7 +151,7 @@ def target_marks(targets: Columns) -> tuple[Mark, ...]:
         columns = ("east_m", "north_m", "sigma_horizontal_m")
         east, north, sigma = (float(targets[key][i]) for key in columns)
         if np.isfinite([east, north, sigma]).all():
-            marks.append(Mark(name, east, north, "target", sigma))
+            marks.append(MapMark(name, east, north, "target", sigma))
     return tuple(marks)
 
 
@@ -156,7 +165,7 @@ def by_name(targets: Columns) -> dict[str, np.ndarray]:
 
 def target_table(
     targets: Columns, errors: Mapping[str, np.ndarray] | None = None, limit_m: float | None = None
-) -> Table | None:
+) -> ReportTable | None:
     """Each target on its own line: its last place, and its errors where the truth is known."""
     grouped = by_name(targets)
     known = errors or {}
@@ -176,7 +185,7 @@ def target_table(
     headings = ("target", "fixes", "latitude", "longitude", "height, m", "sigma, m", "elsewhere")
     more = ("median error, m", "p95, m", "max, m") if errors is not None else ()
     note = _NEWEST_FIX if errors is None else f"{_NEWEST_FIX} {_EVERY_FIX}"
-    return Table((*headings, *more), tuple(rows), frozenset(bad), note)
+    return ReportTable((*headings, *more), tuple(rows), frozenset(bad), note)
 
 
 def _last_place(targets: Columns, rows: np.ndarray | None) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from av.sidedata.sidedata import Type as SideDataType
 
 from companion.errors import RecordError, StreamOpenError
 from companion.klv.local_set import encode
-from companion.klv.metadata import Scene, picture_fields
+from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.transport import TransportWriter
 from companion.offline.tables import Columns, poses
 from companion.reporting.record import RecordTables, read_record
@@ -69,10 +69,10 @@ def describe_recording(
     cache = TileCache.open(map_path)
     tables.flown.require_frame(cache)
     with ExitStack() as stack:
-        scene = Scene(
+        scene = KlvContext(
             cache.frame, MapSurface(cache).cast, cache.manifest.geoid_separation_m, mission
         )
-        track = _Track(tables, scene)
+        track = _RecordTrack(tables, scene)
         try:
             source = stack.enter_context(av.open(str(video)))
             stream = source.streams.video[0]
@@ -145,10 +145,10 @@ def _packets(
         yield packet, taken
 
 
-class _Track:
+class _RecordTrack:
     """What the record knows at a time: pose, the aircraft's attitude, the newest target."""
 
-    def __init__(self, tables: RecordTables, scene: Scene) -> None:
+    def __init__(self, tables: RecordTables, scene: KlvContext) -> None:
         self._scene = scene
         self._utc_ns = tables.utc_ns - tables.start_ns
         estimates = tables.estimates

@@ -14,7 +14,16 @@ import cv2
 import numpy as np
 
 from companion.errors import ReportError
-from companion.reporting.content import NOTHING, RIM, MapSheet, Plot, Report, Stanford, Table, Track
+from companion.reporting.content import (
+    NOTHING,
+    RIM,
+    MapSheet,
+    MapTrack,
+    Plot,
+    Report,
+    ReportTable,
+    Stanford,
+)
 from companion.vendored import licence_of, vendored
 from companion.writing import writing
 from localizer.types import Image
@@ -153,7 +162,7 @@ def _label(name: str, at: tuple[float, float], arm: float, width: float) -> str:
     )
 
 
-def _polyline(track: Track, points: list[str]) -> str:
+def _polyline(track: MapTrack, points: list[str]) -> str:
     """A track with a dark rim, which is seen on any ground."""
     line = " ".join(points)
     return (
@@ -287,7 +296,7 @@ def _cell(text: str) -> str:
     return f"<td{' class=n' if number else ''}>{escape(text)}</td>"
 
 
-def _table(table: Table) -> str:
+def _table(table: ReportTable) -> str:
     head = "".join(f"<th>{escape(h)}" for h in table.headings)
     rows = "".join(
         f"<tr{' class=missed' if i in table.bad else ''}>" + "".join(_cell(cell) for cell in row)

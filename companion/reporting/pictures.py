@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.errors import RecordError, StreamDecodeError
 from companion.offline.flown_map import FlownMap
-from companion.reporting.content import MapSheet, Mark, Overlay, Track
+from companion.reporting.content import MapMark, MapSheet, MapTrack, Overlay
 from companion.sources.folder_source import read_image
 from companion.terminal.steps import Say
 from localizer.errors import LocalizerError
@@ -51,7 +51,7 @@ class MapPictures:
     notes: list[str] = field(default_factory=list)
     say: Say = silent
 
-    def sheet(self, tracks: Sequence[Track], marks: Sequence[Mark]) -> MapSheet | None:
+    def sheet(self, tracks: Sequence[MapTrack], marks: Sequence[MapMark]) -> MapSheet | None:
         """The square about all tracks and marks; None without any."""
         places = [t.points[np.isfinite(t.points).all(axis=1)] for t in tracks]
         points = np.vstack([*places, *([[m.east_m, m.north_m]] for m in marks), np.empty((0, 2))])

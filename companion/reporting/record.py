@@ -22,12 +22,12 @@ from companion.reporting.content import (
     INNER,
     MIDDLE,
     OUTER,
+    CriterionResult,
     Curve,
+    MapTrack,
     Overlay,
     Plot,
     Report,
-    Track,
-    Verdict,
 )
 from companion.reporting.pictures import ShownFrame, map_pictures, silent
 from companion.terminal.steps import Say
@@ -302,24 +302,24 @@ def _plots(
     )
 
 
-def _tracks(estimates: Columns, autopilot: AutopilotTracks) -> list[Track]:
+def _tracks(estimates: Columns, autopilot: AutopilotTracks) -> list[MapTrack]:
     accepted = np.asarray(estimates["accepted"]) > 0
     vision = figures.track("vision (camera)", VISION, INNER, estimates)
     points = np.where(accepted[:, None], vision.points, np.nan)
     tracks = []
     if autopilot.gnss is not None:
-        tracks.append(Track("GNSS", GNSS, OUTER, autopilot.gnss.points))
+        tracks.append(MapTrack("GNSS", GNSS, OUTER, autopilot.gnss.points))
     if autopilot.ekf is not None:
-        tracks.append(Track("autopilot's EKF", AUTOPILOT, MIDDLE, autopilot.ekf.points))
-    return [*tracks, Track(vision.name, vision.colour, vision.width, points)]
+        tracks.append(MapTrack("autopilot's EKF", AUTOPILOT, MIDDLE, autopilot.ekf.points))
+    return [*tracks, MapTrack(vision.name, vision.colour, vision.width, points)]
 
 
-def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
+def _verdicts(tables: RecordTables) -> tuple[CriterionResult, ...]:
     """What can be judged without the truth."""
     health, estimates = tables.health, tables.estimates
     ended = health.get("level") == "ended"
     verdicts = [
-        Verdict(
+        CriterionResult(
             "ended in order", str(health.get("text", "no health.json")), "an orderly end", ended,
             "the process died, was killed, or the computer lost power: the last seconds may lack",
             "the log of that time, power supply, `dmesg` for memory",
@@ -330,7 +330,7 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
         began = np.flatnonzero(np.asarray(estimates["state"]) == "tracking")
         share = 100.0 * float(accepted[began[0] :].mean()) if len(began) else 0.0
         verdicts.append(
-            Verdict(
+            CriterionResult(
                 "frames accepted once tracking", f"{share:.1f} %", ">= 95 %", share >= 95.0,
                 "frames were refused, so there was no position for them",
                 "quality over time and the worst of the kept frames",
@@ -341,7 +341,7 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
         p95 = float(np.percentile(known, 95)) if len(known) else float("nan")
         limit = tables.delay_ms or _LATEST_MS
         verdicts.append(
-            Verdict(
+            CriterionResult(
                 "exposure to estimate p95", f"{p95:.0f} ms", f"<= {limit:.0f} ms", p95 <= limit,
                 "fixes are older than the EKF was told",
                 "latency by stage; more processor, lower localizer.width, higher delay_ms",
@@ -351,7 +351,7 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
     shadow = str(health.get("shadow", ""))
     if shadow:
         verdicts.append(
-            Verdict(
+            CriterionResult(
                 "shadow score at the end", shadow, "go", shadow.startswith("go"),
                 "vision was not shown to agree with GNSS for long enough",
                 "the reasons after the colon, and vision against GNSS",
@@ -360,14 +360,14 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
     return tuple(verdicts)
 
 
-def _untold_targets(counts: Any) -> list[Verdict]:
+def _untold_targets(counts: Any) -> list[CriterionResult]:
     """Clicks and detections that were not told; nothing where all were, or nobody counted."""
     named = {k: v for k, v in _mapping(counts).items() if isinstance(v, int) and v > 0}
     if not named:
         return []
     text = ", ".join(f"{number} {name}" for name, number in named.items())
     return [
-        Verdict(
+        CriterionResult(
             "clicks and detections not told", text, "none", False,
             "missed: no map under the pixel; doubted: its place may not be told; refused: more "
             "than 32 at a time; unmatched: of a frame without a position; failed: an error",

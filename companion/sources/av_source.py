@@ -43,7 +43,7 @@ from companion.sources.datagrams import (
 )
 from companion.sources.misp import MispTime, parse_message
 from companion.sources.references import Damage, References
-from companion.sources.timing import ExposureClock, Stamps
+from companion.sources.timing import ExposureClock, FrameTimestamps
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange, grey_levels
 from localizer.tracking.mailbox import Mailbox
@@ -73,7 +73,7 @@ class _Input:
     """What is read instead of `url`, where the receiving is ours."""
 
 
-class Decoder:
+class VideoDecoder:
     """One open container: packets in, pictures out. Single-threaded, because FFmpeg's frame threads
     add a frame of delay each.
     """
@@ -180,7 +180,7 @@ class VideoFileSource:
     def frames(self) -> Iterator[Frame]:
         """Every picture; raises `StreamDecodeError` when the file holds none."""
         try:
-            decoder = Decoder(_Input(str(self._path), {}), None, self._tap)
+            decoder = VideoDecoder(_Input(str(self._path), {}), None, self._tap)
         except av.error.FFmpegError as error:
             raise StreamOpenError(
                 f"{self._path}: not a video, or damaged from the start: {error}"
@@ -199,7 +199,7 @@ class VideoFileSource:
         self._closed.set()
         self._report(StreamState.CLOSED, f"{self._path}: closed")
 
-    def _play(self, decoder: Decoder) -> Iterator[Frame]:
+    def _play(self, decoder: VideoDecoder) -> Iterator[Frame]:
         start = time.monotonic_ns()
         first: int | None = None
         for picture in self._readable(decoder):
@@ -229,7 +229,7 @@ class VideoFileSource:
             text = scaling_text(camera.width, camera.height, self._camera, str(self._path))
             self._report(StreamState.SCALED, text)
 
-    def _readable(self, decoder: Decoder) -> Iterator[av.VideoFrame]:
+    def _readable(self, decoder: VideoDecoder) -> Iterator[av.VideoFrame]:
         try:
             for picture, _ in decoder.pictures():
                 if picture is None:
@@ -249,7 +249,7 @@ class VideoFileSource:
         n = self._counters.undecodable + 1
         self._counters = replace(self._counters, undecodable=n)
 
-    def _pts_ns(self, picture: av.VideoFrame, decoder: Decoder) -> int:
+    def _pts_ns(self, picture: av.VideoFrame, decoder: VideoDecoder) -> int:
         stamp = _pts_ns(picture)
         if stamp is not None:
             return stamp
@@ -388,7 +388,7 @@ class LiveVideoSource:
 
     def _receive_once(self, *, reconnect: bool) -> str:
         """Receives until the connection ends; returns why it did."""
-        decoder = Decoder(self._input, self._settings.stall_timeout_s, self._tap)
+        decoder = VideoDecoder(self._input, self._settings.stall_timeout_s, self._tap)
         if reconnect:
             self._count(reconnects=1)
         clock = ExposureClock(
@@ -425,7 +425,7 @@ class LiveVideoSource:
         camera = self._fitted(picture)
         if camera is None:
             return
-        stamps = Stamps(_pts_ns(picture), _misp_time(picture))
+        stamps = FrameTimestamps(_pts_ns(picture), _misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns) - self._settings.late_ns
         _tell(self._tap, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):

@@ -83,7 +83,7 @@ class SourceSettings(BaseModel):
         le=1000,
         description="fixed glass-to-glass latency, taken off where the stream has no exact times",
     )
-    stamps_late_ms: float = Field(
+    time_offset_ms: float = Field(
         default=0.0,
         ge=-1000,
         le=1000,
@@ -124,8 +124,8 @@ class SourceSettings(BaseModel):
 
     @property
     def late_ns(self) -> int:
-        """`stamps_late_ms` in ns."""
-        return round(1e6 * self.stamps_late_ms)
+        """`time_offset_ms` in ns."""
+        return round(1e6 * self.time_offset_ms)
 
     @field_validator("grey_range")
     @classmethod

@@ -65,7 +65,7 @@ class MinimumLag:
 
 
 @dataclass(frozen=True)
-class Stamps:
+class FrameTimestamps:
     """What a decoded picture says about time. pts_ns: presentation time, epoch unknown."""
 
     pts_ns: int | None
@@ -85,7 +85,7 @@ class ExposureClock:
         self._excess_ns: int | None = None  # of the smallest lag's times over the exact ones
         self._held = False
 
-    def exposure_time(self, stamps: Stamps, arrival_ns: int) -> int:
+    def exposure_time(self, stamps: FrameTimestamps, arrival_ns: int) -> int:
         """CLOCK_MONOTONIC nanoseconds of the exposure of a frame that arrived at `arrival_ns`."""
         if self._device and stamps.pts_ns is not None and _plausible(stamps.pts_ns, arrival_ns):
             return stamps.pts_ns

@@ -38,13 +38,13 @@ class Pulse:
         self._begun_ns = monotonic_ns()
         self._thread.start()
 
-    def stop(self, *, in_order: bool) -> None:
+    def stop(self, *, clean_shutdown: bool) -> None:
         """Say that the end begins, and end. One in order (stopped, the feed is over) is given the
         time that a recording takes; after an error another process should fly soon.
         """
         self._stop.set()
         ended = joined(self._thread)
-        self._say(f"{ENDING if in_order else 'failing'} 0\n".encode())
+        self._say(f"{ENDING if clean_shutdown else 'failing'} 0\n".encode())
         if ended:  # else its next line would go into whatever file has the number then
             os.close(self._descriptor)
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 from companion.config import TargetConfig
 from companion.targets.history import PoseHistory
-from companion.targets.population import Click
 from companion.targets.reporter import TargetReporter
+from companion.targets.target_manager import Click
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.messages import TrackRequest
 

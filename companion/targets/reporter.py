@@ -14,7 +14,7 @@ from companion.config import TargetConfig
 from companion.ending import joined
 from companion.targets.detections import Detection
 from companion.targets.pictures import RecentPictures
-from companion.targets.population import Click, Population, Target
+from companion.targets.target_manager import Click, TargetEstimate, TargetManager
 from localizer.targets.locate import RayCaster
 from localizer.types import Frame, PoseEstimate
 
@@ -42,11 +42,11 @@ class TargetReporter:
         self,
         config: TargetConfig,
         cast: RayCaster,
-        on_target: Callable[[Target], None],
+        on_target: Callable[[TargetEstimate], None],
         on_gone: Callable[[str], None] = lambda _name: None,
         say: Callable[[int, str], None] = _say_nothing,
     ) -> None:
-        self._population = Population(config, cast, on_target, on_gone, say)
+        self._population = TargetManager(config, cast, on_target, on_gone, say)
         self._on_gone, self._say = on_gone, say
         self._forgotten: tuple[str, ...] = ()
         self._clicks: list[Click] = []

@@ -200,7 +200,7 @@ def evaluate(
                 progress(index)
                 continue
             started = time.perf_counter()
-            lost = not has_prior or localizer.tracker.standing.wants_prior
+            lost = not has_prior or localizer.tracker.track_status.wants_prior
             fresh = (mode == "each" or not has_prior) if find is None else lost
             if fresh:
                 truth = sequence.truth[index]
@@ -250,7 +250,7 @@ def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:
         world_from_camera=prior.world_from_camera,
         covariance=prior.covariance,
         quality=0.0,
-        state=localizer.tracker.standing.state,
+        state=localizer.tracker.track_status.state,
         status=RegistrationStatus.TOO_FEW_ANCHORS,
         accepted=False,
         exposure_time_ns=frame.exposure_time_ns,

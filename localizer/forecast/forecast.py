@@ -9,7 +9,7 @@ import numpy as np
 from localizer.config import LocalizerConfig
 from localizer.features.extractor import FeatureExtractor
 from localizer.forecast.risk import RIGHT_M, WORST_M, Figures, expected_sigma_m, failure_risk
-from localizer.forecast.rivals import Rival, likest_rival
+from localizer.forecast.rivals import AmbiguousPosition, likest_rival
 from localizer.forecast.visit import another_visit
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -44,7 +44,7 @@ class ViewForecast:
     risk: float
     ground_m: float
     texture: float
-    rival: Rival
+    rival: AmbiguousPosition
 
 
 class Forecaster:
@@ -93,7 +93,7 @@ class Forecaster:
         prior: PosePrior,
         rng: np.random.Generator,
     ) -> ViewForecast:
-        found, rival = [], Rival(0.0, 0.0)
+        found, rival = [], AmbiguousPosition(0.0, 0.0)
         for draw in range(self._draws):
             query = self._extractor.extract(another_visit(view, condition, rng))
             found.append(self._optimizer.register(query, self._camera, anchors, prior, seed=draw))
@@ -172,4 +172,4 @@ def _width_m(view: RenderedView) -> float:
 def _nothing(condition: str, share: float) -> ViewForecast:
     """Where the view does not meet the map."""
     figures = Figures(WORST_M, 0.0, 0.0, share, 1.0, WORST_M)
-    return ViewForecast(condition, figures, WORST_M, 1.0, 0.0, 0.0, Rival(0.0, 0.0))
+    return ViewForecast(condition, figures, WORST_M, 1.0, 0.0, 0.0, AmbiguousPosition(0.0, 0.0))

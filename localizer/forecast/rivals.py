@@ -20,7 +20,7 @@ _ANCHORS = 250
 
 
 @dataclass(frozen=True)
-class Rival:
+class AmbiguousPosition:
     """The likest other place. share: its match over the true one's, 0 (chance) to 1 (the same);
     distance_m: how far off it is, 0 without one.
     """
@@ -31,7 +31,7 @@ class Rival:
 
 def likest_rival(
     optimizer: JNGO, levels: tuple[LevelProblem, ...], origin: Array, truth: Pose, width_m: float
-) -> Rival:
+) -> AmbiguousPosition:
     """The best mode that displaced poses run into, away from the true one.
 
     levels: of the query, coarse to fine, the network's; origin: (3,) of their local frame;
@@ -56,9 +56,9 @@ def likest_rival(
     best = int(np.argmin(scores))
     own = quality(fine, here, there, settings)
     if not np.isfinite(scores[best]) or own <= 0:
-        return Rival(0.0, 0.0)
+        return AmbiguousPosition(0.0, 0.0)
     other = quality(fine, R[best], t[best], settings)
-    return Rival(min(other / own, 1.0), float(np.linalg.norm(differences[best, :3])))
+    return AmbiguousPosition(min(other / own, 1.0), float(np.linalg.norm(differences[best, :3])))
 
 
 def _motion(problem: LevelProblem, rotation: Array, translation: Array) -> Array:

@@ -22,10 +22,10 @@ class IntegrityConfig(BaseModel):
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
-    min_agreement: float = Field(
+    min_patch_inlier_ratio: float = Field(
         0.4, ge=0, le=1, description="share of the image's parts that match best where they lie"
     )
-    min_parts: int = Field(
+    min_patches: int = Field(
         8, ge=0, le=1000, description="parts of the image that can say so, of 32 px"
     )
     max_sigma_m: float = Field(
@@ -37,19 +37,21 @@ class IntegrityConfig(BaseModel):
         le=1,
         description="share by which another focal length may fit a place on trial better",
     )
-    distinct_from_m: float = Field(
+    ambiguity_sigma_m: float = Field(
         6.0,
         ge=0,
         le=1e4,
         description="sigma of the prior's place from which on the place has to stand out",
     )
-    min_peak: float = Field(
+    peak_to_sidelobe_min: float = Field(
         4.5,
         ge=0,
         le=100,
         description="the image's match over its matches beside, in their sigmas, to stand out",
     )
-    gate: float = Field(40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof")
+    chi2_threshold: float = Field(
+        40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof"
+    )
     confirmations: int = Field(
         3, ge=1, le=1000, description="acceptances in a row that begin TRACKING"
     )
@@ -91,9 +93,9 @@ def is_acceptable(
         return False
     if not parts_agree(config, result) or result.focal_gain > config.max_focal_gain:
         return False
-    if prior_sigma_m >= config.distinct_from_m and not stands_out(config, result):
+    if prior_sigma_m >= config.ambiguity_sigma_m and not stands_out(config, result):
         return False
-    return distance_squared <= config.gate
+    return distance_squared <= config.chi2_threshold
 
 
 def stands_out(config: IntegrityConfig, result: Registration) -> bool:
@@ -103,7 +105,7 @@ def stands_out(config: IntegrityConfig, result: Registration) -> bool:
     lot says which of them is seen; a wider one does not, and no test of one picture can. On a GPU
     there are no votes: what is searched there is judged by the relocalizer's verdict alone.
     """
-    return result.agreement is None or result.agreement.peak >= config.min_peak
+    return result.agreement is None or result.agreement.peak >= config.peak_to_sidelobe_min
 
 
 def parts_agree(config: IntegrityConfig, result: Registration) -> bool:
@@ -113,4 +115,4 @@ def parts_agree(config: IntegrityConfig, result: Registration) -> bool:
     votes = result.agreement
     if votes is None:
         return True
-    return votes.parts >= config.min_parts and votes.share >= config.min_agreement
+    return votes.patches >= config.min_patches and votes.share >= config.min_patch_inlier_ratio

@@ -26,7 +26,7 @@ _SLACK_M = 1.5  # of two displacements over seconds, beside what their sigmas sa
 _TURN_RAD = np.radians(15.0)  # a view that turned by this shows other ground
 
 
-class Verdict(Enum):
+class Consistency(Enum):
     """What the evidence says of a found place so far."""
 
     PENDING = "pending"
@@ -35,7 +35,7 @@ class Verdict(Enum):
 
 
 @dataclass(frozen=True)
-class Probation:
+class TentativeTrack:
     """The first acceptance of a run at a found place. covariance: (6, 6); time_ns: its exposure.
 
     independent_prior: the place was proposed by something that owes our own fixes nothing, such as
@@ -49,7 +49,7 @@ class Probation:
 
 
 @dataclass(frozen=True)
-class Witness:
+class IndependentEvidence:
     """What other sensors say. rotation: (3, 3) world_from_camera at the newest acceptance, or None;
     displacement: (3,) metres since the probation began with its sigma (m), or None.
     """
@@ -58,35 +58,35 @@ class Witness:
     displacement: tuple[Array, float] | None = None
 
 
-def weigh(
-    probation: Probation,
+def consistency_test(
+    tentative_track: TentativeTrack,
     pose: Pose,
     covariance: Array,
     time_ns: int,
-    witness: Witness,
+    evidence: IndependentEvidence,
     config: IntegrityConfig,
-) -> Verdict:
+) -> Consistency:
     """The evidence after another acceptance at `pose`, covariance (6, 6)."""
-    if witness.rotation is not None and not _attitude_agrees(pose, witness.rotation, config):
-        return Verdict.CONTRADICTED
-    moved = pose.translation - probation.world_from_camera.translation
-    if witness.displacement is not None:
-        seen, sigma_m = witness.displacement
-        own = np.sqrt((probation.covariance + covariance).diagonal()[:3].max())
+    if evidence.rotation is not None and not _attitude_agrees(pose, evidence.rotation, config):
+        return Consistency.CONTRADICTED
+    moved = pose.translation - tentative_track.world_from_camera.translation
+    if evidence.displacement is not None:
+        seen, sigma_m = evidence.displacement
+        own = np.sqrt((tentative_track.covariance + covariance).diagonal()[:3].max())
         limit = _SLACK_M + _SIGMAS * (sigma_m + own)
         if np.linalg.norm(moved - seen) > limit:
-            return Verdict.CONTRADICTED
-    if probation.independent_prior:
-        return Verdict.CONFIRMED
-    turned = so3_log(pose.rotation @ probation.world_from_camera.rotation.T)
-    noise_m = _noise_m(moved, probation.covariance + covariance)
+            return Consistency.CONTRADICTED
+    if tentative_track.independent_prior:
+        return Consistency.CONFIRMED
+    turned = so3_log(pose.rotation @ tentative_track.world_from_camera.rotation.T)
+    noise_m = _noise_m(moved, tentative_track.covariance + covariance)
     has_moved = np.linalg.norm(moved) >= max(config.confirm_distance_m, noise_m)
     has_moved = has_moved or np.linalg.norm(turned) >= _TURN_RAD
-    has_stayed = (time_ns - probation.time_ns) * 1e-9 >= config.confirm_still_s
+    has_stayed = (time_ns - tentative_track.time_ns) * 1e-9 >= config.confirm_still_s
     # A hovering camera sees the same ground again: without the autopilot's attitude beside it,
     # that the map goes on matching says nothing new.
-    has_stayed = has_stayed and witness.rotation is not None
-    return Verdict.CONFIRMED if has_moved or has_stayed else Verdict.PENDING
+    has_stayed = has_stayed and evidence.rotation is not None
+    return Consistency.CONFIRMED if has_moved or has_stayed else Consistency.PENDING
 
 
 def _noise_m(moved: Array, covariance: Array) -> float:

@@ -49,7 +49,7 @@ class OdometryConfig(BaseModel):
     max_sigma_m: float = Field(
         2.0, ge=0.01, le=100, description="position sigma of a usable registration"
     )
-    gate: float = Field(
+    chi2_threshold: float = Field(
         60.0, ge=1, le=1e4, description="squared Mahalanobis distance from the prediction, 6 dof"
     )
     new_below_overlap: float = Field(

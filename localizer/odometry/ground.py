@@ -19,7 +19,7 @@ _SOUNDED_NS = 5_000_000_000  # of a rangefinder's readings: longer than a house 
 _LEAST_READINGS = 5
 
 
-class Ground(Protocol):
+class TerrainModel(Protocol):
     """A terrain model: a height grid, a plane, or a rangefinder's account of the ground."""
 
     def height(self, east: Array, north: Array) -> Array:
@@ -39,7 +39,7 @@ class FlatGround:
         return cls(float(np.quantile(points_world[:, 2], _LOW_SHARE)))
 
     def height(self, east: Array, north: Array) -> Array:
-        """See `Ground.height`."""
+        """See `TerrainModel.height`."""
         del north
         return np.full(np.shape(east), self.height_m)
 
@@ -48,17 +48,17 @@ class FlatGround:
 class RaisedGround:
     """Another ground, raised by so much: its shape counts and not its datum."""
 
-    ground: Ground
+    ground: TerrainModel
     by_m: float
 
     @classmethod
-    def onto(cls, ground: Ground, points_world: Array) -> RaisedGround:
+    def onto(cls, ground: TerrainModel, points_world: Array) -> RaisedGround:
         """So that it lies under surface points (N, 3) as ground does, e.g. the map's last ones."""
         above = points_world[:, 2] - ground.height(points_world[:, 0], points_world[:, 1])
         return cls(ground, float(np.quantile(above, _LOW_SHARE)))
 
     def height(self, east: Array, north: Array) -> Array:
-        """See `Ground.height`."""
+        """See `TerrainModel.height`."""
         return self.ground.height(east, north) + self.by_m
 
 
@@ -87,7 +87,7 @@ class SoundedGround:
 
 
 def ground_points(
-    ground: Ground, world_from_camera: Pose, camera: Camera, pixels: Array
+    ground: TerrainModel, world_from_camera: Pose, camera: Camera, pixels: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Where the rays of pixels (N, 2) meet the ground: points (N, 3), and which do at all (N,)."""
     rays = camera.rays(pixels) @ world_from_camera.rotation.T

@@ -13,7 +13,7 @@ from localizer.errors import DeviceArrayError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
-from localizer.odometry.ground import Ground, ground_points
+from localizer.odometry.ground import TerrainModel, ground_points
 from localizer.registration.anchors import anchors_at
 from localizer.registration.priors import PoseConstraint
 from localizer.types import Anchors, FeaturePyramid
@@ -67,7 +67,7 @@ def keyframe_anchors(
     camera: Camera,
     world_from_camera: Pose,
     surface: Array | None,
-    ground: Ground | None,
+    ground: TerrainModel | None,
     count: int,
     seed: int = 0,
     sweep: Sweep | None = None,

@@ -12,13 +12,13 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
-from localizer.odometry.ground import FlatGround, Ground, RaisedGround, SoundedGround
+from localizer.odometry.ground import FlatGround, RaisedGround, SoundedGround, TerrainModel
 from localizer.odometry.growth import carried, scaled
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
-from localizer.odometry.parallax import View, align
+from localizer.odometry.parallax import ParallaxView, align
 from localizer.odometry.track import (
-    Beginning,
-    Track,
+    OdometryStart,
+    OdometryTrack,
     aided_rotation,
     fault,
     followed,
@@ -56,19 +56,19 @@ class VisualOdometry:
         camera: Camera,
         optimizer: JNGO,
         config: OdometryConfig | None = None,
-        ground: Ground | None = None,
+        ground: TerrainModel | None = None,
         seed: int = 0,
     ) -> None:
         self._camera = camera
         self._optimizer = optimizer
         self.config = config or OdometryConfig()
         self._ground = self._terrain = ground
-        self._plane: Ground | None = None
+        self._plane: TerrainModel | None = None
         self._sounded = SoundedGround()
         self._seed = seed
-        self._beginning: Beginning | None = None
+        self._beginning: OdometryStart | None = None
         self._keyframe: Keyframe | None = None
-        self._track: Track | None = None
+        self._track: OdometryTrack | None = None
 
     @property
     def ready(self) -> bool:
@@ -94,11 +94,11 @@ class VisualOdometry:
         in every step. Costs nothing; the first `step` makes a keyframe of it. Whatever was bridged
         before is forgotten.
         """
-        self._beginning = Beginning(frame, pose, covariance, surface, constraint)
+        self._beginning = OdometryStart(frame, pose, covariance, surface, constraint)
         self._keyframe = None
         speed = np.zeros(3) if velocity is None else np.asarray(velocity, dtype=np.float64)
         aided, corrected = aided_rotation(constraint), self._beginning.corrected(constraint)
-        self._track = Track(
+        self._track = OdometryTrack(
             pose, covariance, speed, frame.time_ns, 0.0, aided, corrected, np.zeros((6, 6))
         )
         if surface is not None and len(surface) > self._optimizer.config.min_anchors:
@@ -171,7 +171,7 @@ class VisualOdometry:
             self._hand_over(frame, after, surface() if callable(surface) else surface)
         return estimate
 
-    def _first_keyframe(self, beginning: Beginning) -> Keyframe:
+    def _first_keyframe(self, beginning: OdometryStart) -> Keyframe:
         constraint = beginning.corrected(beginning.constraint)
         made = self._make_keyframe(
             beginning.frame, beginning.pose, beginning.covariance, 0.0, beginning.surface,
@@ -204,7 +204,7 @@ class VisualOdometry:
             surface if source is DepthSource.MAP else None, constraint, behind,
         )  # fmt: skip
 
-    def _below(self, time_ns: int) -> tuple[Ground | None, DepthSource]:
+    def _below(self, time_ns: int) -> tuple[TerrainModel | None, DepthSource]:
         """The ground where the map has none, and how it is known."""
         if self._ground is not None:
             return self._ground, DepthSource.GROUND
@@ -212,7 +212,9 @@ class VisualOdometry:
             return sounded, DepthSource.RANGE
         return self._plane, DepthSource.PLANE
 
-    def _aligned(self, keyframe: Keyframe, frame: OdometryFrame, track: Track) -> Track:
+    def _aligned(
+        self, keyframe: Keyframe, frame: OdometryFrame, track: OdometryTrack
+    ) -> OdometryTrack:
         """The track once more, from the keyframe's pose by the parallax over the map's shape."""
         noise = self.config.parallax_noise
         is_fine = frame.features.levels[-1].stride == 1  # nothing else shows a parallax of a pixel
@@ -220,8 +222,8 @@ class VisualOdometry:
             return track
         found = align(
             self._optimizer.backend,
-            View(keyframe.features, keyframe.world_from_camera, keyframe.camera),
-            View(frame.features, track.pose, frame.camera or self._camera),
+            ParallaxView(keyframe.features, keyframe.world_from_camera, keyframe.camera),
+            ParallaxView(frame.features, track.pose, frame.camera or self._camera),
             keyframe.surface,
             keyframe.covariance,
             noise,
@@ -232,7 +234,7 @@ class VisualOdometry:
         covariance = carried(found.covariance, lever) + track.relative
         return replace(track, pose=found.second, covariance=covariance)
 
-    def _hand_over(self, frame: OdometryFrame, track: Track, surface: Array | None) -> None:
+    def _hand_over(self, frame: OdometryFrame, track: OdometryTrack, surface: Array | None) -> None:
         """The frame becomes the keyframe, unless it has too little depth for one."""
         made = self._make_keyframe(
             frame, track.pose, track.covariance, track.way_m, surface, track.constraint
@@ -241,7 +243,7 @@ class VisualOdometry:
             self._keyframe = replace(made, unmatched_m2=track.unmatched_m2)
             self._track = replace(track, best=0.0)
 
-    def _is_spent(self, keyframe: Keyframe, result: Registration, track: Track) -> bool:
+    def _is_spent(self, keyframe: Keyframe, result: Registration, track: OdometryTrack) -> bool:
         c = self.config
         turn = so3_log(track.pose.rotation @ keyframe.world_from_camera.rotation.T)
         return (
@@ -273,7 +275,7 @@ class VisualOdometry:
         status: OdometryStatus,
         reason: str,
         time_ns: int,
-        track: Track,
+        track: OdometryTrack,
         keyframe: Keyframe,
         pose: Pose,
         quality: float,

@@ -42,7 +42,7 @@ _RADIAN_M = 100.0  # weighs turns against shifts where the axes of a covariance 
 
 
 @dataclass(frozen=True)
-class View:
+class ParallaxView:
     """A picture's features, its pose, world_from_camera, and its pinhole."""
 
     features: FeaturePyramid
@@ -51,7 +51,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ParallaxAlignment:
     """Poses of two pictures on the map's shape; covariance: (6, 6) of the first's."""
 
     first: Pose
@@ -60,8 +60,8 @@ class Alignment:
 
 
 def align(
-    backend: Backend, first: View, second: View, points: Array, prior: Array, noise: float
-) -> Alignment | None:  # fmt: skip
+    backend: Backend, first: ParallaxView, second: ParallaxView, points: Array, prior: Array, noise: float
+) -> ParallaxAlignment | None:  # fmt: skip
     """Both pictures' poses on surface points (N, 3) of the map; None where it cannot be told.
 
     second: registered against the first, so that the two are one rigid body but for what the shape
@@ -87,7 +87,7 @@ def align(
     score, moved = cost(step)
     if not np.isfinite(score):
         return None
-    return Alignment(_moved(first.pose, step), moved, axes.T @ C @ axes)
+    return ParallaxAlignment(_moved(first.pose, step), moved, axes.T @ C @ axes)
 
 
 def _axes(prior: Array) -> Array:
@@ -117,7 +117,9 @@ def _moved(pose: Pose, step: Array) -> Pose:
 class _Cost:
     """How badly the second picture fits the first, draped over the shape from another pose."""
 
-    def __init__(self, backend: Backend, first: View, second: View, points: Array) -> None:
+    def __init__(
+        self, backend: Backend, first: ParallaxView, second: ParallaxView, points: Array
+    ) -> None:
         self._backend, self._cameras = backend, (first.camera, second.camera)
         self._first, self._second = first.pose, second.pose
         self._features = [_finest(view.features) for view in (first, second)]

@@ -27,7 +27,7 @@ _SEARCH_M, _SEARCH_RAD = 1.0, float(np.radians(2.0))  # sigmas of a search witho
 
 
 @dataclass(frozen=True)
-class Beginning:
+class OdometryStart:
     """Where and when the pose was last known otherwise, and what a first keyframe is made of."""
 
     frame: OdometryFrame
@@ -44,7 +44,7 @@ class Beginning:
 
 
 @dataclass(frozen=True)
-class Track:
+class OdometryTrack:
     """The last usable estimate. covariance: without the error of scale. constraint: what other
     sensors said, less their constant error. relative: (6, 6) what the covariance holds beside the
     keyframe's own. best: quality of the keyframe's first registration. unmatched_m2: variance of
@@ -97,19 +97,19 @@ def fault(config: OdometryConfig, result: Registration, prior: PosePrior) -> str
     sigma = float(np.sqrt(result.covariance.diagonal()[:3].max()))
     if sigma > config.max_sigma_m:
         return f"position sigma {sigma:.1f} m is beyond {config.max_sigma_m:g}"
-    if distance_squared(prior, result.world_from_camera, result.covariance) > config.gate:
+    if distance_squared(prior, result.world_from_camera, result.covariance) > config.chi2_threshold:
         return "the pose contradicts the prediction"
     return ""
 
 
 def followed(
     config: OdometryConfig,
-    track: Track,
+    track: OdometryTrack,
     keyframe: Keyframe,
     result: Registration,
     time_ns: int,
     sensed: tuple[PoseConstraint | None, PoseConstraint | None],
-) -> Track:
+) -> OdometryTrack:
     """The track after a registration against the keyframe.
 
     sensed: what other sensors say of this frame, as they say it and less their constant error.
@@ -130,7 +130,7 @@ def followed(
     dt = seconds(track.time_ns, time_ns)
     velocity = (pose.translation - track.pose.translation) / dt if dt > 0 else track.velocity
     unmatched = (model.unmatched * (1.0 - result.quality)) ** 2 * hop
-    return Track(
+    return OdometryTrack(
         pose, covariance, velocity, time_ns, keyframe.way_m + hop, aided_rotation(constraint),
         corrected, relative, track.best or result.quality, keyframe.unmatched_m2 + unmatched,
     )  # fmt: skip

@@ -27,22 +27,22 @@ _LEAST_ANCHORS = 4  # of a part, to have a vote
 
 
 @dataclass(frozen=True)
-class Agreement:
+class PatchAgreement:
     """parts: of the image that could vote; votes: of those that match best where they lie; peak:
     the whole image's match there over its matches under other shifts, in their standard deviations.
     """
 
-    parts: int
+    patches: int
     votes: int
     peak: float
 
     @property
     def share(self) -> float:
         """Of the parts that agree, 0 to 1."""
-        return self.votes / max(self.parts, 1)
+        return self.votes / max(self.patches, 1)
 
 
-def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> Agreement:
+def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> PatchAgreement:
     """How the parts vote on a pose camera_from_local; problem: a level and some of its anchors."""
     sums, anchors = _shifted_sums(problem, rotation, translation)
     offset = np.arange(-_REACH, _REACH + 1)
@@ -53,7 +53,7 @@ def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> Agr
     total = sums.sum(axis=0).ravel()
     others = total[(distance > 2 * _NEAR).ravel()]
     peak = (float(total[near].max()) - float(others.mean())) / max(float(others.std()), 1e-9)
-    return Agreement(len(able), votes, peak if len(sums) else 0.0)
+    return PatchAgreement(len(able), votes, peak if len(sums) else 0.0)
 
 
 def _shifted_sums(

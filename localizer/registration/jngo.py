@@ -39,10 +39,11 @@ from localizer.registration.covariance import (
 )
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
+from localizer.registration.device_registration import DeviceBackend
 from localizer.registration.devices import trial
 from localizer.registration.hypotheses import draw_hypotheses
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.result import Found, Registration, failure, registration
+from localizer.registration.result import Registration, SearchSurvivors, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,
     distinct,
@@ -50,7 +51,6 @@ from localizer.registration.selection import (
     quality,
     thinned,
 )
-from localizer.registration.whole import WholeBackend
 from localizer.registration.zoom import FocalTest
 from localizer.types import Anchors, FeaturePyramid, FocalFit, PosePrior, RegistrationStatus
 
@@ -78,7 +78,7 @@ class JNGO:
         self.config = config or JNGOConfig()
         self.backend = make_backend(backend, threads) if isinstance(backend, str) else backend
         self._threads = threads
-        self._whole = self.backend.whole() if isinstance(self.backend, WholeBackend) else None
+        self._whole = self.backend.whole() if isinstance(self.backend, DeviceBackend) else None
 
     @property
     def on_gpu(self) -> bool:
@@ -225,12 +225,14 @@ class JNGO:
         weight = self.config.prior_weight * max(float(best), LEAST_SCORE)
         return replace(problem, prior=QuadraticPrior(target, constraint.information, weight))
 
-    def _found(self, swarm: _Swarm, winner: _Winner, level: LevelProblem, stride: int) -> Found:
+    def _found(
+        self, swarm: _Swarm, winner: _Winner, level: LevelProblem, stride: int
+    ) -> SearchSurvivors:
         """The survivors with the winner in the first's place, and the sums at its pose; level: the
         network's finest, on which the image's parts vote.
         """
         c, problem, R, t = self.config, winner.problem, winner.rotation, winner.translation
-        return Found(
+        return SearchSurvivors(
             np.concatenate([R[None], swarm.rotations[1:]]),
             np.concatenate([t[None], swarm.translations[1:]]),
             swarm.scores,

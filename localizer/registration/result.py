@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array, Pose
-from localizer.registration.agreement import Agreement
+from localizer.registration.agreement import PatchAgreement
 from localizer.registration.backend import world_from_camera
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import (
@@ -43,13 +43,13 @@ class Registration:
     quality: float
     status: RegistrationStatus
     evaluations: int
-    agreement: Agreement | None = None
+    agreement: PatchAgreement | None = None
     lead: float = np.inf
     focal_gain: float = -np.inf
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchSurvivors:
     """What a search ends with. rotations (K, 3, 3), translations (K, 3): the survivors,
     camera_from_local, best first, the first one sharpened; scores and overlaps (K,): as the search
     left them; sums: of equation 11 at the first one, None where no anchor has weight;
@@ -64,10 +64,12 @@ class Found:
     prior_weight: float
     quality: float
     evaluations: int
-    agreement: Agreement | None = None
+    agreement: PatchAgreement | None = None
 
 
-def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Array) -> Registration:
+def registration(
+    found: SearchSurvivors, config: JNGOConfig, prior: PosePrior, origin: Array
+) -> Registration:
     """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE."""
     tangent = None
     if found.sums is not None:

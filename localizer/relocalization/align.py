@@ -25,7 +25,7 @@ Complex64 = NDArray[np.complex64]
 
 
 @dataclass(frozen=True)
-class Shift:
+class ImageOffset:
     """u, v: px of the image that the frame lies to the right of and below in the rendering;
     score: correlation there times the root of the share that both see, 0 to 1.
     """
@@ -52,7 +52,7 @@ class FrameShift:
         self._share = np.clip(seen, 0.0, 1.0)
         self._under = self._back(self._ones * self._energy)
 
-    def over(self, levels: tuple[FeatureLevel, ...]) -> Shift:
+    def over(self, levels: tuple[FeatureLevel, ...]) -> ImageOffset:
         """The best shift over a rendering's pyramid."""
         features = _weighted(levels[_LEVEL])
         raw = self._back((self._transformed(features) * self._spectrum).sum(axis=2))
@@ -63,7 +63,7 @@ class FrameShift:
         i, j = (int(k) for k in np.unravel_index(int(scores.argmax()), scores.shape))
         v = i if i < self._shape[0] else i - self._size[0]
         u = j if j < self._shape[1] else j - self._size[1]
-        return Shift(float(u * self._stride), float(v * self._stride), float(scores[i, j]))
+        return ImageOffset(float(u * self._stride), float(v * self._stride), float(scores[i, j]))
 
     def _transformed(self, values: Float32) -> Complex64:
         spectrum: Complex64 = scipy.fft.rfft2(values, self._size, axes=(0, 1), workers=1)
@@ -74,7 +74,7 @@ class FrameShift:
         return values
 
 
-def moved(pose: Pose, camera: Camera, shift: Shift, ground_m: float) -> Array:
+def moved(pose: Pose, camera: Camera, shift: ImageOffset, ground_m: float) -> Array:
     """How far (2,) m a camera lies from a rendering's pose whose image its own is shifted over, at
     one heading and height; ground_m: the height of the ground. Zero where no ground is seen.
     """

@@ -40,7 +40,7 @@ class RelocalizationConfig(BaseModel):
         3, ge=1, le=10, description="renderings of a place, each from the last pose"
     )
     min_quality: float = Field(0.2, ge=0, le=1, description="registration quality of an answer")
-    min_agreement: float = Field(
+    min_patch_inlier_ratio: float = Field(
         0.6, ge=0, le=1, description="share of the image's parts that agree on an answer"
     )
     max_focal_gain: float = Field(

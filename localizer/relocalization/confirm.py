@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from localizer.registration.result import Registration, failure
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
-from localizer.relocalization.verdict import NEARLY, SAME_PLACE_M, Judged, is_decisive
-from localizer.relocalization.verify import Aligned, Sight, Verifier
+from localizer.relocalization.verdict import NEARLY, SAME_PLACE_M, VerifiedCandidate, is_decisive
+from localizer.relocalization.verify import Aligned, QueryFeatures, Verifier
 from localizer.types import PosePrior, RegistrationStatus
 
 _ROUNDS = (3, 24)  # candidates screened before the best are registered; then all
@@ -26,7 +26,9 @@ class StopAskedError(Exception):
     """The answer is not wanted any more."""
 
 
-def compared(candidates: list[PlaceCandidate], judged: list[Judged]) -> list[PlaceCandidate]:
+def compared(
+    candidates: list[PlaceCandidate], judged: list[VerifiedCandidate]
+) -> list[PlaceCandidate]:
     """The candidates that an answer is held against: the best of the search, or as many as it took
     to find it.
     """
@@ -43,18 +45,18 @@ class Confirmation:
     """
 
     verifier: Verifier
-    sight: Sight
-    small: Sight
+    sight: QueryFeatures
+    small: QueryFeatures
     query: PlaceQuery
     candidates: list[PlaceCandidate]
     config: RelocalizationConfig
     should_stop: Callable[[], bool]
     places: list[Aligned] = field(default_factory=list)
-    judged: dict[int, Judged] = field(default_factory=dict)
+    judged: dict[int, VerifiedCandidate] = field(default_factory=dict)
     surrounded: set[int] = field(default_factory=set)
     finished: set[int] = field(default_factory=set)
 
-    def run(self) -> list[Judged]:
+    def run(self) -> list[VerifiedCandidate]:
         """Those that were registered, the best of them to the end; best first. None if stopped."""
         try:
             self._first_pass()
@@ -128,7 +130,7 @@ class Confirmation:
             if result.quality > begun.result.quality:
                 self.judged[rank] = self._judged(rank, begun.prior, result)
 
-    def _settle_alike(self, best: Judged) -> None:
+    def _settle_alike(self, best: VerifiedCandidate) -> None:
         """The others whose ground looks nearly as much like the frame, so that it is known whether
         the best stands out: registered where their rendering looks nearly as much like it, too, and
         not the place where it does not.
@@ -152,7 +154,7 @@ class Confirmation:
             self.finished.add(j.rank)
             self.judged[j.rank] = self._further(j)
 
-    def _further(self, begun: Judged) -> Judged:
+    def _further(self, begun: VerifiedCandidate) -> VerifiedCandidate:
         j = begun
         for _ in range(self.config.passes - 1):
             self._go_on()
@@ -163,7 +165,7 @@ class Confirmation:
             j = self._judged(j.rank, prior, result)
         return j
 
-    def _order(self) -> list[Judged]:
+    def _order(self) -> list[VerifiedCandidate]:
         return sorted(self.judged.values(), key=lambda j: (-int(j.credible), -j.result.quality))
 
     def _is_any_credible(self) -> bool:
@@ -188,13 +190,13 @@ class Confirmation:
                 return True
         return False
 
-    def _decisive(self) -> list[Judged]:
+    def _decisive(self) -> list[VerifiedCandidate]:
         return [j for j in self.judged.values() if is_decisive(j, self.config)]
 
-    def _judged(self, rank: int, prior: PosePrior, result: Registration) -> Judged:
+    def _judged(self, rank: int, prior: PosePrior, result: Registration) -> VerifiedCandidate:
         candidate = self.candidates[rank]
         credible = self.verifier.is_credible(result, candidate, self.query)
-        return Judged(candidate, rank, result, prior, credible)
+        return VerifiedCandidate(candidate, rank, result, prior, credible)
 
     def _apart(self, a: int, b: int) -> tuple[float, float]:
         """Two screened places, metres and degrees."""

@@ -19,7 +19,7 @@ _EDGE_RAYS = 9  # per side of the image, to outline what is seen
 
 
 @dataclass(frozen=True)
-class Footprint:
+class CameraFootprint:
     """The ground that a camera sees at heading 0, relative to the point below it.
 
     centre: (2,) m; side_m: of a square about it that holds the footprint at every heading.
@@ -47,7 +47,9 @@ def turned(rotation: Array, heading_rad: float) -> Array:
     return result
 
 
-def footprint(camera: Camera, rotation: Array, height_m: float, largest_m: float) -> Footprint:
+def footprint(
+    camera: Camera, rotation: Array, height_m: float, largest_m: float
+) -> CameraFootprint:
     """What a camera `height_m` above flat ground sees, as far as it is of use."""
     u = np.linspace(0, camera.width, _EDGE_RAYS)
     v = np.linspace(0, camera.height, _EDGE_RAYS)
@@ -66,7 +68,7 @@ def footprint(camera: Camera, rotation: Array, height_m: float, largest_m: float
         length = float(np.linalg.norm(along))
         centre = height_m * along * min(1.0, 1.6 / max(length, 1e-9))
         radius = float(np.linalg.norm(points - centre, axis=1).max())
-    return Footprint(centre, min(2 * radius, largest_m))
+    return CameraFootprint(centre, min(2 * radius, largest_m))
 
 
 def patch_side(side_m: float, gsd_m: float, most_px: int) -> int:

@@ -23,10 +23,10 @@ from localizer.relocalization.align import FrameShift
 from localizer.relocalization.confirm import Confirmation, compared
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import MapOverview, Progress, open_overview
-from localizer.relocalization.search import View, search
+from localizer.relocalization.search import SearchView, search
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
-from localizer.relocalization.verdict import Judged, answer
-from localizer.relocalization.verify import Sight, Verifier
+from localizer.relocalization.verdict import VerifiedCandidate, answer
+from localizer.relocalization.verify import QueryFeatures, Verifier
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Undistorter, working_camera
@@ -111,7 +111,7 @@ class Relocalizer:
             < _LEAST_CONTRAST
         ):
             return []
-        view = View(image.astype(np.uint8, copy=False), camera)
+        view = SearchView(image.astype(np.uint8, copy=False), camera)
         threads = self._config.threads
         pool = ThreadPoolExecutor(threads, "place-search") if threads > 1 else None
         try:
@@ -129,22 +129,22 @@ class Relocalizer:
         query: PlaceQuery,
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
-    ) -> list[Judged]:
+    ) -> list[VerifiedCandidate]:
         """The places that were registered, the best of them to the end; best first."""
         sight, small = self._sights(query)
         return Confirmation(
             self._verifier, sight, small, query, candidates, self._config, should_stop
         ).run()
 
-    def _sights(self, query: PlaceQuery) -> tuple[Sight, Sight]:
+    def _sights(self, query: PlaceQuery) -> tuple[QueryFeatures, QueryFeatures]:
         """The frame as the tracker sees it, and smaller."""
         camera = working_camera(query.frame.camera, self._width)
         small = working_camera(query.frame.camera, min(_SCREEN_WIDTH, self._width))
         features = self._detail.extract(self._undistorted(query, camera))
         few = self.extractor.extract(self._undistorted(query, small))
         return (
-            Sight(camera, features, FrameShift(features.levels)),
-            Sight(small, few, FrameShift(few.levels)),
+            QueryFeatures(camera, features, FrameShift(features.levels)),
+            QueryFeatures(small, few, FrameShift(few.levels)),
         )
 
     def _undistorted(self, query: PlaceQuery, camera: Camera) -> np.ndarray:
@@ -210,4 +210,4 @@ def open_relocalizer(
     return None
 
 
-__all__ = ["Judged", "OpenRelocalizer", "Relocalizer", "open_relocalizer"]
+__all__ = ["OpenRelocalizer", "Relocalizer", "VerifiedCandidate", "open_relocalizer"]

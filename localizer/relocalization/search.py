@@ -32,7 +32,7 @@ from localizer.relocalization.overview import (
 )
 from localizer.relocalization.patch import (
     FARTHEST,
-    Footprint,
+    CameraFootprint,
     footprint,
     patch_side,
     rectify,
@@ -48,7 +48,7 @@ _LEAST_HEIGHT_M = 10.0
 
 
 @dataclass(frozen=True)
-class View:
+class SearchView:
     """The frame as the search uses it: image (H, W, 3) of a pinhole camera."""
 
     image: Image
@@ -56,7 +56,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Rectification:
     """One rectification. heading_rad: turn of the query's rotation, counter-clockwise; height_m:
     above the ground; centre: (2,) m of the patch from the point below the camera; cells: its side.
     """
@@ -134,7 +134,7 @@ class Scores:
 
 
 def search(
-    view: View,
+    view: SearchView,
     query: PlaceQuery,
     correlators: tuple[LevelCorrelator, ...],
     extractor: FeatureExtractor,
@@ -156,10 +156,10 @@ def search(
     run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
     groups = shared_extractions(heights, config.extraction_ratio)
     jobs = [(float(a), g) for g in groups for a in headings(query, config)]
-    trials: list[Found] = []
+    trials: list[BlockScores] = []
     scores = run.empty()
 
-    def work(job: tuple[float, list[int]]) -> list[Found] | None:
+    def work(job: tuple[float, list[int]]) -> list[BlockScores] | None:
         return None if should_stop() else run.at_heading(*job, should_stop)
 
     results = map(work, jobs) if pool is None else pool.map(work, jobs)
@@ -184,14 +184,14 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 
 @dataclass(frozen=True)
-class Found:
+class BlockScores:
     """Scores (STEP, STEP) of one trial at the origins of each block that it can lie in.
 
     noise: root mean square of the trial's scores. A score over it is what competes: on a hill close
     below the camera few cells are seen, of which some place or other always looks the same.
     """
 
-    trial: Trial
+    trial: Rectification
     noise: float
     blocks: list[tuple[Block, Float32]]
 
@@ -200,12 +200,12 @@ class Found:
 class _Search:
     """suited: for each height the blocks that it is right for anywhere, and where (`suits`)."""
 
-    view: View
+    view: SearchView
     query: PlaceQuery
     correlator: LevelCorrelator
     extractor: FeatureExtractor
     config: RelocalizationConfig
-    seen: Footprint
+    seen: CameraFootprint
     heights: Array
     suited: tuple[dict[Block, NDArray[np.bool_]], ...] = ()
 
@@ -217,7 +217,7 @@ class _Search:
 
     def at_heading(
         self, heading: float, group: list[int], should_stop: Callable[[], bool]
-    ) -> list[Found] | None:
+    ) -> list[BlockScores] | None:
         """One heading at heights that share an extraction, against every block of theirs."""
         wanted = []
         for scale in group:
@@ -247,21 +247,21 @@ class _Search:
                 power[n] += float(np.vdot(raw, raw)) / raw.size
                 scores[n].append((block, self.masked(raw, block, trial, blocks[block])))
         return [
-            Found(trial, max(math.sqrt(power[n] / len(blocks)), 1e-6), scores[n])
+            BlockScores(trial, max(math.sqrt(power[n] / len(blocks)), 1e-6), scores[n])
             for n, (trial, blocks) in enumerate(wanted)
         ]
 
-    def trial(self, heading: float, height: float) -> Trial:
+    def trial(self, heading: float, height: float) -> Rectification:
         c, s = np.cos(heading), np.sin(heading)
         offset = np.array([[c, -s], [s, c]]) @ self.seen.centre * height
-        return Trial(heading, height, offset, self.cells(height))
+        return Rectification(heading, height, offset, self.cells(height))
 
     def cells(self, height: float) -> int:
         """Of a patch's side."""
         side = self.seen.side_m * height / self.correlator.level.cell_m
         return int(np.clip(round(side), 8, SIZE - STEP))
 
-    def patch(self, trial: Trial) -> tuple[Float32, Float32]:
+    def patch(self, trial: Rectification) -> tuple[Float32, Float32]:
         """Features (n, n, K), weighted, and where they count (n, n), of one rectification."""
         level = self.correlator.level
         side_px = patch_side(self.seen.side_m * trial.height_m, level.gsd_m, _MOST_PX)
@@ -279,7 +279,7 @@ class _Search:
         known = (mask > 0.05).astype(np.float32)
         return without_local_mean(weighted.astype(np.float32), known), known
 
-    def meets(self, block: Block, trial: Trial) -> bool:
+    def meets(self, block: Block, trial: Rectification) -> bool:
         """Whether any origin of a block is a place of the region."""
         region = self.query.region
         if region is None:
@@ -320,7 +320,7 @@ class _Search:
         return np.asarray((low <= height) & (height <= high))
 
     def masked(
-        self, scores: Float32, block: Block, trial: Trial, suits: NDArray[np.bool_]
+        self, scores: Float32, block: Block, trial: Rectification, suits: NDArray[np.bool_]
     ) -> Float32:
         if not suits.all():
             fine = suits.repeat(GROUND_CELLS, axis=0).repeat(GROUND_CELLS, axis=1)
@@ -329,12 +329,12 @@ class _Search:
             scores = np.where(self.inside(block, trial, self.query.region), scores, -1.0)
         return scores.astype(np.float32, copy=False)
 
-    def inside(self, block: Block, trial: Trial, region: SearchRegion) -> NDArray[np.bool_]:
+    def inside(self, block: Block, trial: Rectification, region: SearchRegion) -> NDArray[np.bool_]:
         rows, columns = np.arange(STEP) + block.row, np.arange(STEP) + block.column
         grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
         return region.contains(self.camera_at(grid, trial))
 
-    def camera_at(self, origin: NDArray[np.int64], trial: Trial) -> Array:
+    def camera_at(self, origin: NDArray[np.int64], trial: Rectification) -> Array:
         """East and north (..., 2) of the camera whose patch begins at cell (..., 2)."""
         level = self.correlator.level
         middle = (np.asarray(origin, np.float64) + trial.cells / 2) * level.cell_m
@@ -342,7 +342,7 @@ class _Search:
         north = level.north - middle[..., 0] - trial.centre[1]
         return np.stack([east, north], axis=-1)
 
-    def merge(self, scores: Scores, trial: int, found: Found) -> None:
+    def merge(self, scores: Scores, trial: int, found: BlockScores) -> None:
         lead = (SIZE - STEP) // 2
         rows, columns = scores.best.shape
         for block, values in found.blocks:
@@ -354,7 +354,7 @@ class _Search:
             scores.best[window][better] = weighed[better]
             scores.trial[window][better] = trial
 
-    def candidates(self, scores: Scores, trials: list[Found]) -> list[PlaceCandidate]:
+    def candidates(self, scores: Scores, trials: list[BlockScores]) -> list[PlaceCandidate]:
         """The highest peaks, no two closer than `_SUPPRESSED_M`."""
         lead = (SIZE - STEP) // 2
         best = scores.best.copy()

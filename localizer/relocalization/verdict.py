@@ -17,7 +17,7 @@ SAME_PLACE_M = 5.0  # answers that are closer are one
 
 
 @dataclass(frozen=True)
-class Judged:
+class VerifiedCandidate:
     """A candidate after registration. prior: what the next pass begins from."""
 
     candidate: PlaceCandidate
@@ -27,7 +27,7 @@ class Judged:
     credible: bool
 
 
-def is_decisive(judged: Judged, config: RelocalizationConfig) -> bool:
+def is_decisive(judged: VerifiedCandidate, config: RelocalizationConfig) -> bool:
     """Whether no other candidate can be better: all but a few parts of the image agree."""
     votes = judged.result.agreement
     return judged.credible and votes is not None and votes.share >= config.decisive_agreement
@@ -36,7 +36,7 @@ def is_decisive(judged: Judged, config: RelocalizationConfig) -> bool:
 def answer(
     query: PlaceQuery,
     candidates: list[PlaceCandidate],
-    judged: list[Judged],
+    judged: list[VerifiedCandidate],
     config: RelocalizationConfig,
     stages: dict[str, float],
 ) -> Relocalization | None:
@@ -71,7 +71,7 @@ def answer(
     )
 
 
-def _stands_out(best: Judged, alike: set[int], judged: list[Judged]) -> bool:
+def _stands_out(best: VerifiedCandidate, alike: set[int], judged: list[VerifiedCandidate]) -> bool:
     """Whether the candidates whose ground looks nearly as much like the frame are all known not to
     be the place: each was registered, and nowhere else is nearly as good. Where houses are all
     alike and the right one is none of the candidates, the frame fits several as badly.
@@ -90,4 +90,4 @@ def _distance(a: Registration, b: Registration) -> float:
     return float(np.linalg.norm(away))
 
 
-__all__ = ["NEARLY", "SAME_PLACE_M", "Judged", "answer", "is_decisive"]
+__all__ = ["NEARLY", "SAME_PLACE_M", "VerifiedCandidate", "answer", "is_decisive"]

@@ -38,7 +38,7 @@ _SIDES = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
 @dataclass(frozen=True)
-class Reference:
+class RenderedReference:
     """The map rendered at a pose, with its features."""
 
     view: RenderedView
@@ -63,7 +63,7 @@ class Aligned:
 
 
 @dataclass(frozen=True)
-class Sight:
+class QueryFeatures:
     """The query's frame at one size. camera: its pinhole; features: of the frame."""
 
     camera: Camera
@@ -98,14 +98,14 @@ class Verifier:
 
     def reference(
         self, prior: PosePrior, camera: Camera, extractor: FeatureExtractor | None = None
-    ) -> Reference | None:
+    ) -> RenderedReference | None:
         """The map as the prior's pose sees it; None where that is hardly any."""
         view = self.renderer.render(prior.world_from_camera, camera, wait=True)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
             return None
-        return Reference(view, (extractor or self.extractor).extract(fill_holes(view)))
+        return RenderedReference(view, (extractor or self.extractor).extract(fill_holes(view)))
 
-    def screened(self, small: Sight, prior: PosePrior) -> Aligned:
+    def screened(self, small: QueryFeatures, prior: PosePrior) -> Aligned:
         """The prior moved to where the frame, at a small size, lies over its rendering."""
         reference = self.reference(prior, small.camera, self.coarse)
         if reference is None:
@@ -116,7 +116,7 @@ class Verifier:
         return Aligned(shifted(prior, away) if near else prior, shift.score)
 
     def from_place(
-        self, sight: Sight, place: Aligned, query: PlaceQuery
+        self, sight: QueryFeatures, place: Aligned, query: PlaceQuery
     ) -> tuple[PosePrior, Registration]:
         """A screened place aligned once more, at full size, and registered from there."""
         prior = place.prior
@@ -132,7 +132,7 @@ class Verifier:
             reference = self.reference(prior, sight.camera)
         return prior, self.register(sight, prior, query, reference)
 
-    def around(self, sight: Sight, prior: PosePrior, query: PlaceQuery) -> Registration:
+    def around(self, sight: QueryFeatures, prior: PosePrior, query: PlaceQuery) -> Registration:
         """The best of registrations that begin to all sides of an aligned place."""
         reference = self.reference(prior, sight.camera)
         if reference is None:
@@ -145,10 +145,10 @@ class Verifier:
 
     def register(
         self,
-        sight: Sight,
+        sight: QueryFeatures,
         prior: PosePrior,
         query: PlaceQuery,
-        reference: Reference | None = None,
+        reference: RenderedReference | None = None,
     ) -> Registration:
         """One pass: the frame registered to the view at the prior's pose, rendered if not given;
         another focal length is tried where the result is good.
@@ -187,7 +187,7 @@ class Verifier:
         if result.covariance.diagonal()[:3].max() > c.max_sigma_m**2:
             return False
         votes = result.agreement  # None on a GPU: the other tests decide
-        return votes is None or votes.share >= c.min_agreement
+        return votes is None or votes.share >= c.min_patch_inlier_ratio
 
     def agrees(self, pose: Pose, candidate: PlaceCandidate, query: PlaceQuery) -> bool:
         """Whether a pose is where the candidate was, as high and as level as the sensors say."""

@@ -76,7 +76,7 @@ class _Uploaded:
 
 
 @dataclass(eq=False)
-class _Target:
+class _Framebuffer:
     """A framebuffer of one size."""
 
     colour: Any
@@ -111,7 +111,7 @@ class ModernGLRenderer(TileRenderer):
         self._context.enable(moderngl.DEPTH_TEST)
         self._uploaded: OrderedDict[int, _Uploaded] = OrderedDict()  # least recent first
         self._bytes = 0
-        self._targets: dict[tuple[int, int], _Target] = {}
+        self._targets: dict[tuple[int, int], _Framebuffer] = {}
 
     @property
     def is_software(self) -> bool:
@@ -159,13 +159,13 @@ class ModernGLRenderer(TileRenderer):
         if threading.get_ident() != self._owner:
             raise RenderError("an OpenGL renderer was used by a thread that did not make it")
 
-    def _target(self, width: int, height: int) -> _Target:
+    def _target(self, width: int, height: int) -> _Framebuffer:
         if (width, height) not in self._targets:
             colour = self._context.texture((width, height), 4, dtype="f1")
             depth = self._context.texture((width, height), 1, dtype="f4")
             buffer = self._context.depth_texture((width, height))
             framebuffer = self._context.framebuffer([colour, depth], buffer)
-            self._targets[width, height] = _Target(colour, depth, framebuffer)
+            self._targets[width, height] = _Framebuffer(colour, depth, framebuffer)
         return self._targets[width, height]
 
     def _on_gpu(self, mesh: TileMesh) -> _Uploaded:

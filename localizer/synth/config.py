@@ -50,7 +50,7 @@ class WorldConfig:
 
 
 @dataclass(frozen=True)
-class Look:
+class VisitLook:
     """One visit's light, season and movable things.
 
     Sun angles in degrees (azimuth clockwise from north); `sun_rgb` and `sky_rgb` are the irradiance
@@ -79,8 +79,8 @@ class Look:
         return np.array([np.sin(az) * np.cos(el), np.cos(az) * np.cos(el), np.sin(el)])
 
 
-SURVEY = Look()
-LIVE = Look(
+SURVEY = VisitLook()
+LIVE = VisitLook(
     sun_azimuth_deg=238.0,
     sun_elevation_deg=38.0,
     sun_rgb=(1.02, 0.92, 0.76),
@@ -93,6 +93,6 @@ LIVE = Look(
 )
 
 
-def look_of(variant: Variant) -> Look:
+def look_of(variant: Variant) -> VisitLook:
     """The default look of a variant."""
     return {"survey": SURVEY, "live": LIVE}[variant]

@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array
-from localizer.synth.config import BLOCK_M, TOP_M, Look, Variant, WorldConfig, look_of
+from localizer.synth.config import BLOCK_M, TOP_M, Variant, VisitLook, WorldConfig, look_of
 from localizer.synth.plan.layout import plan_world
-from localizer.synth.plan.plan import Target, WorldPlan
+from localizer.synth.plan.plan import PlannedTarget, WorldPlan
 from localizer.synth.plan.terrain import River, Terrain
-from localizer.synth.tiles.bake import Baker, Part, bake_block, start_worker
+from localizer.synth.tiles.bake import Baker, TilePart, bake_block, start_worker
 from localizer.synth.tiles.coarse import assemble_root, assemble_top
-from localizer.synth.tiles.scene import Scene, make_scene
+from localizer.synth.tiles.scene import TileScene, make_scene
 from localizer.synth.tiles.write import write_tileset
 from localizer.synth.visits.visit import Visit
 
@@ -46,7 +46,7 @@ class WorldInfo:
     size_m: float
     origin: Geodetic
     geoid_separation_m: float
-    targets: tuple[Target, ...]
+    targets: tuple[PlannedTarget, ...]
     roads: tuple[Array, ...]
     buildings: int
     terrain: Terrain
@@ -101,7 +101,7 @@ class WorldInfo:
                 origin=Geodetic(**data["origin"]),
                 geoid_separation_m=float(data["geoid_separation_m"]),
                 targets=tuple(
-                    Target(t["name"], np.array(t["enu_m"], float)) for t in data["targets"]
+                    PlannedTarget(t["name"], np.array(t["enu_m"], float)) for t in data["targets"]
                 ),
                 roads=tuple(np.array(r, float).reshape(-1, 3) for r in data["roads_enu_m"]),
                 buildings=int(data["buildings"]),
@@ -128,7 +128,7 @@ def build_world(
     variant: Variant = "survey",
     size_m: float = 1600.0,
     config: WorldConfig | None = None,
-    look: Look | None = None,
+    look: VisitLook | None = None,
     processes: int = 2,
 ) -> WorldInfo:
     """Generate a world and write it to the folder `out` as tileset.json, GLB tiles and world.json.
@@ -188,8 +188,8 @@ def _write_visit(
     baker = Baker(scene, folder)
     count = round(plan.config.size_m / BLOCK_M)
     places = [(column, row) for row in range(count) for column in range(count)]
-    waiting: dict[tuple[int, int], list[Part]] = defaultdict(list)
-    tops: dict[tuple[int, int], Part] = {}
+    waiting: dict[tuple[int, int], list[TilePart]] = defaultdict(list)
+    tops: dict[tuple[int, int], TilePart] = {}
     per_top = round(TOP_M / BLOCK_M)
     with painted_blocks(scene, folder, places, processes) as done:
         for number, ((column, row), part) in enumerate(done, start=1):
@@ -207,8 +207,8 @@ def _write_visit(
 
 @contextmanager
 def painted_blocks(
-    scene: Scene, folder: Path, places: list[tuple[int, int]], processes: int
-) -> Iterator[Iterable[tuple[tuple[int, int], Part]]]:
+    scene: TileScene, folder: Path, places: list[tuple[int, int]], processes: int
+) -> Iterator[Iterable[tuple[tuple[int, int], TilePart]]]:
     """Painted blocks as they are finished, in this process or in a pool."""
     if processes <= 1:
         baker = Baker(scene, folder)

@@ -33,7 +33,7 @@ _H = np.hstack([np.eye(3), np.zeros((3, 3))])
 
 
 @dataclass(frozen=True)
-class _Track:
+class _TrackHypothesis:
     """A hypothesis. mean: (6,) position m and velocity m/s, world axes; covariance: (6, 6);
     sightings: how many it was made of.
     """
@@ -48,7 +48,7 @@ class TargetFilter:
     """Tracks one target; not thread-safe."""
 
     def __init__(self) -> None:
-        self._tracks: list[_Track] = []
+        self._tracks: list[_TrackHypothesis] = []
         self._time_ns = 0
         self._outliers = 0
 
@@ -114,14 +114,16 @@ class TargetFilter:
         )
 
 
-def _new_track(surface: TargetSurface) -> _Track:
+def _new_track(surface: TargetSurface) -> _TrackHypothesis:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = surface.covariance
     covariance[3:, 3:] = np.diag(np.square(_SPEED_SIGMA))
-    return _Track(surface.probability, np.concatenate([surface.position, np.zeros(3)]), covariance)
+    return _TrackHypothesis(
+        surface.probability, np.concatenate([surface.position, np.zeros(3)]), covariance
+    )
 
 
-def _predicted(track: _Track, elapsed_ns: int) -> _Track:
+def _predicted(track: _TrackHypothesis, elapsed_ns: int) -> _TrackHypothesis:
     dt = max(elapsed_ns * 1e-9, 1e-3)
     F = np.eye(6)
     F[:3, 3:] = np.eye(3) * dt
@@ -130,7 +132,9 @@ def _predicted(track: _Track, elapsed_ns: int) -> _Track:
     return replace(track, mean=np.asarray(mean), covariance=np.asarray(P))
 
 
-def _met(tracks: list[_Track], surfaces: tuple[TargetSurface, ...]) -> list[_Track]:
+def _met(
+    tracks: list[_TrackHypothesis], surfaces: tuple[TargetSurface, ...]
+) -> list[_TrackHypothesis]:
     """Every track with every surface within its gate; empty if there is no such pair.
 
     What is measured is a pixel, whichever surface it shows: the likelihood is a Gaussian of the
@@ -148,7 +152,9 @@ def _met(tracks: list[_Track], surfaces: tuple[TargetSurface, ...]) -> list[_Tra
             mean, P = kalman_update(
                 track.mean, track.covariance, surface.position, surface.covariance, _H
             )
-            met.append(_Track(weight, np.asarray(mean), np.asarray(P), track.sightings + 1))
+            met.append(
+                _TrackHypothesis(weight, np.asarray(mean), np.asarray(P), track.sightings + 1)
+            )
         if not pairs:
             lonely.append(track)
     heaviest = max((t.weight for t in met), default=0.0)
@@ -156,7 +162,7 @@ def _met(tracks: list[_Track], surfaces: tuple[TargetSurface, ...]) -> list[_Tra
     return met + [replace(t, weight=t.weight * factor) for t in lonely] if met else []
 
 
-def _likelihood(track: _Track, surface: TargetSurface) -> float:
+def _likelihood(track: _TrackHypothesis, surface: TargetSurface) -> float:
     """Of a surface's point, relative to the best possible one; 0 outside the gate."""
     S = track.covariance[:3, :3] + surface.covariance
     innovation = surface.position - track.mean[:3]
@@ -167,11 +173,11 @@ def _likelihood(track: _Track, surface: TargetSurface) -> float:
     return float(np.sqrt(height) * np.exp(-0.5 * distance))
 
 
-def _reduced(tracks: list[_Track]) -> list[_Track]:
+def _reduced(tracks: list[_TrackHypothesis]) -> list[_TrackHypothesis]:
     """Normalised, the heaviest first; the same ones merged, negligible ones dropped."""
     waiting = sorted(tracks, key=lambda t: -t.weight)
     total = sum(t.weight for t in waiting)
-    kept: list[_Track] = []
+    kept: list[_TrackHypothesis] = []
     while waiting and len(kept) < _MOST_TRACKS:
         head = waiting[0]
         offsets = [t.mean - head.mean for t in waiting]
@@ -183,11 +189,11 @@ def _reduced(tracks: list[_Track]) -> list[_Track]:
     return sorted((replace(t, weight=t.weight / total) for t in kept), key=lambda t: -t.weight)
 
 
-def _merged(tracks: list[_Track]) -> _Track:
+def _merged(tracks: list[_TrackHypothesis]) -> _TrackHypothesis:
     """One Gaussian with the tracks' common mean and covariance."""
     weight = sum(t.weight for t in tracks)
     mean = np.sum([t.weight * t.mean for t in tracks], axis=0) / weight
     covariance = np.zeros((6, 6))
     for t in tracks:
         covariance += t.weight / weight * (t.covariance + np.outer(t.mean - mean, t.mean - mean))
-    return _Track(weight, mean, covariance, max(t.sightings for t in tracks))
+    return _TrackHypothesis(weight, mean, covariance, max(t.sightings for t in tracks))

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
-from localizer.targets.foreground import Cover, Look, covered, is_distinct, is_ground
+from localizer.targets.foreground import (
+    AppearanceCoverage,
+    TargetAppearance,
+    covered,
+    is_distinct,
+    is_ground,
+)
 from localizer.targets.standing import StandingLook
 from localizer.targets.track import projected
 from localizer.types import PoseEstimate
@@ -54,7 +60,7 @@ _FLAT = 4.0  # grey levels: a template of less contrast tells nothing
 
 
 @dataclass(frozen=True)
-class Found:
+class FollowedPosition:
     """Where the target is in a frame. position: (3,) world metres on the chart's plane."""
 
     position: Array
@@ -89,7 +95,7 @@ class ImageFollower:
         self._mask: Grey | None = None
         self._outline: NDArray[np.uint8] | None = None
         self._ground: Grey | None = None
-        self._isolated_look: Look | None = None  # as it was on that ground
+        self._isolated_look: TargetAppearance | None = None  # as it was on that ground
         self._learns_m = 0.5 * self._half_m  # from where it was clicked, once it is so far away
         self._renewed_ns = estimate.exposure_time_ns
         self._stands = StandingLook()
@@ -103,7 +109,7 @@ class ImageFollower:
         reach_m: float,
         *,
         was_hidden: bool = False,
-    ) -> Found | None:
+    ) -> FollowedPosition | None:
         """The target within `reach_m` of where it is expected (3,); None where it is not seen.
 
         was_hidden: it comes out of an occlusion, so nearer to there is likelier.
@@ -133,7 +139,7 @@ class ImageFollower:
         is_due = estimate.exposure_time_ns - self._renewed_ns >= _RENEWED_NS
         if is_due and best[0] >= _SURE:
             self._renew(gray, estimate, position)
-        return Found(position, pixel, best[0])
+        return FollowedPosition(position, pixel, best[0])
 
     def find_before(
         self,
@@ -144,7 +150,7 @@ class ImageFollower:
         pictures: Sequence[tuple[PoseEstimate, Gray]],
         *,
         was_hidden: bool = False,
-    ) -> tuple[bool, Found | None]:
+    ) -> tuple[bool, FollowedPosition | None]:
         """(whether these pictures can tell, the target): as `find`, of an isolated target, where it
         covers the ground that `pictures` show without it. Neither road markings nor shadows under
         it are taken for its look; where it looks as the ground does, or has stood in them all, they
@@ -176,9 +182,9 @@ class ImageFollower:
             return can_tell, None
         self._course += turn
         self._learn(gray, estimate, position, best.share)
-        return True, Found(position, pixel, best.share)
+        return True, FollowedPosition(position, pixel, best.share)
 
-    def _look(self, grey: Grey | None, angle: float) -> Look | None:
+    def _look(self, grey: Grey | None, angle: float) -> TargetAppearance | None:
         """An isolated target's look, turned by `angle`."""
         if grey is None or self._outline is None:
             return None
@@ -186,7 +192,7 @@ class ImageFollower:
         grey = self._turned(grey, angle)
         if turned is None or grey is None:
             return None
-        return Look.of(grey, (turned > 0.5).astype(np.uint8))
+        return TargetAppearance.of(grey, (turned > 0.5).astype(np.uint8))
 
     def _learn(self, gray: Gray, estimate: PoseEstimate, position: Array, share: float) -> None:
         """Its look as it is now: as it leaves the place where it was clicked, whose ground is about
@@ -230,7 +236,7 @@ class ImageFollower:
         if mask is None or not _SHARES[0] <= share <= _SHARES[1]:
             return False
         self._mask = cv2.dilate(mask, np.ones((3, 3))).astype(np.float32)
-        look = Look.of(self._first, mask)
+        look = TargetAppearance.of(self._first, mask)
         if float(look.inside.sum()) >= _INSIDE:
             self._outline, self._ground, self._isolated_look = mask, ground, look
         return True
@@ -314,7 +320,7 @@ class ImageFollower:
         return np.asarray(chart, dtype=np.float32)
 
 
-def _is_better(one: Cover, best: Cover | None) -> bool:
+def _is_better(one: AppearanceCoverage, best: AppearanceCoverage | None) -> bool:
     return best is None or one.evidence > (1.0 + _PREFERRED) * best.evidence
 
 

@@ -29,7 +29,7 @@ _AHEAD = 3  # an end is a third of the length
 
 
 @dataclass(frozen=True)
-class Look:
+class TargetAppearance:
     """A target's own look in a chart. grey, inside, about: (2 half + 1) square; inside is 1 where
     the grey levels are the target's own, about is 1 close by, where the ground is seen.
     """
@@ -39,7 +39,7 @@ class Look:
     about: Grey
 
     @classmethod
-    def of(cls, grey: Grey, outline: NDArray[np.uint8]) -> Look:
+    def of(cls, grey: Grey, outline: NDArray[np.uint8]) -> TargetAppearance:
         """From a mask that is 1 within the outline."""
         inside = cv2.erode(outline, np.ones((3, 3)))
         about = cv2.dilate(outline, np.ones((7, 7))) - cv2.dilate(outline, np.ones((3, 3)))
@@ -59,7 +59,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Cover:
+class AppearanceCoverage:
     """Where a look covers the ground. share: of the look that is seen, 1 is all of it; offset: (2,)
     cells, x then y; evidence: log-likelihood ratio against the ground, times twice the noise's
     variance.
@@ -70,7 +70,7 @@ class Cover:
     evidence: float
 
 
-def is_distinct(ground: Grey, look: Look) -> bool:
+def is_distinct(ground: Grey, look: TargetAppearance) -> bool:
     """Whether the look in the middle of the ground (both square) differs enough to be told."""
     side, size = len(look.grey), len(ground)
     k = (size - side) // 2
@@ -78,7 +78,7 @@ def is_distinct(ground: Grey, look: Look) -> bool:
     return float((off * look.inside).sum()) >= _DIFFERS**2 * float(look.inside.sum())
 
 
-def is_ground(chart: Grey, ground: Grey, look: Look) -> bool:
+def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
     """Whether a chart (all of one size) shows the ground and nothing of the look, though the two
     differ.
     """
@@ -90,7 +90,9 @@ def is_ground(chart: Grey, ground: Grey, look: Look) -> bool:
     return float(share[0, 0]) <= _NOTHING and off <= _AS_GROUND * float(whole[0, 0])
 
 
-def covered(chart: Grey, ground: Grey, look: Look, aside: float = 0.0) -> Cover | None:
+def covered(
+    chart: Grey, ground: Grey, look: TargetAppearance, aside: float = 0.0
+) -> AppearanceCoverage | None:
     """Where the look covers the ground; None where it does not, is half hidden, or a second place
     rivals. chart, ground: squares of the same size. aside: by how much evidence at the end of the
     reach counts less.
@@ -129,7 +131,7 @@ def covered(chart: Grey, ground: Grey, look: Look, aside: float = 0.0) -> Cover 
             a, b, c = (float(v) for v in values[k - 1 : k + 2])
             bend = a - 2 * b + c
             offset[axis] += 0.5 * (a - c) / bend if bend < 0 else 0.0
-    return Cover(float(share[y, x]), offset, best)
+    return AppearanceCoverage(float(share[y, x]), offset, best)
 
 
 def _evidence(chart: Grey, ground: Grey, look: Grey, inside: Grey) -> tuple[Grey, Grey, Grey]:

@@ -52,7 +52,7 @@ class SightedRay:
 
 
 @dataclass(frozen=True)
-class Place:
+class PositionHypothesis:
     """Where the target may be. weight: probability; position: (3,) m; covariance: (3, 3) m²."""
 
     weight: float
@@ -154,7 +154,7 @@ class StaticTarget:
         n = len(self._recent)
         return n > 0 and sum(self._recent) > 2 * n + 8.0 * np.sqrt(n)
 
-    def places(self) -> tuple[Place, ...]:
+    def places(self) -> tuple[PositionHypothesis, ...]:
         """The one of the smallest expected error first, then by weight."""
         logs = np.array([h.log_weight for h in self._hypotheses])
         weights = np.exp(logs - logs.max())
@@ -164,7 +164,7 @@ class StaticTarget:
         first = int(np.argmin(apart @ weights))
         order = sorted(range(len(weights)), key=lambda i: (i != first, -weights[i]))
         return tuple(
-            Place(float(weights[i]), points[i].copy(), self._hypotheses[i].covariance)
+            PositionHypothesis(float(weights[i]), points[i].copy(), self._hypotheses[i].covariance)
             for i in order
         )
 
@@ -202,7 +202,7 @@ class StaticTarget:
 
     def _settle(self) -> None:
         """Each hypothesis to where plane and rays have it; the unlikely ones go."""
-        stack = _Rays.of(self._views)
+        stack = _ViewRays.of(self._views)
         settled = []
         for h in self._hypotheses:
             moved, cost = stack.solve(h)
@@ -229,7 +229,7 @@ def thinned(views: Sequence[_Item]) -> list[_Item]:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class _ViewRays:
     """All viewpoints as arrays: eyes, directions (G, 3); sideways (G, 2, 3); weights (G, 2, 2)."""
 
     eyes: Array
@@ -238,7 +238,7 @@ class _Rays:
     weights: Array
 
     @classmethod
-    def of(cls, views: list[_View]) -> _Rays:
+    def of(cls, views: list[_View]) -> _ViewRays:
         return cls(
             np.array([v.eye for v in views]),
             np.array([v.direction for v in views]),

@@ -28,7 +28,7 @@ from localizer.targets.locate import (
     ray_spread,
     surface_covariance,
 )
-from localizer.targets.static import Place, SightedRay, StaticTarget
+from localizer.targets.static import PositionHypothesis, SightedRay, StaticTarget
 from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
 
 _STANDS_S = 2.0  # for so long it must agree with standing before it stands again
@@ -209,7 +209,7 @@ class TargetTrack:
         first = float(self._cast(eye, (point - eye)[None] / distance).distances[0])
         return distance - first > max(_HIDDEN_M, beyond_m)
 
-    def places(self) -> tuple[Place, ...]:
+    def places(self) -> tuple[PositionHypothesis, ...]:
         """Where it may stand, the reported place first; none of one that moves."""
         return self._static.places() if self._last.fix is not None and not self._moves else ()
 

@@ -18,10 +18,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from localizer.errors import LocalizerError
-from localizer.tracking.ahead import Ahead, Prepared
 from localizer.tracking.engine_health import EngineHealth, HealthBook
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
+from localizer.tracking.prefetch import FeaturePrefetcher, PrefetchedFrame
 from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 
 _log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class DualThreadEngine:
         self._unknown_frames = self._left_frames = 0
         self._clock = clock
         self._search_alive_ns: int | None = None  # while one is under way: when it last said so
-        self._ahead = Ahead(localizer.extract_query, self._may_extract_ahead)
+        self._ahead = FeaturePrefetcher(localizer.extract_query, self._may_extract_ahead)
         self._registers = False  # whether the last frame was registered: the next will be, too
         self._render_times: Mailbox[int] = Mailbox()
         self._bundle: ReferenceBundle | None = None
@@ -123,10 +123,10 @@ class DualThreadEngine:
         """A snapshot of the counters."""
         localizer = self._localizer
         return self._book.read(
-            self._ahead.dropped, localizer.optimizer_name, localizer.levelling.horizon
+            self._ahead.dropped, localizer.optimizer_name, localizer.attitude_bias.bias
         )
 
-    def turns(self) -> dict[str, int]:
+    def last_ticks_ns(self) -> dict[str, int]:
         """When each thread that makes fixes began its newest turn, CLOCK_MONOTONIC ns, by name."""
         return {n: self._turns[n] for n in _FIX_THREADS if n in self._turns}
 
@@ -181,7 +181,7 @@ class DualThreadEngine:
 
     def _knows_place(self) -> bool:
         """Whether a search has become idle: the place is known or on probation, or we end."""
-        return self._stop.is_set() or not self._localizer.tracker.standing.wants_prior
+        return self._stop.is_set() or not self._localizer.tracker.track_status.wants_prior
 
     def _render_once(self) -> None:
         time_ns = self._render_times.take(_IDLE_S)
@@ -214,7 +214,7 @@ class DualThreadEngine:
         finally:
             self._registers = registered
 
-    def _localize(self, prepared: Prepared) -> bool:
+    def _localize(self, prepared: PrefetchedFrame) -> bool:
         """Register a frame and publish the estimate; False where there is nothing to do it with."""
         frame = prepared.frame
         self._seek(frame)
@@ -249,8 +249,8 @@ class DualThreadEngine:
         """
         tracker = self._localizer.tracker
         known = tracker.motion is not None
-        if known and not tracker.standing.wants_prior:
-            if tracker.standing.state is TrackingState.TRACKING:
+        if known and not tracker.track_status.wants_prior:
+            if tracker.track_status.state is TrackingState.TRACKING:
                 self._found = None  # of a loss that is over: at the next one it is another place
             return True
         found, self._found = self._found, None
@@ -264,7 +264,7 @@ class DualThreadEngine:
         """Offer the frame to the search, once the poses known outside have led nowhere."""
         if self._searcher is None:
             return
-        wanting = self._localizer.tracker.standing.wants_prior
+        wanting = self._localizer.tracker.track_status.wants_prior
         self._unknown_frames = self._unknown_frames + 1 if wanting else 0
         if self._unknown_frames > _TRIED_FRAMES:
             self._sought.put(frame)

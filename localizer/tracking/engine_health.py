@@ -7,7 +7,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
-from localizer.tracking.horizon import Horizon
+from localizer.tracking.attitude_bias import AttitudeBias
 
 _log = logging.getLogger(__name__)
 _REPORT_EVERY_S = 5.0
@@ -49,7 +49,7 @@ class HealthBook:
         self._lock = threading.Lock()
 
     def read(
-        self, frames_dropped: int, optimizer: str, horizon: Horizon | None = None
+        self, frames_dropped: int, optimizer: str, bias: AttitudeBias | None = None
     ) -> EngineHealth:
         """A snapshot, with what only the engine knows."""
         with self._lock:
@@ -57,7 +57,7 @@ class HealthBook:
                 self._health,
                 frames_dropped=frames_dropped,
                 optimizer=optimizer,
-                horizon_off_deg=None if horizon is None else horizon.told_deg,
+                horizon_off_deg=None if bias is None else bias.told_deg,
                 last_error=next(iter(self._errors.values()), ""),
             )
 

@@ -180,7 +180,7 @@ def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | N
 
 
 @dataclass(frozen=True)
-class OtherSensors:
+class AuxiliarySensors:
     """What other sensors (autopilot and gimbal) say of the camera; None where they do not know.
 
     rotation_at: (3, 3) world_from_camera at a time in ns. displacement_between: the way (3,)

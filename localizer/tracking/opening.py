@@ -19,7 +19,7 @@ from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.select import open_renderer
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.pipeline import Localizer, working_camera
 
 
@@ -45,7 +45,7 @@ def open_localizer(
     map_cache: Path | str,
     camera: Camera,
     config: LocalizerConfig | None = None,
-    sensors: OtherSensors | None = None,
+    sensors: AuxiliarySensors | None = None,
 ) -> Localizer:
     """A localizer for one camera over a tile cache on disk; close it, or use it in a ``with``.
 
@@ -67,7 +67,7 @@ def build_localizer(
     stack: MapStack,
     camera: Camera,
     config: LocalizerConfig,
-    sensors: OtherSensors | None = None,
+    sensors: AuxiliarySensors | None = None,
     *,
     on_close: Callable[[], None] = lambda: None,
 ) -> Localizer:

@@ -27,16 +27,16 @@ from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
-from localizer.odometry import Ground
+from localizer.odometry import TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
-from localizer.tracking.bridging import Bridging
-from localizer.tracking.horizon import Levelling, Sight
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.attitude_bias import AttitudeBiasEstimator, AttitudeObservation
+from localizer.tracking.dead_reckoning import DeadReckoning
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.reference import lead_share, still_serves
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
@@ -156,7 +156,7 @@ class Localizer:
 
     sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
     angular rate of the motion model, their roll and pitch constrain the registration while it
-    tracks (`tracking.horizon`), and with the displacement they confirm or refute a place that was
+    tracks (`tracking.bias`), and with the displacement they confirm or refute a place that was
     searched.
     map_frame: the map's. terrain: the ground's shape where the map has none. on_close: releases
     what was opened for this localizer alone. is_loading: whether tiles that were asked for are
@@ -170,10 +170,10 @@ class Localizer:
         optimizer: JNGO,
         camera: Camera,
         config: LocalizerConfig,
-        sensors: OtherSensors | None = None,
+        sensors: AuxiliarySensors | None = None,
         *,
         map_frame: LocalFrame | None = None,
-        terrain: Ground | None = None,
+        terrain: TerrainModel | None = None,
         on_close: Callable[[], None] = lambda: None,
         is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -183,7 +183,7 @@ class Localizer:
         self._extractor = extractor
         self._optimizer = optimizer
         self._config = config
-        self._sensors = sensors or OtherSensors()
+        self._sensors = sensors or AuxiliarySensors()
         self._pinhole = working_camera(camera, config.width)
         self.camera = self._pinhole
         """The working pinhole of the newest frame: another where its lens has zoomed."""
@@ -191,17 +191,19 @@ class Localizer:
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
         self._fitted_ns: int | None = None  # of the last picture whose focal length was fitted
-        self.levelling = Levelling(config.attitude, self._sensors.rotation_at)
+        self.attitude_bias = AttitudeBiasEstimator(config.attitude, self._sensors.rotation_at)
         """What the other sensors' roll and pitch are off by."""
-        self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer, terrain))
+        self._tracker = Tracker(
+            config, self._sensors, self._dead_reckoning(config, optimizer, terrain)
+        )
 
-    def _bridging(
-        self, config: LocalizerConfig, optimizer: JNGO, terrain: Ground | None
-    ) -> Bridging | None:
+    def _dead_reckoning(
+        self, config: LocalizerConfig, optimizer: JNGO, terrain: TerrainModel | None
+    ) -> DeadReckoning | None:
         # A GPU's features are valid until the next frame only: there is no keyframe to keep.
         if config.odometry is None or optimizer.on_gpu:
             return None
-        return Bridging(
+        return DeadReckoning(
             self._pinhole, optimizer, config.odometry, config.threads, self._sensors, terrain
         )
 
@@ -265,7 +267,7 @@ class Localizer:
         """Take a pose that is known outside, as it deserves: before the first fix one that owes
         our own fixes nothing begins the tracking; any other place is on trial (`propose`).
         """
-        begins = self.tracker.standing.state is TrackingState.INITIALIZING
+        begins = self.tracker.track_status.state is TrackingState.INITIALIZING
         if prior.independent and begins:
             self.set_prior(prior)
         else:
@@ -322,8 +324,8 @@ class Localizer:
         self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
     ) -> ReferenceBundle:
         """The last reference as long as it serves (`reference_shift_px`), else a new one."""
-        standing = self.tracker.standing
-        holds = standing.state is TrackingState.TRACKING and standing.rejected_in_row == 0
+        track_status = self.tracker.track_status
+        holds = track_status.state is TrackingState.TRACKING and track_status.rejected_in_row == 0
         steady = holds and not self._is_loading()
         shift_px = self._config.reference_shift_px
         pose, time_ns = prior.world_from_camera, prior.time_ns
@@ -399,19 +401,19 @@ class Localizer:
                 about = ahead.prior.world_from_camera
                 seen_anchors = swept(anchors, sweep, about, frame.camera)
                 # Not on trial: there the reported attitude is what confirms or refutes a place.
-                tracks = seen.standing.state is TrackingState.TRACKING
-                tracks = tracks and not seen.standing.on_trial
-                level = self.levelling.constraint(ahead.prior) if tracks else None
+                tracks = seen.track_status.state is TrackingState.TRACKING
+                tracks = tracks and not seen.track_status.tentative
+                level = self.attitude_bias.constraint(ahead.prior) if tracks else None
                 result = self._optimizer.register(
                     query,
                     camera,
                     seen_anchors,
                     ahead.prior,
-                    motion=ahead.prior if seen.standing.trusts_prediction else None,
+                    motion=ahead.prior if seen.track_status.trusts_prediction else None,
                     constraint=level,
                     seed=self._config.seed + frame.sequence,
                 )
-                if seen.standing.on_trial and not seen.standing.independent:
+                if seen.track_status.tentative and not seen.track_status.independent:
                     result = self._optimizer.focal_tested(query, camera, seen_anchors, result)
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
         if anchors is not None and estimate.status is RegistrationStatus.OK:
@@ -442,7 +444,7 @@ class Localizer:
         pose, time_ns = estimate.world_from_camera, frame.exposure_time_ns
         distance_m = _distance_m(anchors, pose.translation)
         tracks = estimate.state is TrackingState.TRACKING
-        if not tracks or not self.levelling.is_due(pose.translation, distance_m):
+        if not tracks or not self.attitude_bias.is_due(pose.translation, distance_m):
             return
         if free is None:
             prior = PosePrior(pose, estimate.covariance, time_ns)
@@ -452,9 +454,11 @@ class Localizer:
             )
         if free.status is RegistrationStatus.OK:
             covariance = free.covariance + unknown
-            self.levelling.learn(Sight(free.world_from_camera, covariance, distance_m, time_ns))
+            self.attitude_bias.learn(
+                AttitudeObservation(free.world_from_camera, covariance, distance_m, time_ns)
+            )
         else:
-            self.levelling.pass_by(pose.translation, time_ns)
+            self.attitude_bias.pass_by(pose.translation, time_ns)
 
     def _is_focal_due(self, estimate: PoseEstimate) -> bool:
         """Whether this picture is one whose focal length is to be fitted."""

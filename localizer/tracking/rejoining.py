@@ -14,7 +14,12 @@ import numpy as np
 
 from localizer.geometry.pose import Array, Pose
 from localizer.integrity.acceptance import IntegrityConfig
-from localizer.integrity.confirmation import Probation, Verdict, Witness, weigh
+from localizer.integrity.confirmation import (
+    Consistency,
+    IndependentEvidence,
+    TentativeTrack,
+    consistency_test,
+)
 
 _LEAST_RUN = 8  # answers in a row
 _DRIFT_SIGMA_M = 0.2  # of the odometry over such a way
@@ -27,7 +32,7 @@ class Rejoining:
     begun: the run's first answer; carried: the odometry's position (3,) then.
     """
 
-    begun: Probation | None = None
+    begun: TentativeTrack | None = None
     carried: Array | None = None
     answers: int = 0
     confirmed: bool = False
@@ -39,15 +44,17 @@ class Rejoining:
         """After one more answer that is good in itself. rotation: the autopilot's account of the
         camera's, or None.
         """
-        first = Rejoining(Probation(pose, covariance, time_ns), carried.translation, 1)
+        first = Rejoining(TentativeTrack(pose, covariance, time_ns), carried.translation, 1)
         if self.begun is None or self.carried is None:
             return first
         way = (carried.translation - self.carried, _DRIFT_SIGMA_M)
-        verdict = weigh(self.begun, pose, covariance, time_ns, Witness(rotation, way), config)
-        if verdict is Verdict.CONTRADICTED or self._jumps(pose, way[0], covariance):
+        verdict = consistency_test(
+            self.begun, pose, covariance, time_ns, IndependentEvidence(rotation, way), config
+        )
+        if verdict is Consistency.CONTRADICTED or self._jumps(pose, way[0], covariance):
             return first
         answers = self.answers + 1
-        confirmed = verdict is Verdict.CONFIRMED and answers >= _LEAST_RUN
+        confirmed = verdict is Consistency.CONFIRMED and answers >= _LEAST_RUN
         return replace(self, answers=answers, confirmed=self.confirmed or confirmed)
 
     def _jumps(self, pose: Pose, way: Array, covariance: Array) -> bool:

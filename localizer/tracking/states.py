@@ -11,28 +11,33 @@ from dataclasses import dataclass, replace
 
 from localizer.geometry.pose import Array, Pose
 from localizer.integrity.acceptance import IntegrityConfig
-from localizer.integrity.confirmation import Probation, Verdict, Witness, weigh
-from localizer.tracking.bridging import Carry
+from localizer.integrity.confirmation import (
+    Consistency,
+    IndependentEvidence,
+    TentativeTrack,
+    consistency_test,
+)
+from localizer.tracking.dead_reckoning import PropagationResult
 from localizer.types import TrackingState
 
 _SEES = (TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.BRIDGING)
 
 
 @dataclass(frozen=True)
-class Standing:
+class TrackStatus:
     """State of the machine: immutable, `judge` returns the next one.
 
-    on_trial: the place was proposed, and counts only once it is confirmed. probation: the run of
-    acceptances there. independent: of the newest proposal, see `Probation`. last_fix_ns: exposure
+    tentative: the place was proposed, and counts only once it is confirmed. probation: the run of
+    acceptances there. independent: of the newest proposal, see `TentativeTrack`. last_fix_ns: exposure
     of the newest fix that was given out, None before the first.
     """
 
     state: TrackingState = TrackingState.INITIALIZING
     accepted_in_row: int = 0
     rejected_in_row: int = 0
-    on_trial: bool = False
+    tentative: bool = False
     independent: bool = True
-    probation: Probation | None = None
+    tentative_track: TentativeTrack | None = None
     last_fix_ns: int | None = None
 
     @property
@@ -47,19 +52,19 @@ class Standing:
         """
         return self.state not in _SEES and self.accepted_in_row == 0
 
-    def begun(self) -> Standing:
+    def begun(self) -> TrackStatus:
         """Begun anew from a pose that is known."""
-        return Standing(last_fix_ns=self.last_fix_ns)
+        return TrackStatus(last_fix_ns=self.last_fix_ns)
 
-    def proposed(self, independent: bool) -> Standing:
-        """The same state, with a new place on trial. independent: see `Probation`."""
+    def proposed(self, independent: bool) -> TrackStatus:
+        """The same state, with a new place on trial. independent: see `TentativeTrack`."""
         return replace(
-            self, accepted_in_row=0, on_trial=True, independent=independent, probation=None
+            self, accepted_in_row=0, tentative=True, independent=independent, tentative_track=None
         )
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RegistrationOutcome:
     """A registration that was judged. covariance: (6, 6); time_ns: the frame's exposure; carry:
     what the odometry made of a frame that the map rejected.
     """
@@ -68,81 +73,98 @@ class Outcome:
     world_from_camera: Pose
     covariance: Array
     time_ns: int
-    carry: Carry = Carry.NONE
+    carry: PropagationResult = PropagationResult.NONE
 
 
-_NO_WITNESS = Witness()
+_NO_EVIDENCE = IndependentEvidence()
 
 
 def judge(
-    standing: Standing, config: IntegrityConfig, outcome: Outcome, witness: Witness = _NO_WITNESS
-) -> Standing:
+    track_status: TrackStatus,
+    config: IntegrityConfig,
+    outcome: RegistrationOutcome,
+    evidence: IndependentEvidence = _NO_EVIDENCE,
+) -> TrackStatus:
     """The machine after one more frame; witness: what other sensors say, for a place on trial."""
     if not outcome.acceptable:
-        return _after_rejection(standing, config, outcome.carry)
-    if standing.on_trial:
-        return _on_trial(standing, config, outcome, witness)
-    count = standing.accepted_in_row + 1
-    state = standing.state
+        return _after_rejection(track_status, config, outcome.carry)
+    if track_status.tentative:
+        return _tentative(track_status, config, outcome, evidence)
+    count = track_status.accepted_in_row + 1
+    state = track_status.state
     if state is TrackingState.DEGRADED or count >= config.confirmations:
         state = TrackingState.TRACKING
     given = state is not TrackingState.BRIDGING
     return replace(
-        standing,
+        track_status,
         state=state,
         accepted_in_row=count,
         rejected_in_row=0,
-        last_fix_ns=outcome.time_ns if given else standing.last_fix_ns,
+        last_fix_ns=outcome.time_ns if given else track_status.last_fix_ns,
     )
 
 
-def _on_trial(
-    standing: Standing, config: IntegrityConfig, outcome: Outcome, witness: Witness
-) -> Standing:
-    probation = standing.probation or Probation(
-        outcome.world_from_camera, outcome.covariance, outcome.time_ns, standing.independent
+def _tentative(
+    track_status: TrackStatus,
+    config: IntegrityConfig,
+    outcome: RegistrationOutcome,
+    evidence: IndependentEvidence,
+) -> TrackStatus:
+    tentative_track = track_status.tentative_track or TentativeTrack(
+        outcome.world_from_camera, outcome.covariance, outcome.time_ns, track_status.independent
     )
-    count = standing.accepted_in_row + 1
-    tried = replace(standing, accepted_in_row=count, rejected_in_row=0, probation=probation)
-    verdict = weigh(
-        probation, outcome.world_from_camera, outcome.covariance, outcome.time_ns, witness, config
+    count = track_status.accepted_in_row + 1
+    tried = replace(
+        track_status, accepted_in_row=count, rejected_in_row=0, tentative_track=tentative_track
     )
-    if verdict is Verdict.CONTRADICTED:
-        return _after_rejection(replace(standing, probation=None), config, Carry.NONE)
-    if verdict is Verdict.PENDING or count < config.confirmations:
+    verdict = consistency_test(
+        tentative_track,
+        outcome.world_from_camera,
+        outcome.covariance,
+        outcome.time_ns,
+        evidence,
+        config,
+    )
+    if verdict is Consistency.CONTRADICTED:
+        return _after_rejection(
+            replace(track_status, tentative_track=None), config, PropagationResult.NONE
+        )
+    if verdict is Consistency.PENDING or count < config.confirmations:
         return tried
     return replace(
         tried,
         state=TrackingState.TRACKING,
-        on_trial=False,
-        probation=None,
+        tentative=False,
+        tentative_track=None,
         last_fix_ns=outcome.time_ns,
     )
 
 
-def _after_rejection(standing: Standing, config: IntegrityConfig, carry: Carry) -> Standing:
-    count = standing.rejected_in_row + 1
-    state = _worse(standing.state, count, config, carry)
-    trial = standing.on_trial or state is TrackingState.LOST
+def _after_rejection(
+    track_status: TrackStatus, config: IntegrityConfig, carry: PropagationResult
+) -> TrackStatus:
+    count = track_status.rejected_in_row + 1
+    state = _worse(track_status.state, count, config, carry)
+    trial = track_status.tentative or state is TrackingState.LOST
     return replace(
-        standing,
+        track_status,
         state=state,
         accepted_in_row=0,
         rejected_in_row=count,
-        on_trial=trial,
-        independent=standing.independent and not trial,
-        probation=None,
+        tentative=trial,
+        independent=track_status.independent and not trial,
+        tentative_track=None,
     )
 
 
 def _worse(
-    state: TrackingState, count: int, config: IntegrityConfig, carry: Carry
+    state: TrackingState, count: int, config: IntegrityConfig, carry: PropagationResult
 ) -> TrackingState:
     """The state after `count` rejections in a row."""
     if state is TrackingState.BRIDGING:
-        holds = carry in (Carry.CARRIED, Carry.GAP)
+        holds = carry in (PropagationResult.CARRIED, PropagationResult.GAP)
         return TrackingState.BRIDGING if holds else TrackingState.LOST
-    if state in _SEES and count >= config.degraded_after and carry is Carry.CARRIED:
+    if state in _SEES and count >= config.degraded_after and carry is PropagationResult.CARRIED:
         return TrackingState.BRIDGING
     if count >= config.lost_after:
         return TrackingState.LOST

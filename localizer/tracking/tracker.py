@@ -9,13 +9,13 @@ from localizer.config import LocalizerConfig
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.integrity.acceptance import is_acceptable
-from localizer.integrity.confirmation import Witness
+from localizer.integrity.confirmation import IndependentEvidence
 from localizer.registration.result import Registration
 from localizer.tracking import motion
-from localizer.tracking.bridging import Bridging, Carried, Carry
-from localizer.tracking.motion import MeasuredMotion, MotionState, OtherSensors
+from localizer.tracking.dead_reckoning import DeadReckoning, PropagatedPose, PropagationResult
+from localizer.tracking.motion import AuxiliarySensors, MeasuredMotion, MotionState
 from localizer.tracking.rejoining import Rejoining
-from localizer.tracking.states import Outcome, Standing, judge
+from localizer.tracking.states import RegistrationOutcome, TrackStatus, judge
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -32,7 +32,7 @@ class TrackerState:
     """What the two halves share; replaced as a whole, never changed."""
 
     motion: MotionState | None = None
-    standing: Standing = field(default_factory=Standing)
+    track_status: TrackStatus = field(default_factory=TrackStatus)
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class Tracker:
     def __init__(
         self,
         config: LocalizerConfig,
-        sensors: OtherSensors,
-        bridging: Bridging | None,
+        sensors: AuxiliarySensors,
+        dead_reckoning: DeadReckoning | None,
     ) -> None:
         self._config = config
         self._motion = MeasuredMotion(config.motion, sensors.rotation_at)
         self._sensors = sensors
-        self._bridging = bridging
+        self._dead_reckoning = dead_reckoning
         self._rejoining = Rejoining()
         self._lock = threading.Lock()
         self._state = TrackerState()
@@ -75,20 +75,20 @@ class Tracker:
     @property
     def can_carry(self) -> bool:
         """Whether a frame without any reference can be carried on to."""
-        trusted = self.state.standing.trusts_prediction
-        return trusted and self._bridging is not None and self._bridging.is_ready
+        trusted = self.state.track_status.trusts_prediction
+        return trusted and self._dead_reckoning is not None and self._dead_reckoning.is_ready
 
     def set_prior(self, prior: PosePrior) -> None:
         """Begin (again) from a pose known from outside."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
-            self._state = TrackerState(state, self._state.standing.begun())
+            self._state = TrackerState(state, self._state.track_status.begun())
 
     def propose(self, prior: PosePrior) -> None:
         """Put a place on trial; the state stays what it is."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
-            self._state = TrackerState(state, self._state.standing.proposed(prior.independent))
+            self._state = TrackerState(state, self._state.track_status.proposed(prior.independent))
 
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction; None before the first prior."""
@@ -119,31 +119,38 @@ class Tracker:
         """
         acceptable = result is not None and self._is_acceptable(result, ahead.prior)
         carried = self._carry(seen, ahead, frame, query, anchors, acceptable)
-        rejoins = not acceptable and self._rejoins(seen.standing, result, carried, frame)
+        rejoins = not acceptable and self._rejoins(seen.track_status, result, carried, frame)
         acceptable = acceptable or rejoins
         if result is not None:
             measured, covariance = result.world_from_camera, result.covariance
         else:
             measured, covariance = ahead.prior.world_from_camera, ahead.prior.covariance
-        outcome = Outcome(acceptable, measured, covariance, frame.exposure_time_ns, carried.status)
-        witness = self._witness(seen.standing, outcome)
-        standing = judge(seen.standing, self._config.integrity, outcome, witness)
-        bridges = standing.state is TrackingState.BRIDGING
-        lost = standing.state is TrackingState.LOST
+        outcome = RegistrationOutcome(
+            acceptable, measured, covariance, frame.exposure_time_ns, carried.status
+        )
+        evidence = self._evidence(seen.track_status, outcome)
+        track_status = judge(seen.track_status, self._config.integrity, outcome, evidence)
+        bridges = track_status.state is TrackingState.BRIDGING
+        lost = track_status.state is TrackingState.LOST
         moved = self._next_motion(ahead, result, acceptable and not bridges, carried, lost)
         if rejoins and not bridges and result is not None:  # the prediction was of the wrong place
             moved = motion.start(_restart(result, ahead), self._config.motion)
-        self._store(seen, moved, standing)
-        given, usable = _given(outcome, result, carried, standing)
+        self._store(seen, moved, track_status)
+        given, usable = _given(outcome, result, carried, track_status)
         if usable and not bridges:
             # Position and tilt err together, from frame to frame anew; the turn between two frames
             # is known several times better. The sigmas told stay the registration's: the map errs
             # alike for seconds, which a filter takes for knowledge.
             given = replace(given, world_from_camera=moved.prior.world_from_camera)
-        estimate = _estimate(frame, given, standing, usable)
-        if estimate.accepted and not bridges and self._bridging is not None and anchors is not None:
+        estimate = _estimate(frame, given, track_status, usable)
+        if (
+            estimate.accepted
+            and not bridges
+            and self._dead_reckoning is not None
+            and anchors is not None
+        ):
             swept = self.sweep(frame, ahead)
-            self._bridging.begin(estimate, query, anchors, moved.velocity, swept)
+            self._dead_reckoning.begin(estimate, query, anchors, moved.velocity, swept)
         return estimate
 
     def _is_acceptable(self, result: Registration, prior: PosePrior) -> bool:
@@ -155,22 +162,26 @@ class Tracker:
     def _carry(
         self, seen: TrackerState, ahead: MotionState, frame: Frame, query: FeaturePyramid,
         anchors: Anchors | None, acceptable: bool,
-    ) -> Carried:  # fmt: skip
+    ) -> PropagatedPose:  # fmt: skip
         """The odometry's answer: for frames that the map rejected, and until it has confirmed."""
-        standing = seen.standing
-        wanted = not acceptable or standing.state is TrackingState.BRIDGING
-        if self._bridging is None or not standing.trusts_prediction or not wanted:
-            return Carried(Carry.NONE)
+        track_status = seen.track_status
+        wanted = not acceptable or track_status.state is TrackingState.BRIDGING
+        if self._dead_reckoning is None or not track_status.trusts_prediction or not wanted:
+            return PropagatedPose(PropagationResult.NONE)
         swept = self.sweep(frame, ahead)
-        return self._bridging.carry(frame, query, ahead.prior, anchors, swept)
+        return self._dead_reckoning.carry(frame, query, ahead.prior, anchors, swept)
 
     def _rejoins(
-        self, standing: Standing, result: Registration | None, carried: Carried, frame: Frame
+        self,
+        track_status: TrackStatus,
+        result: Registration | None,
+        carried: PropagatedPose,
+        frame: Frame,
     ) -> bool:
         """Whether the map's answers, refused by the gate alone, refute the pose that is carried."""
         pose = carried.world_from_camera
         good = result is not None and is_acceptable(self._config.integrity, result, 0.0)
-        if standing.state is not TrackingState.BRIDGING or result is None or not good:
+        if track_status.state is not TrackingState.BRIDGING or result is None or not good:
             self._rejoining = Rejoining()
             return False
         if pose is None:  # a gap of the odometry says nothing of the map's answers
@@ -182,19 +193,21 @@ class Tracker:
         )  # fmt: skip
         return self._rejoining.confirmed
 
-    def _witness(self, standing: Standing, outcome: Outcome) -> Witness:
+    def _evidence(
+        self, track_status: TrackStatus, outcome: RegistrationOutcome
+    ) -> IndependentEvidence:
         """What other sensors say of a place on trial."""
-        if not standing.on_trial or not outcome.acceptable:
-            return Witness()
+        if not track_status.tentative or not outcome.acceptable:
+            return IndependentEvidence()
         rotation = self._sensors.rotation_at(outcome.time_ns)
-        if standing.probation is None:
-            return Witness(rotation)
-        begun_ns = standing.probation.time_ns
+        if track_status.tentative_track is None:
+            return IndependentEvidence(rotation)
+        begun_ns = track_status.tentative_track.time_ns
         way = self._sensors.displacement_between(begun_ns, outcome.time_ns)
-        return Witness(rotation, way)
+        return IndependentEvidence(rotation, way)
 
     def _next_motion(
-        self, ahead: MotionState, result: Registration | None, use_map: bool, carried: Carried,
+        self, ahead: MotionState, result: Registration | None, use_map: bool, carried: PropagatedPose,
         lost: bool,
     ) -> MotionState:  # fmt: skip
         if use_map and result is not None:
@@ -207,11 +220,11 @@ class Tracker:
             return motion.kept(ahead, ahead.time_ns, self._config.motion, None)
         return ahead
 
-    def _store(self, seen: TrackerState, state: MotionState, standing: Standing) -> None:
+    def _store(self, seen: TrackerState, state: MotionState, track_status: TrackStatus) -> None:
         """Keep the new state unless a prior from outside replaced it meanwhile."""
         with self._lock:
             if self._state is seen:
-                self._state = TrackerState(state, standing)
+                self._state = TrackerState(state, track_status)
 
 
 def _restart(result: Registration, ahead: MotionState) -> PosePrior:
@@ -222,30 +235,33 @@ def _restart(result: Registration, ahead: MotionState) -> PosePrior:
 
 
 def _given(
-    outcome: Outcome, result: Registration | None, carried: Carried, standing: Standing
+    outcome: RegistrationOutcome,
+    result: Registration | None,
+    carried: PropagatedPose,
+    track_status: TrackStatus,
 ) -> tuple[_Pose, bool]:
     """What is given out, and whether it may be used."""
-    if standing.state is TrackingState.BRIDGING:
+    if track_status.state is TrackingState.BRIDGING:
         pose, covariance = carried.world_from_camera, carried.covariance
         if pose is not None and covariance is not None:
             return _Pose(pose, covariance, carried.quality, RegistrationStatus.OK), True
     status = result.status if result is not None else RegistrationStatus.NO_OVERLAP
     quality = result.quality if result is not None and status is RegistrationStatus.OK else 0.0
-    seen = standing.state is not TrackingState.BRIDGING and not standing.on_trial
+    seen = track_status.state is not TrackingState.BRIDGING and not track_status.tentative
     given = _Pose(outcome.world_from_camera, outcome.covariance, quality, status)
     return given, outcome.acceptable and seen
 
 
-def _estimate(frame: Frame, given: _Pose, standing: Standing, usable: bool) -> PoseEstimate:
+def _estimate(frame: Frame, given: _Pose, track_status: TrackStatus, usable: bool) -> PoseEstimate:
     return PoseEstimate(
         world_from_camera=given.world_from_camera,
         covariance=given.covariance,
         quality=given.quality,
-        state=standing.state,
+        state=track_status.state,
         status=given.status,
         accepted=usable,
         exposure_time_ns=frame.exposure_time_ns,
         sequence=frame.sequence,
         camera=frame.camera,
-        last_fix_ns=standing.last_fix_ns,
+        last_fix_ns=track_status.last_fix_ns,
     )

@@ -12,7 +12,7 @@ from torch import nn
 
 
 @dataclass(frozen=True)
-class Workers:
+class TrainingProcess:
     """This process's rank among `count`, and its device."""
 
     rank: int
@@ -20,7 +20,7 @@ class Workers:
     device: torch.device
 
     @classmethod
-    def from_environment(cls) -> Workers:
+    def from_environment(cls) -> TrainingProcess:
         """Join the group that torchrun describes in RANK, WORLD_SIZE and LOCAL_RANK, if any."""
         cuda = torch.cuda.is_available()
         count = int(os.environ.get("WORLD_SIZE", "1"))

@@ -56,7 +56,7 @@ _MIN_INTERVAL_US = 20_000
 _PER_TICK = 4  # targets: more in one go would fill a slow port, and positions wait behind them
 
 
-class _Pace:
+class _ClickRate:
     """Of clicks: more in a while would end targets before they are found."""
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class CameraComponent:
         self._on_track = on_track
         self._numbers = numbers
         self._last_click: tuple[Any, int, TrackRequest] | None = None
-        self._pace = _Pace()
+        self._pace = _ClickRate()
         self._period_ns = int(1e9 / config.targets.rate_hz)
         self._image_ns = self._geo_ns = self._period_ns
         self._targets: dict[int, TargetReport] = {}

@@ -13,7 +13,7 @@ _MOST = 256  # remembered of targets that are gone, so that none that comes back
 
 
 @dataclass
-class Mark:
+class TargetMark:
     """A confirmed target's place as it is told. left: how often still."""
 
     report: TargetReport
@@ -29,17 +29,17 @@ class Marks:
 
     def __init__(self, sigma_m: float) -> None:
         self._sigma_m = sigma_m
-        self._marks: dict[int, Mark] = {}
+        self._marks: dict[int, TargetMark] = {}
         self._next = 0
 
     def __len__(self) -> int:
         return len(self._marks)
 
-    def due(self, targets: Mapping[int, TargetReport], now_ns: int) -> Mark | None:
+    def due(self, targets: Mapping[int, TargetReport], now_ns: int) -> TargetMark | None:
         """The one to send now, noted as sent; one at a time: a slow port carries positions."""
         for number, report in targets.items():
             if number not in self._marks and is_confirmed(report, self._sigma_m):
-                self._marks[number] = Mark(report, self._next)
+                self._marks[number] = TargetMark(report, self._next)
                 self._next += 1
         gone = [number for number in self._marks if number not in targets]
         for number in gone[: max(0, len(self._marks) - _MOST)]:

@@ -36,7 +36,7 @@ Angles = tuple[float | None, float | None, float | None]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EncodedEstimate:
     """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), None where
     it is not known.
 
@@ -97,7 +97,7 @@ def pose_covariance(
 
 
 def vision_position_estimate(
-    e: Estimate, ned: tuple[float, float, float], formula: CovarianceFormula
+    e: EncodedEstimate, ned: tuple[float, float, float], formula: CovarianceFormula
 ) -> Any:
     """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
@@ -108,7 +108,7 @@ def vision_position_estimate(
 
 
 def odometry(
-    e: Estimate,
+    e: EncodedEstimate,
     attitude: tuple[float, float, float],
     ned: tuple[float, float, float],
     formula: CovarianceFormula,
@@ -148,7 +148,7 @@ def odometry(
 
 
 def gps_input(
-    e: Estimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
+    e: EncodedEstimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
 ) -> Any:
     """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored.
 
@@ -184,7 +184,7 @@ def gps_input(
     )
 
 
-def global_position_sensor(e: Estimate, altitude_amsl_m: float, now_ns: int) -> Any:
+def global_position_sensor(e: EncodedEstimate, altitude_amsl_m: float, now_ns: int) -> Any:
     """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes.
 
     Unlike the others it is stamped with its transmission, and says how long ago the exposure was.

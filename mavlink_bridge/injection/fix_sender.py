@@ -7,12 +7,12 @@ from collections import Counter
 from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.injector import NO_FIX_YET, NO_FRESH_FIX, Injector
-from mavlink_bridge.injection.message_maker import Injection, InjectionContext
+from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import FirmwareProfile
 
@@ -35,7 +35,7 @@ class FixSender:
         shared: Shared,
         origin: OriginExchange,
         outcome: InjectionOutcome,
-        teller: Teller,
+        teller: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self.fixes = FixQueue(_QUEUE)
@@ -98,7 +98,7 @@ class FixSender:
         """Lengths of everything that waits here."""
         return {"fixes": len(self.fixes), "due": self.injector.waiting}
 
-    def _deliver(self, link: Link, mode: Mode, injection: Injection, now_ns: int) -> None:
+    def _deliver(self, link: Link, mode: Mode, injection: EncodedMessage, now_ns: int) -> None:
         self._outcome.made(injection.estimate)
         # What a port that is full does not take, the EKF does not have: no source to switch to.
         self._taken = mode != "inject" or link.send(injection.message, self._component)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.messages import VehicleState, without_figures
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.profile import FirmwareProfile
 
 _RELIEF_SHARE = 0.9  # of a limit, below which its warning ends
@@ -16,7 +16,7 @@ _IN_TIME_S = 15.0  # until lateness is over; a computer at its limit is late and
 class FixWarnings:
     """Looks at the injector and the computer's clock; one thread."""
 
-    def __init__(self, shared: Shared, injector: Injector, teller: Teller) -> None:
+    def __init__(self, shared: Shared, injector: Injector, teller: StatusNotifier) -> None:
         self._config = shared.config.injection
         self._utc = shared.utc
         self._injector = injector

@@ -16,13 +16,13 @@ import statistics
 from collections import Counter, deque
 
 from mavlink_bridge.config import InjectionConfig
-from mavlink_bridge.injection.encode import Estimate
+from mavlink_bridge.injection.encode import EncodedEstimate
 from mavlink_bridge.injection.fix_queue import Latency, PendingJump
 from mavlink_bridge.injection.message_maker import (
-    Injection,
+    EncodedMessage,
+    HeldOutput,
     InjectionContext,
     MessageMaker,
-    Withheld,
     attitude_of,
 )
 from mavlink_bridge.injection.propagate import FixPropagator, grown_protection
@@ -38,7 +38,7 @@ _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
 
 
-class _Pace:
+class _FixRate:
     """How often fixes come of age, and whether the next one should have."""
 
     def __init__(self, overdue_intervals: float) -> None:
@@ -89,7 +89,7 @@ class Injector:
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
         self._last_was_fill = False
-        self._pace = _Pace(config.overdue_intervals)
+        self._pace = _FixRate(config.overdue_intervals)
         self._sent_fix_ns = 0
         self.yaw_difference_rad: float | None = None
         """The last fix's yaw minus the autopilot's; None while none could be compared."""
@@ -144,14 +144,14 @@ class Injector:
             self._jump.note(self._waiting.popleft())
         self._fresh = None
 
-    def step(self, now_ns: int, context: InjectionContext) -> Injection | None:
+    def step(self, now_ns: int, context: InjectionContext) -> EncodedMessage | None:
         """What to send now, if anything."""
         self._take_due(now_ns, context)
         outcome = self._next(now_ns, context)
         if outcome is None:
             return None
         self._last_slot_ns = now_ns
-        if isinstance(outcome, Withheld):
+        if isinstance(outcome, HeldOutput):
             self.reason = outcome.reason
             self.counters[outcome.counter] += 1
             return None
@@ -209,7 +209,7 @@ class Injector:
         between = min(self._last_slot_ns + self._period_ns, due - self._least_gap_ns)
         return between if between >= self._earliest_ns() else due + self._period_ns // 2
 
-    def _next(self, now_ns: int, context: InjectionContext) -> Injection | Withheld | None:
+    def _next(self, now_ns: int, context: InjectionContext) -> EncodedMessage | HeldOutput | None:
         if self._propagator.fix is None and not self.guard.blocked:
             return None
         fill_due = now_ns >= self._fill_due_ns()
@@ -217,7 +217,7 @@ class Injector:
             self._fresh = None
             degrees = math.degrees(refused)
             reason = f"vision yaw differs from the autopilot's by {degrees:+.1f} deg"
-            return Withheld(reason, "withheld_yaw") if fill_due else None
+            return HeldOutput(reason, "withheld_yaw") if fill_due else None
         if self._fresh is not None and now_ns >= self._earliest_ns():
             fix, self._fresh = self._fresh, None
             too_old = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
@@ -230,20 +230,20 @@ class Injector:
 
     def _make(
         self, time_ns: int, now_ns: int, context: InjectionContext, *, fresh: bool
-    ) -> Injection | Withheld | None:
+    ) -> EncodedMessage | HeldOutput | None:
         fix = self._propagator.fix
         position = self._propagator.at(time_ns)
         if fix is None or position is None or time_ns <= self._last_stamp_ns:
             return None
         too_far = (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s
         if too_far or (not fresh and self._pace.overdue(now_ns)):
-            return Withheld(NO_FRESH_FIX, "withheld_stale")
+            return HeldOutput(NO_FRESH_FIX, "withheld_stale")
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:
-            return Withheld(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")
+            return HeldOutput(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")
         attitude = attitude_of(fix, time_ns, context)
         counter = (self._reset_counter + self._jump.pending) % 256
-        estimate = Estimate(
+        estimate = EncodedEstimate(
             position,
             attitude,
             fix.attitude_sigma_rad,
@@ -254,7 +254,7 @@ class Injector:
             protection_m=grown_protection(fix, position),
         )
         outcome = self._maker.make(estimate, now_ns, context)
-        if isinstance(outcome, Injection):
+        if isinstance(outcome, EncodedMessage):
             self._reset_counter = counter
             self._jump.told()
             self._sent_fix_ns = fix.time_ns

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mavlink_bridge.config import Mode
-from mavlink_bridge.injection.gate_memory import NoGoMemory
+from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore, gnss_healthy
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 
 _PERIOD_NS = 1_000_000_000
 _WITHOUT_GNSS_NS = 2_000_000_000  # GPS_RAW_INT comes five times a second
@@ -33,8 +33,8 @@ class ShadowInterlock:
         force: bool,
         score: Callable[[int], ShadowScore],
         compared_ns: Callable[[], int],
-        teller: Teller,
-        memory: NoGoMemory | None = None,
+        teller: StatusNotifier,
+        memory: ShadowFailureMemory | None = None,
     ) -> None:
         self._force, self._memory = force, memory
         self._score = score
@@ -55,10 +55,10 @@ class ShadowInterlock:
             self._against = self._reason = against
             self._teller.warn("no go, as before the restart")
 
-    def end(self, *, in_order: bool = True) -> None:
+    def end(self, *, clean_shutdown: bool = True) -> None:
         """The end; of an orderly one nothing is remembered."""
         if self._memory is not None:
-            self._memory.stop(in_order=in_order)
+            self._memory.stop(clean_shutdown=clean_shutdown)
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
         """What may be done of what is wanted. by_pilot: the gate of mode ``rc`` is a person's word:

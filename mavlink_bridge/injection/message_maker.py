@@ -11,7 +11,7 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.encode import (
     Angles,
-    Estimate,
+    EncodedEstimate,
     global_position_sensor,
     gps_input,
     odometry,
@@ -26,7 +26,7 @@ _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 
 @dataclass(frozen=True)
-class Withheld:
+class HeldOutput:
     """Why nothing is sent although it is time. counter: the name it is counted under."""
 
     reason: str
@@ -34,11 +34,11 @@ class Withheld:
 
 
 @dataclass(frozen=True)
-class Injection:
+class EncodedMessage:
     """One message to send, and the estimate it was made from."""
 
     message: Any
-    estimate: Estimate
+    estimate: EncodedEstimate
 
 
 @dataclass(frozen=True)
@@ -76,17 +76,19 @@ class MessageMaker:
         self._geoid_m = geoid_separation_m
         self._utc = utc
 
-    def make(self, e: Estimate, now_ns: int, context: InjectionContext) -> Injection | Withheld:
+    def make(
+        self, e: EncodedEstimate, now_ns: int, context: InjectionContext
+    ) -> EncodedMessage | HeldOutput:
         """The configured message of an estimate."""
         kind: InjectionMessage = self._config.message
         altitude = e.position.height_m - self._geoid_m
         if kind == "gps_input":
             week_ms = self._utc.gps_week_ms(e.position.time_ns)
-            return Injection(gps_input(e, altitude, week_ms, self._config), e)
+            return EncodedMessage(gps_input(e, altitude, week_ms, self._config), e)
         if kind == "global_position_sensor":
-            return Injection(global_position_sensor(e, altitude, now_ns), e)
+            return EncodedMessage(global_position_sensor(e, altitude, now_ns), e)
         if context.origin is None:
-            return Withheld("the EKF has no origin", "withheld_no_origin")
+            return HeldOutput("the EKF has no origin", "withheld_no_origin")
         ned = ned_from_origin(
             context.origin,
             e.position.latitude_deg,
@@ -96,7 +98,7 @@ class MessageMaker:
         )
         if math.hypot(*ned) > _FARTHEST_M:
             reason = f"the EKF origin is {math.hypot(*ned) * 1e-3:.0f} km away"
-            return Withheld(reason, "withheld_far_origin")
+            return HeldOutput(reason, "withheld_far_origin")
         formula = context.profile.covariance
         if self._config.covariance != "profile":
             formula = self._config.covariance
@@ -104,22 +106,22 @@ class MessageMaker:
             return self._odometry(e, ned, formula, context)
         if not self._config.send_attitude:
             e = replace(e, attitude=(None, None, None))
-        return Injection(vision_position_estimate(e, ned, formula), e)
+        return EncodedMessage(vision_position_estimate(e, ned, formula), e)
 
     def _odometry(
         self,
-        e: Estimate,
+        e: EncodedEstimate,
         ned: tuple[float, float, float],
         formula: CovarianceFormula,
         context: InjectionContext,
-    ) -> Injection | Withheld:
+    ) -> EncodedMessage | HeldOutput:
         """Velocity is rotated by the message's quaternion, so there must be one."""
         attitude = _all_known(e.attitude)
         if attitude is None:
             now = context.attitude_at(e.position.time_ns)
             if now is None:
-                return Withheld("no attitude for ODOMETRY", "withheld_no_attitude")
+                return HeldOutput("no attitude for ODOMETRY", "withheld_no_attitude")
             attitude = (now.roll_rad, now.pitch_rad, now.yaw_rad)
             e = replace(e, attitude=attitude)
         frame = context.profile.odometry_frame
-        return Injection(odometry(e, attitude, ned, formula, frame), e)
+        return EncodedMessage(odometry(e, attitude, ned, formula, frame), e)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter, deque
 
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
-from mavlink_bridge.injection.encode import Estimate
+from mavlink_bridge.injection.encode import EncodedEstimate
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScorer, gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin import north_east, offset
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 
@@ -28,11 +28,11 @@ class InjectionOutcome:
     """
 
     def __init__(
-        self, shared: Shared, origin: OriginExchange, teller: Teller, counters: Counter[str]
+        self, shared: Shared, origin: OriginExchange, teller: StatusNotifier, counters: Counter[str]
     ) -> None:
         self.shadow = ShadowScorer(shared.geoid_separation_m)
         self.verdict: LoopVerdict | None = None
-        self.doubt = ""
+        self.suppress_ekf_ok = ""
         self.compared_ns = 0
         self._loop = ClosedLoopCheck(shared.config.injection.message)
         self._tracker = shared.tracker
@@ -41,12 +41,12 @@ class InjectionOutcome:
         self._counters = counters
         self._to_compare: deque[PropagatedFix] = deque(maxlen=_QUEUE)
 
-    def made(self, estimate: Estimate) -> None:
+    def made(self, estimate: EncodedEstimate) -> None:
         """An estimate is due, whether it is sent or not."""
         if estimate.fresh:
             self._to_compare.append(estimate.position)
 
-    def sent(self, estimate: Estimate, now_ns: int) -> None:
+    def sent(self, estimate: EncodedEstimate, now_ns: int) -> None:
         """An estimate went to the flight controller."""
         origin, position = self._origin.origin, estimate.position
         if origin is None:
@@ -82,7 +82,7 @@ class InjectionOutcome:
     def judge(self, state: VehicleState, now_ns: int) -> bool:
         """Whether the EKF follows, told; True when a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
-        if self.verdict is not None and (self.verdict.reason or not self.doubt):
+        if self.verdict is not None and (self.verdict.reason or not self.suppress_ekf_ok):
             self._teller.tell_settled("loop", self.verdict.reason, "the EKF follows", now_ns)
         if not self._loop.jump_missed():
             return False

@@ -21,7 +21,7 @@ from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import north_east
 
@@ -242,7 +242,7 @@ class SourceOrders:
         self,
         config: SourceSwitchConfig,
         commander: Commander,
-        teller: Teller,
+        teller: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self._switch = SourceSwitch(config)

@@ -106,7 +106,7 @@ class _Sync:
         return abs(apart) <= trips + _DRIFT * rate * abs(elapsed) + 2.0 * _STAMP_GRAIN_NS
 
 
-class _Run:
+class _StampRun:
     """Stamps in a row, each after the one before, of a time that is not the one that is known."""
 
     def __init__(self) -> None:
@@ -157,7 +157,7 @@ class BootClock:
         self._anchor: tuple[int, int] | None = None
         self._newest_boot_ns = self._newest_at_ns = 0
         self._in_time_ns = 0  # when the last stamp came that was
-        self._behind, self._ahead = _Run(), _Run()
+        self._behind, self._ahead = _StampRun(), _StampRun()
 
     @property
     def offset_ns(self) -> int | None:

@@ -140,10 +140,10 @@ class Link:
         return transport.port if isinstance(transport, UdpTransport) else None
 
     @property
-    def turn_ns(self) -> int:
+    def last_tick_ns(self) -> int:
         """When the owner thread began its newest turn, CLOCK_MONOTONIC; now while it opens."""
-        turn_ns = self._turn_ns
-        return monotonic_ns() if turn_ns is None else turn_ns
+        last_tick_ns = self._turn_ns
+        return monotonic_ns() if last_tick_ns is None else last_tick_ns
 
     @property
     def congested(self) -> bool:

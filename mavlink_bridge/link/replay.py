@@ -12,7 +12,7 @@ import logging
 import threading
 from pathlib import Path
 
-from mavlink_bridge.whole_file import read_whole, replace_whole
+from mavlink_bridge.atomic_file import read_small_file, replace_file
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class ReplayWindow:
         with self._lock:
             document = {":".join(map(str, key)): stamp for key, stamp in self._leases.items()}
         try:
-            replace_whole(self._path, json.dumps(document), durable=True)
+            replace_file(self._path, json.dumps(document), durable=True)
         except OSError as error:
             if not self._failed:
                 _log.warning(
@@ -89,7 +89,7 @@ class ReplayWindow:
 
     def _read(self) -> dict[Stream, int]:
         try:
-            document = json.loads(read_whole(self._path, _MAX_SIZE))
+            document = json.loads(read_small_file(self._path, _MAX_SIZE))
             return {_stream(key): _stamp(stamp) for key, stamp in document.items()}
         except FileNotFoundError:
             return {}

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.errors import RecordError
+from mavlink_bridge.errors import TlogError
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def _append_to(path: Path) -> RecordFile:
 class TlogRecorder:
     """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
-    Raises `RecordError` when the file cannot be opened, unless the disk is full or failing. What
+    Raises `TlogError` when the file cannot be opened, unless the disk is full or failing. What
     the disk does not take is dropped and counted, and on_failure (called once, in the recorder's
     thread) is told why. open_file: raises OSError as `Path.open` does.
     """
@@ -80,7 +80,7 @@ class TlogRecorder:
         except OSError as error:
             self._refusal = error.strerror or str(error)
             if not is_disk_fault(error):
-                raise RecordError(
+                raise TlogError(
                     f"bridge.tlog {path}: cannot be written ({error.strerror}); choose another "
                     "file or leave tlog empty"
                 ) from error
@@ -164,17 +164,17 @@ class TlogRecorder:
 def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
     """(UTC in ns, message) of every frame of a .tlog, in its order; damaged frames are left out.
 
-    Raises `RecordError` where the file cannot be read or holds something else.
+    Raises `TlogError` where the file cannot be read or holds something else.
     """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):  # a record names it: a pipe or a device has no end
-            raise RecordError(f"{path}: is not a plain file")
+            raise TlogError(f"{path}: is not a plain file")
         if status.st_size > _MAX_BYTES:
-            raise RecordError(f"{path}: is larger than the {_MAX_BYTES >> 30} GiB of a .tlog")
+            raise TlogError(f"{path}: is larger than the {_MAX_BYTES >> 30} GiB of a .tlog")
         data = path.read_bytes()
     except OSError as error:
-        raise RecordError(f"{path}: cannot be read: {error.strerror}") from error
+        raise TlogError(f"{path}: cannot be read: {error.strerror}") from error
     codec = mavlink.MAVLink(None)
     codec.robust_parsing = True
     at = 0
@@ -187,12 +187,12 @@ def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
             if message.get_type() != "BAD_DATA":
                 yield time_us * 1000, message
     if at == 0:
-        raise RecordError(f"{path}: holds no MAVLink frame")
+        raise TlogError(f"{path}: holds no MAVLink frame")
 
 
 def _frame_size(data: bytes, at: int) -> int:
     if data[at] not in _FRAME_START:
-        raise RecordError(f"tlog: no MAVLink frame at byte {at}; the file is damaged")
+        raise TlogError(f"tlog: no MAVLink frame at byte {at}; the file is damaged")
     overhead, length_at = _FRAME_START[data[at]]
     is_signed = data[at] == 0xFD and at + 2 < len(data) and data[at + 2] & 1
     return overhead + data[at + length_at] + (_SIGNATURE_BYTES if is_signed else 0)

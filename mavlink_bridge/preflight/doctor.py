@@ -19,8 +19,8 @@ from mavlink_bridge.preflight.failsafes import (
 )
 from mavlink_bridge.preflight.parameters import ParameterClient
 from mavlink_bridge.preflight.rules import (
+    ParameterRule,
     Read,
-    Rule,
     ardupilot_rules,
     arming_rules,
     find_source_set,
@@ -38,7 +38,7 @@ _PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorFinding:
     """One line of the table. fix: the value to write, None where writing cannot help."""
 
     name: str
@@ -57,7 +57,7 @@ class Diagnosis:
     of itself meanwhile, None where it was not asked.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[DoctorFinding, ...]
     state: VehicleState | None = None
 
     @property
@@ -73,7 +73,7 @@ class Diagnosis:
         return 0 if all(f.ok for f in self.findings) else 1
 
     @property
-    def fixable(self) -> tuple[Finding, ...]:
+    def fixable(self) -> tuple[DoctorFinding, ...]:
         """The lines that writing a parameter puts right."""
         return tuple(f for f in self.findings if not f.ok and f.fix is not None)
 
@@ -81,7 +81,7 @@ class Diagnosis:
 # --- examinations -----------------------------------------------------------------------------
 
 
-def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
+def check_parameters(rules: Iterable[ParameterRule], read: Read) -> list[DoctorFinding]:
     """Compare each rule with what the flight controller says."""
     findings = []
     for rule in rules:
@@ -91,22 +91,24 @@ def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
             if value is not None:
                 break
         if value is None:
-            finding = Finding(rule.names[0], "missing", rule.needed, rule.why, False, rule.required)
+            finding = DoctorFinding(
+                rule.names[0], "missing", rule.needed, rule.why, False, rule.required
+            )
         else:
             ok = rule.holds(value)
             fix = None if ok else rule.fix(value)
-            finding = Finding(
+            finding = DoctorFinding(
                 name, f"{value:.7g}", rule.needed, rule.why, ok, rule.required, fix, rule.reboot
             )
         findings.append(finding)
     return findings
 
 
-def check_failsafes(config: BridgeConfig, read: Read, *, px4: bool = False) -> list[Finding]:
+def check_failsafes(config: BridgeConfig, read: Read, *, px4: bool = False) -> list[DoctorFinding]:
     """What the autopilot does once vision ends: advice, which is never written."""
     lines = px4_failsafes(config, read) if px4 else failsafes(config, read)
     return [
-        Finding(line.name, line.found, line.needed, line.why, line.ok, required=False)
+        DoctorFinding(line.name, line.found, line.needed, line.why, line.ok, required=False)
         for line in lines
     ]
 
@@ -126,7 +128,7 @@ class _Measurement:
         return float(self.after.get(key) or 0) - float(self.before.get(key) or 0)
 
 
-def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
+def check_link(config: BridgeConfig) -> tuple[list[DoctorFinding], VehicleState]:
     """Connect in shadow mode for a few seconds and measure identity, clock and streams."""
     quiet = config.model_copy(update={"mode": "shadow", "tlog": None})
     with Bridge(quiet, 0.0) as bridge:
@@ -138,12 +140,14 @@ def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
     return findings, measured.state
 
 
-def _no_connection(config: BridgeConfig, counters: Figures) -> Finding:
+def _no_connection(config: BridgeConfig, counters: Figures) -> DoctorFinding:
     found, why = "silence", "wiring, port, SERIALn_PROTOCOL=2, signing key"
     if counters["fc_open_failures"] and not counters["fc_opened"]:
         found = "cannot be opened"
         why = "nothing there, no permission, or in use: is the companion running?"
-    return Finding("connection", found, f"heartbeats at {config.connection}", why, False, True)
+    return DoctorFinding(
+        "connection", found, f"heartbeats at {config.connection}", why, False, True
+    )
 
 
 def _measure(bridge: Bridge, gimbal: bool) -> _Measurement:
@@ -159,15 +163,15 @@ def _measure(bridge: Bridge, gimbal: bool) -> _Measurement:
     return _Measurement(bridge.state(), before, after, seconds, angles())
 
 
-def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
+def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[DoctorFinding]:
     """Who is there, and whether it takes what is to be injected."""
     state, message = measured.state, config.injection.message
     profile = select_profile(state.autopilot, state.version)
     version = "unknown" if state.version is None else ".".join(map(str, state.version))
     several = bool(measured.after.get("bridge_other_autopilots"))
     findings = [
-        Finding("connection", f"system {state.system_id}", "heartbeats", "", True, True),
-        Finding(
+        DoctorFinding("connection", f"system {state.system_id}", "heartbeats", "", True, True),
+        DoctorFinding(
             "vehicles",
             "several" if several else "one",
             "one, or bridge.system_id",
@@ -175,7 +179,7 @@ def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Find
             not several,
             True,
         ),
-        Finding(
+        DoctorFinding(
             "firmware",
             f"{state.autopilot} {version}",
             "a known profile",
@@ -183,7 +187,7 @@ def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Find
             profile.known,
             False,
         ),
-        Finding(
+        DoctorFinding(
             "injection",
             message,
             " or ".join(profile.messages),
@@ -191,7 +195,7 @@ def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Find
             message in profile.messages,
             True,
         ),
-        Finding(
+        DoctorFinding(
             "EKF origin",
             "read" if state.origin else ("configured" if config.origin else "none"),
             "read or configured",
@@ -204,11 +208,11 @@ def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Find
         rate = config.injection.rate_hz
         why = "external vision is not fused at lower rates; set bridge.injection.rate_hz"
         enough = rate >= _PX4_RATE_HZ
-        findings.append(Finding("rate_hz", f"{rate:g}", ">= 30 for PX4", why, enough, False))
+        findings.append(DoctorFinding("rate_hz", f"{rate:g}", ">= 30 for PX4", why, enough, False))
     return findings
 
 
-def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
+def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[DoctorFinding]:
     """Whether what localization needs comes often enough, in time and whole."""
     source = measured.state.clock_source
     round_trip = float(measured.after["clock_round_trip_ms"] or 0)
@@ -217,7 +221,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Findi
     received = measured.grown("fc_messages") + measured.grown("fc_skipped_messages")
     lost = measured.grown("fc_lost") / max(received, 1.0)
     findings = [
-        Finding(
+        DoctorFinding(
             "clock",
             f"{source}, {round_trip:.1f} ms",
             f"timesync within {_ROUND_TRIP_LIMIT_MS:.0f} ms",
@@ -225,7 +229,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Findi
             source == "timesync" and round_trip <= _ROUND_TRIP_LIMIT_MS,
             True,
         ),
-        Finding(
+        DoctorFinding(
             "ATTITUDE",
             f"{attitude:.0f} Hz",
             f">= {wanted:.0f} Hz",
@@ -233,7 +237,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Findi
             attitude >= wanted,
             True,
         ),
-        Finding(
+        DoctorFinding(
             "lost messages",
             f"{100 * lost:.1f} %",
             f"<= {100 * _LOST_SHARE:.0f} %",
@@ -244,7 +248,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Findi
     ]
     if config.camera.mount == "gimbal":
         findings.append(
-            Finding(
+            DoctorFinding(
                 "gimbal",
                 "silent" if measured.gimbal is None else measured.gimbal.source,
                 "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_STATUS",
@@ -256,14 +260,14 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Findi
     return findings
 
 
-def check_computer_clock(config: BridgeConfig) -> list[Finding]:
+def check_computer_clock(config: BridgeConfig) -> list[DoctorFinding]:
     """A computer without a battery clock wakes up in the past; some links care."""
     if config.injection.message != "gps_input" and not (config.signing or config.ground_signing):
         return []
     utc = SteadyUtc()
     year = time.gmtime(utc.utc_ns(monotonic_ns()) * 1e-9).tm_year
     why = "GPS_INPUT and signatures carry the time; set it by NTP or a battery clock"
-    return [Finding("computer clock", str(year), "the present", why, utc.is_set, True)]
+    return [DoctorFinding("computer clock", str(year), "the present", why, utc.is_set, True)]
 
 
 def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -> Diagnosis:
@@ -275,7 +279,7 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
     say("reading the vehicle's parameters")
     with ParameterClient(config) as client:
         if state.autopilot == "px4":
-            rules: Sequence[Rule] = px4_rules(config)
+            rules: Sequence[ParameterRule] = px4_rules(config)
         else:
             source_set = find_source_set(config, client.read)
             rules = [
@@ -289,8 +293,8 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
     return Diagnosis(tuple(findings), state)
 
 
-def repair(config: BridgeConfig, findings: Iterable[Finding]) -> bool:
-    """Write what `Finding.fix` says, in order; True if a reboot is needed for it to count.
+def repair(config: BridgeConfig, findings: Iterable[DoctorFinding]) -> bool:
+    """Write what `DoctorFinding.fix` says, in order; True if a reboot is needed for it to count.
 
     The order matters: VISO_TYPE brings the other VISO parameters into being.
     """

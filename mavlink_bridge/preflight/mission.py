@@ -16,7 +16,7 @@ from mavlink_bridge.errors import MissionError
 from mavlink_bridge.mission.items import FRAMES
 from mavlink_bridge.mission.path import fly
 from mavlink_bridge.preflight.client import VehicleClient
-from mavlink_bridge.vehicle.mission import Waypoint, item_of, place_of
+from mavlink_bridge.vehicle.mission import MissionWaypoint, item_of, place_of
 
 _RETRIES = 5
 _ANSWER_S = 1.0
@@ -28,7 +28,7 @@ _WANTED = (
 )
 
 
-class MissionClient(VehicleClient):
+class MissionDownloader(VehicleClient):
     """Downloads the mission. A context manager."""
 
     def __init__(self, config: BridgeConfig) -> None:
@@ -37,7 +37,7 @@ class MissionClient(VehicleClient):
         self._items: dict[int, Any] = {}
         self._refusal: int | None = None
 
-    def download(self) -> list[Waypoint]:
+    def download(self) -> list[MissionWaypoint]:
         """Home and the places of the mission in the order in which they are flown to; MissionError
         when it is not handed over.
         """
@@ -86,13 +86,13 @@ class MissionClient(VehicleClient):
             self._refusal = message.type
 
 
-def _as_flown(messages: Sequence[Any]) -> list[Waypoint]:
+def _as_flown(messages: Sequence[Any]) -> list[MissionWaypoint]:
     """Of MISSION_ITEM_INT messages, the first of which is home. Places in metres are left out."""
     home = place_of(messages[0]) if messages else None
     items = [item_of(m) for m in messages[1:] if not _is_local(m)]
     place = None if home is None else (home.latitude_deg, home.longitude_deg)
     flown = fly(items, place).path
-    places = [Waypoint(p.item, p.latitude_deg, p.longitude_deg) for p in flown if p.item > 0]
+    places = [MissionWaypoint(p.item, p.latitude_deg, p.longitude_deg) for p in flown if p.item > 0]
     return places if home is None else [home, *places]
 
 
@@ -100,7 +100,7 @@ def _is_local(message: Any) -> bool:
     return message.command <= mavlink.MAV_CMD_NAV_LAST and message.frame not in FRAMES
 
 
-def download_mission(config: BridgeConfig) -> list[Waypoint]:
+def download_mission(config: BridgeConfig) -> list[MissionWaypoint]:
     """The places of the mission that the flight controller at `config.connection` holds."""
-    with MissionClient(config) as client:
+    with MissionDownloader(config) as client:
         return client.download()

@@ -22,7 +22,7 @@ Read = Callable[[str], float | None]
 
 
 @dataclass(frozen=True)
-class Rule:
+class ParameterRule:
     """A parameter's requirement. names: the parameter and its older names, newest first.
 
     allowed: values that are right, the first being the one to write; None with `minimum` or
@@ -77,18 +77,20 @@ def find_source_set(config: BridgeConfig, read: Read) -> int:
     return config.switch.vision_set if receiver else 1
 
 
-def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[Rule]:
+def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[ParameterRule]:
     """What ArduPilot needs for the configured injection in a source set."""
     common = [
-        Rule(("AHRS_EKF_TYPE",), (3.0,), "only EKF3 has external navigation sources"),
-        Rule(("EK3_ENABLE",), (1.0,), "only EKF3 has external navigation sources", reboot=True),
+        ParameterRule(("AHRS_EKF_TYPE",), (3.0,), "only EKF3 has external navigation sources"),
+        ParameterRule(
+            ("EK3_ENABLE",), (1.0,), "only EKF3 has external navigation sources", reboot=True
+        ),
     ]
     if config.injection.message == "gps_input":
         return common + _gps_input_rules(config, source_set)
     return common + _vision_rules(config, source_set)
 
 
-def arming_rules(config: BridgeConfig, source_set: int, read: Read) -> list[Rule]:
+def arming_rules(config: BridgeConfig, source_set: int, read: Read) -> list[ParameterRule]:
     """What lets a vehicle take off on GNSS while VISO_TYPE is set and no vision flows yet.
 
     ArduPilot refuses to arm then ('VisOdom: not healthy'), so in shadow mode always. A vehicle that
@@ -102,41 +104,47 @@ def arming_rules(config: BridgeConfig, source_set: int, read: Read) -> list[Rule
     why = "no vision on the ground: 'VisOdom: not healthy' refuses to arm (bit 18)"
     checks = read("ARMING_CHECK")
     if checks is None:
-        return [Rule(("ARMING_SKIPCHK",), (), why, required, bits=_VISION_CHECK)]
+        return [ParameterRule(("ARMING_SKIPCHK",), (), why, required, bits=_VISION_CHECK)]
     listed = int(checks) if math.isfinite(checks) else _ALL_CHECKS
     done = _EVERY_CHECK if listed & _ALL_CHECKS else listed
-    return [Rule(("ARMING_CHECK",), (float(done & ~_VISION_CHECK),), why, required)]
+    return [ParameterRule(("ARMING_CHECK",), (float(done & ~_VISION_CHECK),), why, required)]
 
 
-def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:
+def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
     prefix = f"EK3_SRC{number}_"
     injection = config.injection
     odometry = injection.message == "odometry"
     velocity = (6.0, 0.0) if odometry else (0.0,)
     why = "the message carries velocity" if odometry else "the message carries no velocity"
     rules = [
-        Rule(("VISO_TYPE",), (1.0,), "MAVLink vision is ignored otherwise", reboot=True),
-        Rule((prefix + "POSXY",), (6.0,), "horizontal position from external navigation"),
-        Rule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
-        Rule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
-        Rule((prefix + "POSZ",), (1.0,), "the barometer is smoother than vision", required=False),
-        Rule((prefix + "YAW",), (1.0,), "a wrong vision yaw is taken unseen", required=False),
-        Rule(
+        ParameterRule(("VISO_TYPE",), (1.0,), "MAVLink vision is ignored otherwise", reboot=True),
+        ParameterRule((prefix + "POSXY",), (6.0,), "horizontal position from external navigation"),
+        ParameterRule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
+        ParameterRule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
+        ParameterRule(
+            (prefix + "POSZ",), (1.0,), "the barometer is smoother than vision", required=False
+        ),
+        ParameterRule(
+            (prefix + "YAW",), (1.0,), "a wrong vision yaw is taken unseen", required=False
+        ),
+        ParameterRule(
             ("VISO_DELAY_MS",),
             (round(injection.delay_ms),),
             "the age at which the bridge sends; 300 ms unsaid cost 2.4 m",
             tolerance=10.0,
             reboot=True,  # the EKF sizes its buffers by it at boot
         ),
-        Rule(("VISO_SCALE",), (1.0,), "positions are metres", tolerance=1e-3),
+        ParameterRule(("VISO_SCALE",), (1.0,), "positions are metres", tolerance=1e-3),
     ]
     rules += [
-        Rule((f"VISO_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False)
+        ParameterRule(
+            (f"VISO_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False
+        )
         for axis in "XYZ"
     ]
     if odometry:
         rules.append(
-            Rule(
+            ParameterRule(
                 ("VISO_VEL_M_NSE",),
                 (),
                 "velocity derived from positions is no better",
@@ -146,11 +154,13 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:
         )
     else:
         rules.append(
-            Rule(("VISO_QUAL_MIN",), (0.0,), "the message has no quality; > 0 rejects all of it")
+            ParameterRule(
+                ("VISO_QUAL_MIN",), (0.0,), "the message has no quality; > 0 rejects all of it"
+            )
         )
     if number == 1:
         rules.append(
-            Rule(
+            ParameterRule(
                 ("GPS1_TYPE", "GPS_TYPE"),
                 (0.0,),
                 "an absent receiver blocks arming ('Bad fix')",
@@ -161,7 +171,7 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:
     return rules
 
 
-def _gps_input_rules(config: BridgeConfig, number: int) -> list[Rule]:
+def _gps_input_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
     injection = config.injection
     gps = injection.gps_id + 1
     prefix = f"EK3_SRC{number}_"
@@ -171,13 +181,13 @@ def _gps_input_rules(config: BridgeConfig, number: int) -> list[Rule]:
     old_delay = "GPS_DELAY_MS" if gps == 1 else f"GPS_DELAY_MS{gps}"
     why = "velocity is sent" if injection.gps_velocity else "no velocity is sent"
     return [
-        Rule((f"GPS{gps}_TYPE", old_type), (14.0,), "the MAVLink receiver", reboot=True),
-        Rule((prefix + "POSXY",), (3.0,), "horizontal position from GPS"),
-        Rule((prefix + "VELXY",), velocity, why),
-        Rule((prefix + "VELZ",), velocity, why),
-        Rule((prefix + "POSZ",), (1.0,), "the barometer is smoother", required=False),
-        Rule((prefix + "YAW",), yaw, "2 with gps_yaw, else the compass"),
-        Rule(
+        ParameterRule((f"GPS{gps}_TYPE", old_type), (14.0,), "the MAVLink receiver", reboot=True),
+        ParameterRule((prefix + "POSXY",), (3.0,), "horizontal position from GPS"),
+        ParameterRule((prefix + "VELXY",), velocity, why),
+        ParameterRule((prefix + "VELZ",), velocity, why),
+        ParameterRule((prefix + "POSZ",), (1.0,), "the barometer is smoother", required=False),
+        ParameterRule((prefix + "YAW",), yaw, "2 with gps_yaw, else the compass"),
+        ParameterRule(
             (f"GPS{gps}_DELAY_MS", old_delay),
             (round(injection.delay_ms),),
             "the age at which the bridge sends",
@@ -188,15 +198,15 @@ def _gps_input_rules(config: BridgeConfig, number: int) -> list[Rule]:
     ]
 
 
-def _horizon_rules(delay_ms: float) -> list[Rule]:
+def _horizon_rules(delay_ms: float) -> list[ParameterRule]:
     """EKF3 sizes its buffer of measurements when it starts, by the delay of the first receiver and
     of vision. Older positions of another receiver are fused late, by the difference: 1 m behind
     at 8 m/s and 220 ms. Vision's delay makes room, although no vision message is sent.
     """
     why = "room in the EKF's buffer for a second receiver; or let GPS_INPUT be the first, gps_id 0"
     return [
-        Rule(("VISO_TYPE",), (1.0,), why, required=False, reboot=True),
-        Rule(
+        ParameterRule(("VISO_TYPE",), (1.0,), why, required=False, reboot=True),
+        ParameterRule(
             ("VISO_DELAY_MS",),
             (),
             why,
@@ -207,10 +217,10 @@ def _horizon_rules(delay_ms: float) -> list[Rule]:
     ]
 
 
-def px4_rules(config: BridgeConfig) -> list[Rule]:
+def px4_rules(config: BridgeConfig) -> list[ParameterRule]:
     """What PX4 needs; from its documentation and parameter definitions, not flown here."""
     injection = config.injection
-    horizon = Rule(
+    horizon = ParameterRule(
         ("EKF2_DELAY_MAX",),
         (),
         "older measurements are not fused; 50 ms for late ones",
@@ -220,21 +230,27 @@ def px4_rules(config: BridgeConfig) -> list[Rule]:
     )
     if injection.message == "global_position_sensor":
         return [
-            Rule(("EKF2_AGP0_CTRL", "EKF2_AGP_CTRL"), (), "bit 0: horizontal position", bits=1),
+            ParameterRule(
+                ("EKF2_AGP0_CTRL", "EKF2_AGP_CTRL"), (), "bit 0: horizontal position", bits=1
+            ),
             horizon,
         ]
     odometry = injection.message == "odometry"
     stamped = "stamps are exposure times, mapped by TIMESYNC: a delay would count twice"
     why = "bit 0: horizontal position, bit 2: velocity"
     rules = [
-        Rule(("EKF2_EV_CTRL",), (), why, bits=0b0101 if odometry else 0b0001),
-        Rule(("EKF2_EV_DELAY",), (0.0,), stamped, tolerance=10.0, reboot=True),
-        Rule(("EKF2_EV_NOISE_MD",), (0.0,), "1 ignores the covariance that is sent", False),
+        ParameterRule(("EKF2_EV_CTRL",), (), why, bits=0b0101 if odometry else 0b0001),
+        ParameterRule(("EKF2_EV_DELAY",), (0.0,), stamped, tolerance=10.0, reboot=True),
+        ParameterRule(
+            ("EKF2_EV_NOISE_MD",), (0.0,), "1 ignores the covariance that is sent", False
+        ),
         horizon,
     ]
     if not odometry:
-        rules.append(Rule(("EKF2_EV_QMIN",), (0.0,), "the message has no quality"))
+        rules.append(ParameterRule(("EKF2_EV_QMIN",), (0.0,), "the message has no quality"))
     return rules + [
-        Rule((f"EKF2_EV_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False)
+        ParameterRule(
+            (f"EKF2_EV_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False
+        )
         for axis in "XYZ"
     ]

@@ -24,7 +24,7 @@ _MOST_OTHERS = 8
 GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
 
 
-class Timed(Protocol):
+class TimedValue(Protocol):
     """What was reported for a time."""
 
     @property
@@ -32,7 +32,7 @@ class Timed(Protocol):
         """On CLOCK_MONOTONIC."""
 
 
-_Sample = TypeVar("_Sample", bound=Timed)
+_Sample = TypeVar("_Sample", bound=TimedValue)
 
 
 @dataclass(frozen=True)

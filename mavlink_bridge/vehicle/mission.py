@@ -26,7 +26,7 @@ _TRIES = 5
 
 
 @dataclass(frozen=True)
-class Waypoint:
+class MissionWaypoint:
     """A place that the mission flies to. number: of the item; 0 is home in ArduPilot."""
 
     number: int
@@ -34,7 +34,7 @@ class Waypoint:
     longitude_deg: float
 
 
-def place_of(item: Any) -> Waypoint | None:
+def place_of(item: Any) -> MissionWaypoint | None:
     """Where a MISSION_ITEM_INT is flown to; None for other commands, and where 0, 0 or the unset
     value mean the place where the vehicle is. MissionError for what is no place on Earth.
     """
@@ -46,7 +46,7 @@ def place_of(item: Any) -> Waypoint | None:
             f"item {item.seq} of the mission lies at {item.x * 1e-7:g}, {item.y * 1e-7:g} degrees, "
             "which is no place on Earth; load the mission into the vehicle again"
         )
-    return Waypoint(item.seq, item.x * 1e-7, item.y * 1e-7)
+    return MissionWaypoint(item.seq, item.x * 1e-7, item.y * 1e-7)
 
 
 def item_of(message: Any) -> MissionItem:
@@ -72,11 +72,11 @@ class MissionWatch:
     def __init__(self, component: int) -> None:
         self._component = component
         self.wanted = False
-        self.waypoints: tuple[Waypoint, ...] = ()
+        self.waypoints: tuple[MissionWaypoint, ...] = ()
         self._known: int | None = None  # items
         self._flown_as: tuple[bool, int] | None = None
         self._reading: int | None = None  # items
-        self._places: list[Waypoint] = []
+        self._places: list[MissionWaypoint] = []
         self._item: int | None = None  # asked for; None: the number of items is
         self._tries = 0
         self._due_ns = 0

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Origin, without_figures
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import OriginKeeper
 from mavlink_bridge.vehicle.tracker import VehicleTracker
@@ -26,7 +26,7 @@ class OriginExchange:
         config: BridgeConfig,
         tracker: VehicleTracker,
         commander: Commander,
-        teller: Teller,
+        teller: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self._keeper = OriginKeeper(config.origin)

@@ -56,7 +56,7 @@ class VehicleWatch:
             self._first()
 
 
-class TwinWatch:
+class DuplicateSystemIdMonitor:
     """Notices two vehicles of the same ids on one link: boot time runs back again and again."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _PERIOD_NS = 1_000_000_000
@@ -24,7 +24,7 @@ class TimeSync:
     That answers have stopped is told.
     """
 
-    def __init__(self, tracker: VehicleTracker, component: int, teller: Teller) -> None:
+    def __init__(self, tracker: VehicleTracker, component: int, teller: StatusNotifier) -> None:
         self._tracker = tracker
         self._teller = teller
         self._component = component

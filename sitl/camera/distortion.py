@@ -21,7 +21,7 @@ _ROLLING_MARGIN_PX = 8.0  # rows that are exposed before and after look past the
 
 
 @dataclass(frozen=True)
-class Lens:
+class RenderedLens:
     """A distorted `camera` and the `pinhole` to render for it; they share the optical centre.
 
     rays: (H, W, 2) float32, x / z and y / z of every pixel. maps: look-up for ``cv2.remap`` from
@@ -34,7 +34,7 @@ class Lens:
     maps: tuple[NDArray[np.int16], NDArray[np.uint16]]
 
     @classmethod
-    def of(cls, camera: Camera, supersample: float = 1.0, is_rolling: bool = False) -> Lens:
+    def of(cls, camera: Camera, supersample: float = 1.0, is_rolling: bool = False) -> RenderedLens:
         """Chooses the smallest pinhole of the camera's scale, times `supersample`, that covers all
         its rays, with a margin where the shutter rolls.
         """

@@ -32,7 +32,7 @@ from localizer.types import Image
 from sitl.camera.detector import Detector, DetectorErrors, DetectorView, Observed
 from sitl.camera.faults import FaultyLens, PictureFault
 from sitl.camera.movers import Mover
-from sitl.camera.realism import CameraRealism, Stamps
+from sitl.camera.realism import CameraClock, CameraRealism
 from sitl.camera.stream import LossyLink, VideoSender
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera
@@ -253,7 +253,7 @@ class _Studio:
             c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate, misp=c.misp,
             link=self._link,
         )  # fmt: skip
-        self._stamps = Stamps(c.realism, c.seed)
+        self._stamps = CameraClock(c.realism, c.seed)
         self._detector = (
             Detector(c.detections, c.camera, c.targets, c.detector_errors, c.seed)
             if c.detections

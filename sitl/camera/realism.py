@@ -63,7 +63,7 @@ class ShakenTrack:
         return None if pose is None else self._vibration.shaken(pose, time_ns)
 
 
-class Stamps:
+class CameraClock:
     """The time stamps that a camera writes."""
 
     def __init__(self, realism: CameraRealism, seed: int) -> None:

@@ -21,7 +21,7 @@ from localizer.geometry.trajectory import StampedPose, tum_line
 from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.types import Float32, Image, RenderedView
-from sitl.camera.distortion import Lens, row_motion
+from sitl.camera.distortion import RenderedLens, row_motion
 from sitl.camera.imaging import Sensor
 from sitl.camera.movers import Mover
 from sitl.camera.realism import CameraRealism, ShakenTrack, Vibration
@@ -93,7 +93,7 @@ class WorldCamera:
         self.camera = camera
         self._renderer = renderer
         real = options.realism
-        self._lens = Lens.of(camera, real.supersample, real.readout_ms > 0)
+        self._lens = RenderedLens.of(camera, real.supersample, real.readout_ms > 0)
         self._sensor = Sensor(appearance, options.seed, real.auto_exposure)
         self._vibration = Vibration(real.vibration_deg, options.seed)
         self._row_ns = real.readout_ms * 1e6 / camera.height

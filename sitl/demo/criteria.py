@@ -33,7 +33,7 @@ class Criterion:
 
 
 @dataclass(frozen=True)
-class Judged:
+class FlightFigures:
     """What is judged of a flight. ekf_m: horizontal, in the map's frame; fixed_m: 3-D errors of
     targets that stand; inside: per cent of fixes within their own 95 % bound.
     """
@@ -44,7 +44,7 @@ class Judged:
     inside: float | None
 
 
-def judge(flight: Judged) -> tuple[Criterion, ...]:
+def judge(flight: FlightFigures) -> tuple[Criterion, ...]:
     """The targets of a flight."""
     m = flight.localizer
     return (
@@ -58,7 +58,7 @@ def judge(flight: Judged) -> tuple[Criterion, ...]:
     )
 
 
-def headline(flight: Judged, home_error_m: float, denied_s: float) -> str:
+def headline(flight: FlightFigures, home_error_m: float, denied_s: float) -> str:
     """What was won, in one line: before anything that was missed."""
     m, p95 = flight.localizer, flight.ekf_m.p95
     median = m.median_translation_m
@@ -71,7 +71,7 @@ def headline(flight: Judged, home_error_m: float, denied_s: float) -> str:
 
 
 @dataclass(frozen=True)
-class Pace:
+class ComputingRates:
     """How fast a flight was computed. sent_hz, wanted_hz: the world camera's pictures a second;
     taken: share of them that the localizer took; latency_ms: p95 from exposure to estimate.
     """

@@ -53,7 +53,7 @@ from sitl.vehicles.launch import (
 
 
 @dataclass(frozen=True)
-class FlightRecord:
+class DemoRecord:
     """What a flight left behind. denied_ns: from GNSS off to the end of the mission. errors: what
     was drawn; gimbal_alignment_deg: roll, pitch, yaw that the gimbal does not report. broken: why
     the flight was not flown to its end, None where it was; denied_ns then ends where it broke off,
@@ -95,7 +95,7 @@ def fly(
     folder: Path,
     onlookers: Onlookers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
-) -> FlightRecord:
+) -> DemoRecord:
     """Fly the scenario; `folder` receives every record. program: the companion that flies.
 
     A flight that breaks off leaves its record, too: what was flown until then tells why.
@@ -148,7 +148,7 @@ def fly(
         write_vehicle_csv(folder / "vehicle.csv", pilot, cache)
     if camera.statistics is None:
         raise FlightError("the world camera left no statistics")
-    return FlightRecord(
+    return DemoRecord(
         folder,
         vehicle.kind,
         denied_ns,

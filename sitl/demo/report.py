@@ -47,8 +47,15 @@ from sitl.demo.analysis import (
     stage_latencies,
     target_errors,
 )
-from sitl.demo.criteria import Criterion, Judged, Pace, headline, judge, latency_warning
-from sitl.demo.flight import FlightRecord
+from sitl.demo.criteria import (
+    ComputingRates,
+    Criterion,
+    FlightFigures,
+    headline,
+    judge,
+    latency_warning,
+)
+from sitl.demo.flight import DemoRecord
 from sitl.demo.scenario import Scenario
 
 _OVERLAYS = 4
@@ -122,7 +129,7 @@ class _Tables:
         )
 
 
-def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightReport:
+def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightReport:
     """Measure the records and write report.json, frames, plots and overlays into their folder."""
     folder, span = record.folder, record.denied_ns
     tables = _Tables.read(folder)
@@ -143,7 +150,7 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     summary = localization_summary(errors)
     fixed_targets = Spread.of(np.concatenate([*fixed, np.empty(0)]))
     inside = inside_bounds(truth, estimates, span)
-    judged = Judged(summary, Spread.of(horizontal), fixed_targets, inside)
+    judged = FlightFigures(summary, Spread.of(horizontal), fixed_targets, inside)
     denied_s = (span[1] - span[0]) * 1e-9
     stages = stage_latencies(estimates, span) if estimates else {}
     latency = stages.get("latency", Spread(None, None, None))
@@ -186,12 +193,12 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
 
 
 def _pace(
-    record: FlightRecord, scenario: Scenario, errors: FrameErrors, latency: Spread,
+    record: DemoRecord, scenario: Scenario, errors: FrameErrors, latency: Spread,
     config: CompanionConfig,
-) -> Pace:  # fmt: skip
+) -> ComputingRates:  # fmt: skip
     frames = len(errors.time_ns)
     seconds = float(errors.time_ns[-1] - errors.time_ns[0]) * 1e-9 if frames > 1 else 0.0
-    return Pace(
+    return ComputingRates(
         (frames - 1) / seconds if seconds else 0.0,
         scenario.camera.rate_hz,
         float(errors.processed.mean()) if frames else 0.0,
@@ -201,7 +208,7 @@ def _pace(
     )
 
 
-def _target_errors(record: FlightRecord, targets: Columns) -> dict[str, Array]:
+def _target_errors(record: DemoRecord, targets: Columns) -> dict[str, Array]:
     if not len(targets):
         return {t.name: np.empty(0) for t in record.targets}
     times = [int(t) for t in targets["exposure_time_ns"]]
@@ -218,7 +225,7 @@ def _flown(vehicle: Columns, span: tuple[int, int]) -> float:
 def _write_json(
     folder: Path,
     report: FlightReport,
-    record: FlightRecord,
+    record: DemoRecord,
     scenario: Scenario,
     seed: int,
     config: CompanionConfig,
@@ -253,7 +260,7 @@ def _cell(value: float) -> str:
 
 
 def _plot(
-    record: FlightRecord, tables: _Tables, ekf: tuple[Array, Array], config: CompanionConfig
+    record: DemoRecord, tables: _Tables, ekf: tuple[Array, Array], config: CompanionConfig
 ) -> None:
     """ekf: times in ns and horizontal errors."""
     folder, start = record.folder, record.denied_ns[0]

@@ -29,7 +29,7 @@ class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Leg(_Model):
+class ScenarioLeg(_Model):
     """A waypoint: metres east and north of home, height above home, and the gimbal's pitch on the
     way there (-90 looks straight down).
     """
@@ -112,12 +112,12 @@ class CameraSpec(_Model):
 
 
 _LEGS = (
-    Leg(east_m=0, north_m=220, height_m=120, gimbal_pitch_deg=-75),
-    Leg(east_m=220, north_m=260, height_m=140, gimbal_pitch_deg=-60),
-    Leg(east_m=270, north_m=40, height_m=130, gimbal_pitch_deg=-90),
-    Leg(east_m=110, north_m=-170, height_m=110, gimbal_pitch_deg=-55),
-    Leg(east_m=-140, north_m=-90, height_m=120, gimbal_pitch_deg=-70),
-    Leg(east_m=0, north_m=0, height_m=120, gimbal_pitch_deg=-80),
+    ScenarioLeg(east_m=0, north_m=220, height_m=120, gimbal_pitch_deg=-75),
+    ScenarioLeg(east_m=220, north_m=260, height_m=140, gimbal_pitch_deg=-60),
+    ScenarioLeg(east_m=270, north_m=40, height_m=130, gimbal_pitch_deg=-90),
+    ScenarioLeg(east_m=110, north_m=-170, height_m=110, gimbal_pitch_deg=-55),
+    ScenarioLeg(east_m=-140, north_m=-90, height_m=120, gimbal_pitch_deg=-70),
+    ScenarioLeg(east_m=0, north_m=0, height_m=120, gimbal_pitch_deg=-80),
 )
 
 
@@ -129,7 +129,7 @@ class Scenario(_Model):
         20.0, gt=0, le=3600, description="after the take-off height is reached"
     )
     speed_m_s: float = Field(10.0, ge=0.5, le=25)
-    legs: tuple[Leg, ...] = Field(_LEGS, min_length=1)
+    legs: tuple[ScenarioLeg, ...] = Field(_LEGS, min_length=1)
     world: Character = "mixed"
     world_m: float = Field(
         1600.0, ge=400, le=8000, multiple_of=400, description="side of the world"

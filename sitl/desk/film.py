@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import CompanionConfig
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME, Recorder, write_manifest
 from companion.offline.autopilot import RecordedAutopilot
@@ -24,9 +24,9 @@ from localizer.synth.appearance.model import Appearance
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.types import Frame, PoseEstimate
 from sitl.camera.movers import Mover
-from sitl.camera.realism import CameraRealism, Stamps
+from sitl.camera.realism import CameraClock, CameraRealism
 from sitl.camera.world_camera import CameraOptions, WorldCamera
-from sitl.desk.flight import Flown
+from sitl.desk.flight import DeskFlightRecord
 
 _LATENCY_NS = 120_000_000  # from the exposure to the estimate, as flights have it
 
@@ -51,14 +51,14 @@ class Exposed:
     pose: Pose
 
 
-def exposures(eye: Eye, flown: Flown, cache: TileCache, seed: int) -> Iterator[Exposed]:
+def exposures(eye: Eye, flown: DeskFlightRecord, cache: TileCache, seed: int) -> Iterator[Exposed]:
     """The pictures of a flight in their order. cache: the companion's map, in whose ENU poses are.
 
     Frames carry the deployment's stamps; their camera is the true one's size with no model yet.
     """
     live = TileCache.open(eye.cache)
     streamer = TileStreamer(live)
-    stamps = Stamps(eye.realism, seed)
+    stamps = CameraClock(eye.realism, seed)
     try:
         scene = live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu
         options = CameraOptions(eye.movers, scene, seed=seed, realism=eye.realism)
@@ -96,18 +96,20 @@ def write_record(
     stack = MapStack(config.map, config.localizer)
     recorder = Recorder(config.record, stack.cache.frame) if keep else None
     told = config.camera.model.camera()
-    late_ns = round(1e6 * config.camera.settings.stamps_late_ms)
+    late_ns = round(1e6 * config.camera.settings.time_offset_ms)
     localized = []
     try:
         arm = np.array(config.camera.lever_arm_m)
         geoid_m = stack.cache.manifest.geoid_separation_m
-        pose = AutopilotPose(autopilot, Installation(stack.cache.frame, geoid_m, arm), config.prior)
+        pose = AutopilotPose(
+            autopilot, CameraExtrinsics(stack.cache.frame, geoid_m, arm), config.prior
+        )
         localizer = build_localizer(stack, told, config.localizer, pose.sensors)
         for exposed in pictures:
             time_ns = exposed.frame.exposure_time_ns - late_ns
             frame = replace(exposed.frame, camera=told, exposure_time_ns=time_ns)
             autopilot.advance(frame.exposure_time_ns + _LATENCY_NS)
-            if localizer.tracker.standing.wants_prior:
+            if localizer.tracker.track_status.wants_prior:
                 prior = pose.prior(frame.exposure_time_ns)
                 if prior is not None:
                     localizer.offer(prior)

@@ -20,7 +20,7 @@ from sitl.embedded.control.mode import Mode
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.dynamics import ATTITUDE, RATES, TICK_S
 from sitl.embedded.physics.rotation import euler, wrap_pi
-from sitl.embedded.vehicle import Vehicle
+from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.errors import SimulationError
 from sitl.geodesy import Location
 from sitl.vehicles.launch import GIMBAL, SPEEDS
@@ -42,7 +42,7 @@ class Corner:
 
 
 @dataclass(frozen=True)
-class Aircraft:
+class DeskAircraft:
     """How the aircraft really is. mount, gimbal: of the camera; shift_m: east, north, up that the
     map shows the ground beside its true place; speed_m_s, wind_m_s: of the flight.
     """
@@ -55,7 +55,7 @@ class Aircraft:
 
 
 @dataclass(frozen=True)
-class Flown:
+class DeskFlightRecord:
     """What is left of it. samples: the camera's true poses in the map's ENU, every 20 ms; begin_ns,
     end_ns: of the flight above `low_m`, on the companion's clock. ekf_off_m: mean east, north, up
     of the EKF from the truth meanwhile; ekf_yaw_off_rad: mean of its heading's error.
@@ -77,7 +77,7 @@ class DeskFlight:
     """One flight, stepped. frame, geoid_m: the map's."""
 
     def __init__(
-        self, home: Location, aircraft: Aircraft, recorded: RecordedPort, frame: LocalFrame,
+        self, home: Location, aircraft: DeskAircraft, recorded: RecordedPort, frame: LocalFrame,
         geoid_m: float, seed: int,
     ) -> None:  # fmt: skip
         self._server = RecordingServer(recorded)
@@ -88,7 +88,7 @@ class DeskFlight:
                 "SIM_WIND_TURB": 0.3 * aircraft.wind_m_s, "SIM_WIND_DIR": float(37 * seed % 360),
             }
         )  # fmt: skip
-        self._vehicle = Vehicle(home, 30.0, parameters, self._server, seed)
+        self._vehicle = EmbeddedVehicle(home, 30.0, parameters, self._server, seed)
         bridge = BridgeConfig(connection="udpin:127.0.0.1:0")
         for stream in wanted_streams(bridge, "ardupilotmega"):
             self._server.links[0].set_interval(stream.message_id, 1.0 / stream.rate_hz)
@@ -98,14 +98,16 @@ class DeskFlight:
         self._samples: list[tuple[int, Pose]] = []
         self._off: list[tuple[int, Array]] = []
 
-    def fly(self, corners: tuple[Corner, ...], low_m: float, longest_s: float) -> Flown:
+    def fly(self, corners: tuple[Corner, ...], low_m: float, longest_s: float) -> DeskFlightRecord:
         """Take off, and fly from corner to corner for at most so long."""
         try:
             return self._flown(corners, low_m, longest_s)
         finally:
             self._server.close()
 
-    def _flown(self, corners: tuple[Corner, ...], low_m: float, longest_s: float) -> Flown:
+    def _flown(
+        self, corners: tuple[Corner, ...], low_m: float, longest_s: float
+    ) -> DeskFlightRecord:
         modes, aircraft = self._vehicle.aircraft.modes, self._vehicle.aircraft
         while not aircraft.estimator.position_valid or modes.home is None:
             self._step()
@@ -134,12 +136,12 @@ class DeskFlight:
                     return self._result(begin_ns)
         return self._result(begin_ns)
 
-    def _result(self, begin_ns: int) -> Flown:
+    def _result(self, begin_ns: int) -> DeskFlightRecord:
         end_ns = self._recorded.now_ns
         off = np.array([o for t, o in self._off if begin_ns <= t <= end_ns]).mean(axis=0)
         for _ in range(round(1.0 / TICK_S)):
             self._step()
-        return Flown(tuple(self._samples), begin_ns, end_ns, off[:3], float(off[3]))
+        return DeskFlightRecord(tuple(self._samples), begin_ns, end_ns, off[:3], float(off[3]))
 
     def _step(self) -> None:
         self._recorded.tick()

@@ -11,7 +11,7 @@ from types import FrameType
 from sitl.embedded.errors import VehicleError
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters, read_parameter_file
-from sitl.embedded.vehicle import Vehicle
+from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 
 SERIAL_OFFSETS = (0, 2, 3)  # serial0, serial1, serial2 of ArduPilot SITL, from the base port
@@ -72,7 +72,7 @@ def _run(
 ) -> None:
     """From power on until a reboot is ordered; the parameters live on."""
     try:
-        vehicle = Vehicle(home, heading_deg, parameters, server, seed)
+        vehicle = EmbeddedVehicle(home, heading_deg, parameters, server, seed)
         for number, link in enumerate(server.links):
             port = link.listener.getsockname()[1]
             print(f"SERIAL{number} on TCP port {port}", flush=True)  # as ArduPilot SITL prints
@@ -83,7 +83,7 @@ def _run(
 
 def _compile(home: Location) -> None:
     """Fly a moment without links, so that no client waits for the kernels' first compilation."""
-    vehicle = Vehicle(home, 0.0, Parameters(), MavlinkServer((), 1))
+    vehicle = EmbeddedVehicle(home, 0.0, Parameters(), MavlinkServer((), 1))
     vehicle.aircraft.modes.arm()
     for _ in range(60):
         vehicle.step()

@@ -12,7 +12,7 @@ from sitl.embedded.control.loop import advance
 from sitl.embedded.control.mission import MissionStore
 from sitl.embedded.control.modes import FlightModes
 from sitl.embedded.ekf.estimator import Estimator
-from sitl.embedded.ekf.injection import Injection
+from sitl.embedded.ekf.injection import ExternalNavInput
 from sitl.embedded.ekf.measurements import Baro, Compass, GpsData
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
@@ -58,7 +58,7 @@ class Aircraft:
         self.modes = FlightModes(
             parameters, self.estimator, self.gimbal, self.mission, self.notify, self._reached
         )
-        self.injection = Injection(parameters, self.estimator)
+        self.injection = ExternalNavInput(parameters, self.estimator)
         self.gps_sample: GpsSample | None = None
         self._gps_sample_at = -1e9
         self.barometer_m = 0.0

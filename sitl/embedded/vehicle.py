@@ -17,7 +17,7 @@ from sitl.geodesy import Location
 _MAX_LAG_S = 0.25  # of wall time behind schedule after which the schedule starts anew
 
 
-class Vehicle:
+class EmbeddedVehicle:
     """Has an aircraft stream, answer commands, and keep time."""
 
     def __init__(

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 _CLOCK_WINDOW = 25  # samples over which the least latency is taken
 
 
-class Timed(Protocol):
+class TimedSample(Protocol):
     """What lies at a time on CLOCK_MONOTONIC."""
 
     @property
@@ -31,7 +31,7 @@ class Timed(Protocol):
         """When it was so."""
 
 
-_Sample = TypeVar("_Sample", bound=Timed)
+_Sample = TypeVar("_Sample", bound=TimedSample)
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class LeastLatencyClock:
         return round(boot_ms * self._scale + min(self._offsets, default=0.0))
 
 
-class Track(Generic[_Sample]):
+class SampleTrack(Generic[_Sample]):
     """Samples in time order, safe between one writer and many readers."""
 
     def __init__(self, limit: int) -> None:

@@ -16,7 +16,7 @@ from sitl.ground.tracks import (
     EkfSample,
     GimbalState,
     LeastLatencyClock,
-    Track,
+    SampleTrack,
     Truth,
     between,
     share,
@@ -48,9 +48,9 @@ class VehicleRecord:
         self._attitude_ms: int | None = None
         self.ekf_flags = 0
         self._subscribers: list[Callable[[Truth], None]] = []
-        self._truth: Track[Truth] = Track(_SECONDS_KEPT * 50)
-        self._gimbal: Track[GimbalState] = Track(_SECONDS_KEPT * 50)
-        self._ekf: Track[EkfSample] = Track(_SECONDS_KEPT * 25)
+        self._truth: SampleTrack[Truth] = SampleTrack(_SECONDS_KEPT * 50)
+        self._gimbal: SampleTrack[GimbalState] = SampleTrack(_SECONDS_KEPT * 50)
+        self._ekf: SampleTrack[EkfSample] = SampleTrack(_SECONDS_KEPT * 25)
         self.origin: Location | None = None
         self.latest: dict[str, Any] = {}
         self._text_log = TextLog()

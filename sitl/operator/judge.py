@@ -13,7 +13,7 @@ from companion.targets.detections import clicked_name
 from localizer.geometry.pose import Array
 from sitl.operator.operator import Asked
 from sitl.operator.station import GeoReport, Heard
-from sitl.operator.truth import Pointed, Witness, all_pointed
+from sitl.operator.truth import GroundTruth, Pointed, all_pointed
 
 _CHI2_95, _CHI2_999 = 7.815, 13.816  # of three and of two degrees of freedom
 _OWN_PX = 3.0  # beside what its own bound allows, a report is under its pixel
@@ -53,7 +53,7 @@ class TargetLine:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ClickVerdict:
     """A flight's clicks. unanswered: commands without an answer, or refused; untold: accepted and
     never reported; without a word: of them. link: CAMERA_TRACKING_GEO_STATUS that came; foreign: of
     them at no living target's place; link_velocities: with a velocity of what stands.
@@ -62,7 +62,7 @@ class Verdict:
     clicks: int
     stops: int
     unanswered: int
-    untold: int
+    unreported: int
     silent: int
     link: int
     foreign: int
@@ -76,14 +76,14 @@ class Verdict:
 
 
 def judge(
-    witness: Witness, asked: Sequence[Asked], heard: Heard, targets: Path, failure: str = ""
-) -> Verdict:
+    witness: GroundTruth, asked: Sequence[Asked], heard: Heard, targets: Path, failure: str = ""
+) -> ClickVerdict:
     """Hold the record's targets (``targets.csv``) and what came over the link against the truth."""
     pointed = all_pointed(witness, asked)
     table = read_columns(targets, ("target_id", "visibility"))
     names = np.asarray(table.get("target_id", np.empty(0, str)))
     ends = {n: a.answered_ns for a in asked for n in a.ended}
-    lines, untold = [], []
+    lines, unreported = [], []
     for number, point in pointed.items():
         rows = np.flatnonzero(names == clicked_name(number))
         if len(rows) and point.place is not None:
@@ -91,17 +91,17 @@ def judge(
             lines.append(_line(witness, point, others, {k: v[rows] for k, v in table.items()},
                                ends.get(number, 1 << 62)))  # fmt: skip
         elif not len(rows):
-            untold.append(number)
+            unreported.append(number)
     texts = tuple(text for _, text in heard.texts)
-    silent = [n for n in untold if not any(_is_about(text, n) for text in texts)]
+    silent = [n for n in unreported if not any(_is_about(text, n) for text in texts)]
     clicks = [a for a in asked if a.wish.kind != "stop"]
     foreign, velocities = _link(witness, asked, pointed, heard.geo)
-    verdict = Verdict(
-        len(clicks), len(asked) - len(clicks), sum(a.result != 0 for a in asked), len(untold),
+    verdict = ClickVerdict(
+        len(clicks), len(asked) - len(clicks), sum(a.result != 0 for a in asked), len(unreported),
         len(silent), len(heard.geo), foreign, velocities, len(heard.image), failure, tuple(lines),
         texts, tuple(a.late_s for a in clicks),
     )  # fmt: skip
-    return Verdict(**{**verdict.__dict__, "problems": _problems(verdict)})
+    return ClickVerdict(**{**verdict.__dict__, "problems": _problems(verdict)})
 
 
 def _is_about(text: str, number: int) -> bool:
@@ -109,7 +109,7 @@ def _is_about(text: str, number: int) -> bool:
 
 
 def _line(
-    witness: Witness, point: Pointed, others: Sequence[Array], table: Columns, ends_ns: int
+    witness: GroundTruth, point: Pointed, others: Sequence[Array], table: Columns, ends_ns: int
 ) -> TargetLine:
     place = point.place
     assert place is not None
@@ -142,7 +142,9 @@ def _covariances(table: Columns) -> Array:
     return stacked
 
 
-def _pixel_error(witness: Witness, point: Pointed, place: Array, P: Array) -> tuple[float, bool]:
+def _pixel_error(
+    witness: GroundTruth, point: Pointed, place: Array, P: Array
+) -> tuple[float, bool]:
     """How far a told place is from the pixel in the picture that was pointed into, and whether its
     stated error covers that.
     """
@@ -160,7 +162,7 @@ def _pixel_error(witness: Witness, point: Pointed, place: Array, P: Array) -> tu
 
 
 def _link(
-    witness: Witness,
+    witness: GroundTruth,
     asked: Sequence[Asked],
     pointed: Mapping[int, Pointed],
     reports: Sequence[GeoReport],
@@ -192,7 +194,7 @@ def _alive(asked: Sequence[Asked], time_ns: int) -> tuple[int, ...]:
     return tuple(given)
 
 
-def _problems(verdict: Verdict) -> tuple[str, ...]:
+def _problems(verdict: ClickVerdict) -> tuple[str, ...]:
     """What does not hold, in words."""
     standing = [line for line in verdict.lines if not line.on_mover]
     counts = {

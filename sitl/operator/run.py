@@ -14,9 +14,9 @@ import numpy as np
 
 from sitl.demo.budget import draw_errors
 from sitl.errors import SimulationError
-from sitl.operator.judge import TargetLine, Verdict, judge
+from sitl.operator.judge import ClickVerdict, TargetLine, judge
 from sitl.operator.operator import LATE_S, LATE_SIGMA_S, Operator
-from sitl.operator.truth import Witness
+from sitl.operator.truth import GroundTruth
 from sitl.operator.wishes import draw_wishes
 from sitl.suite.loop.case import LoopCase
 from sitl.suite.loop.flight import fly
@@ -57,7 +57,7 @@ class ClickRow:
 
     vehicle: VehicleKind
     seed: int
-    verdict: Verdict | None = None
+    verdict: ClickVerdict | None = None
     error: str = ""
     pace: float = 1.0
     stall_s: float = 0.0
@@ -90,7 +90,7 @@ def _flown(kind: VehicleKind, seed: int, options: ClickOptions) -> ClickRow:
     try:
         record = fly(case, assets, kind, seed, folder, operator)
         camera = draw_errors(case.scenario, seed).camera
-        witness = Witness(assets.world, camera, folder / "frames.csv")
+        witness = GroundTruth(assets.world, camera, folder / "frames.csv")
         targets = folder / "companion" / "targets.csv"
         verdict = judge(witness, operator.asked, operator.heard, targets, operator.failure)
     except SimulationError as error:
@@ -117,7 +117,7 @@ def summary(rows: Sequence[ClickRow]) -> dict[str, Any]:
         "clicks": sum(v.clicks for v in verdicts),
         "stops": sum(v.stops for v in verdicts),
         "unanswered": sum(v.unanswered for v in verdicts),
-        "untold": sum(v.untold for v in verdicts),
+        "untold": sum(v.unreported for v in verdicts),
         "untold_without_a_word": sum(v.silent for v in verdicts),
         "targets": len(lines),
         "on_movers": sum(line.on_mover for v in verdicts for line in v.lines),

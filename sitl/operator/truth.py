@@ -34,7 +34,7 @@ class Pointed:
     on_mover: bool
 
 
-class Witness:
+class GroundTruth:
     """Knows the true camera, its true way and the world as it is today."""
 
     def __init__(self, assets: FlightAssets, camera: Camera, frames: Path) -> None:
@@ -80,6 +80,6 @@ class Witness:
         return pose.translation + distance * ray if np.isfinite(distance) else None
 
 
-def all_pointed(witness: Witness, asked: Sequence[Asked]) -> dict[int, Pointed]:
+def all_pointed(witness: GroundTruth, asked: Sequence[Asked]) -> dict[int, Pointed]:
     """What every accepted click pointed at, by the number that it was given."""
     return {a.number: witness.pointed(a) for a in asked if a.wish.kind != "stop" and a.result == 0}

@@ -17,7 +17,7 @@ from localizer.map.cache.surface import MapSurface
 from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
-from sitl.demo.scenario import Leg, Scenario, ScenarioError
+from sitl.demo.scenario import Scenario, ScenarioError, ScenarioLeg
 from sitl.rehearsal.mission import read_mission
 
 _PITCH_DEG = -75.0  # where the mission does not say
@@ -126,7 +126,8 @@ def _triangle(cache: TileCache) -> dict[str, object]:
     side = round(_SIDE * float((high - low)[:2].min()) / 2)
     corners = ((0, side), (side, side), (0, 0))
     legs = tuple(
-        Leg(east_m=e, north_m=n, height_m=_HEIGHT_M, gimbal_pitch_deg=-80.0) for e, n in corners
+        ScenarioLeg(east_m=e, north_m=n, height_m=_HEIGHT_M, gimbal_pitch_deg=-80.0)
+        for e, n in corners
     )
     return {"legs": legs, "takeoff_height_m": _HEIGHT_M, "deny_after_s": 5.0, "speed_m_s": 8.0}
 

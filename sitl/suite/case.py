@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from companion.guardian.config import GuardianConfig
+from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge import BridgeConfig
 from sitl.demo.scenario import ScenarioError
@@ -76,7 +76,7 @@ class Flight(_Model):
         return self
 
 
-class Event(_Model):
+class CaseEvent(_Model):
     """Something that happens at_s seconds after the take-off height is reached.
 
     fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
@@ -91,7 +91,7 @@ class Event(_Model):
     reboot: bool = False
 
     @model_validator(mode="after")
-    def _does_something(self) -> Event:
+    def _does_something(self) -> CaseEvent:
         if not (self.fixes or self.vehicle or self.source_set or self.reboot):
             raise ValueError("nothing happens: give fixes, vehicle, source_set or reboot")
         return self
@@ -109,7 +109,7 @@ class Event(_Model):
         return ", ".join(parts)
 
 
-class Ground(_Model):
+class GroundSetup(_Model):
     """What is done before take-off. doctor: wrong parameters are found and mended by
     `companion doctor --fix`; reboot: the autopilot starts anew while it is being injected.
     """
@@ -120,7 +120,7 @@ class Ground(_Model):
 
 class Case(_Model):
     """One scenario. Exactly one of bridge (our bridge's configuration, without the connection) and
-    raw (a bare MAVLink sender) injects. guardian: watches what goes to our bridge.
+    raw (a bare MAVLink sender) injects. monitor: watches what goes to our bridge.
 
     ci: among the few that every test run flies on the embedded vehicle.
     """
@@ -131,11 +131,11 @@ class Case(_Model):
     vehicle: VehicleSpec
     fixes: FixModel = FixModel()
     bridge: dict[str, Any] | None = None
-    guardian: GuardianConfig = GuardianConfig()
+    integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
     raw: RawMessage | None = None
     flight: Flight = Flight()
-    before: Ground = Ground()
-    timeline: tuple[Event, ...] = ()
+    before: GroundSetup = GroundSetup()
+    timeline: tuple[CaseEvent, ...] = ()
     expect: tuple[Annotated[Check, Field(discriminator="check")], ...] = Field(min_length=1)
 
     @property
@@ -145,10 +145,12 @@ class Case(_Model):
 
     @property
     def is_honest(self) -> bool:
-        """Whether the guardian watches, and has nothing to find."""
+        """Whether the monitor watches, and has nothing to find."""
         f = self.fixes
         wrong = f.rotation_deg or f.yaw_error_deg or f.offset_north_m or f.silent or f.frozen
-        watched = self.bridge is not None and self.guardian.enabled and not self.flight.ground
+        watched = (
+            self.bridge is not None and self.integrity_monitor.enabled and not self.flight.ground
+        )
         return watched and not wrong and not self.timeline
 
     @model_validator(mode="after")
@@ -157,7 +159,7 @@ class Case(_Model):
             raise ValueError("give exactly one of `bridge` and `raw`")
         if self.bridge is not None:
             BridgeConfig.model_validate(self.bridge)
-        elif self.before != Ground():
+        elif self.before != GroundSetup():
             raise ValueError("`before` needs the bridge")
         if list(self.timeline) != sorted(self.timeline, key=lambda e: e.at_s):
             raise ValueError("timeline: events must be in the order of at_s")
@@ -169,7 +171,7 @@ class Case(_Model):
         return self
 
     @staticmethod
-    def changed(model: FixModel, event: Event) -> FixModel:
+    def changed(model: FixModel, event: CaseEvent) -> FixModel:
         """The fixes after an event."""
         return FixModel.model_validate({**model.model_dump(), **event.fixes})
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from sitl.suite.record import Record
+from sitl.suite.record import CaseRecord
 
 FOREVER = math.inf
 
@@ -28,7 +28,7 @@ class _Expectation(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @abstractmethod
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """Hold the record against the expectation."""
 
 
@@ -37,7 +37,7 @@ class _Span(_Expectation):
     to_s: float = FOREVER
 
 
-class Reference(_Span):
+class AsAccurateAs(_Span):
     """The median of the horizontal EKF error is the reference's within per cent.
 
     Below the band it counts as reproduced only in the sense of "no worse", and is marked.
@@ -49,7 +49,7 @@ class Reference(_Span):
     max: float | None = None
     within_percent: float = Field(25.0, gt=0)
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if len(errors) < 100:
@@ -66,7 +66,7 @@ class MedianBelow(_Span):
     check: Literal["median_below"]
     metres: float
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
@@ -82,7 +82,7 @@ class MaxError(_Span):
     at_least: float = 0.0
     at_most: float = FOREVER
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
@@ -104,7 +104,7 @@ class Jumps(_Expectation):
     tolerance_m: float = 1.0
     overshoot_m: float = 2.0
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         begin = self.at_s + self.settled_s
         there = record.north(begin, begin + 2.0)
@@ -129,7 +129,7 @@ class Lags(_Expectation):
     after_s: float
     before_s: float
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         taken = [
             t - self.at_s
@@ -153,7 +153,7 @@ class Says(_Span):
     sender: Literal["vehicle", "bridge"] = "vehicle"
     absent: bool = False
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         times = [
             t.at_s
@@ -175,7 +175,7 @@ class Alerted(_Span):
     within_s: float = Field(ge=0)
     contains: str
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         beyond = [
             t
@@ -202,7 +202,7 @@ class Silent(_Span):
     check: Literal["no_warning"]
     words: tuple[str, ...] = ("EKF variance", "Failsafe", "rror", "ailed", "litch", "nhealthy")
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         heard = [
             t.text
@@ -221,7 +221,7 @@ class InMode(_Expectation):
     mode: str
     at_s: float | None = None
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         sample = record.at(FOREVER if self.at_s is None else self.at_s)
         mode = sample.mode if sample else "none"
@@ -229,13 +229,13 @@ class InMode(_Expectation):
         return CheckResult(mode == self.mode, f"{mode} {when}")
 
 
-class Moved(_Span):
+class MovedAtMost(_Span):
     """The vehicle truly moved at most this far from where it was at from_s."""
 
     check: Literal["moved"]
     at_most: float
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
@@ -256,7 +256,7 @@ class Injected(_Span):
     at_least: int = 0
     at_most: float = FOREVER
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
@@ -279,7 +279,7 @@ class SourceSet(_Expectation):
     from_s: float
     by_s: float
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         reached = [
             s.at_s for s in record.samples if s.at_s >= self.from_s and s.source_set == self.number
@@ -296,7 +296,7 @@ class Refused(_Expectation):
     check: Literal["arming_refused"]
     any_of: tuple[str, ...]
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         if record.refusals is None:
             return CheckResult(False, "arming was accepted")
@@ -310,7 +310,7 @@ class Diagnosed(_Expectation):
     check: Literal["doctor"]
     finds: tuple[str, ...]
 
-    def judge(self, record: Record) -> CheckResult:
+    def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         d = record.doctor
         if d is None:
@@ -323,7 +323,7 @@ class Diagnosed(_Expectation):
 
 
 Check = (
-    Reference
+    AsAccurateAs
     | MedianBelow
     | MaxError
     | Jumps
@@ -332,7 +332,7 @@ Check = (
     | Alerted
     | Silent
     | InMode
-    | Moved
+    | MovedAtMost
     | Injected
     | SourceSet
     | Refused

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from companion.guardian.guardian import Guardian
-from companion.guardian.monitor import Limits
+from companion.integrity_monitor.checks import IntegrityLimits
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
-from sitl.suite.case import Case, Event
+from sitl.suite.case import Case, CaseEvent
 from sitl.suite.doctor import consult
-from sitl.suite.record import Record, Sample, Text
+from sitl.suite.record import CaseRecord, Text, VehicleSample
 from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink, TruthFeed
 from sitl.vehicles.launch import VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
@@ -37,7 +37,7 @@ _LONGEST_S = 240.0
 _ARMING_TRIES = 3
 
 
-def fly(case: Case, kind: VehicleKind, seed: int = 0) -> Record:
+def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
     """Fly a scenario on a vehicle; SimulationError when it could not be flown at all."""
     with ExitStack() as stack:
         speedup = 1.0 if case.raw is None else _RAW_SPEEDUP
@@ -55,7 +55,7 @@ class _CaseFlight:
 
     def __init__(self, case: Case, vehicle: VehicleProcess, stack: ExitStack, seed: int) -> None:
         self._case, self._vehicle, self._stack, self._seed = case, vehicle, stack, seed
-        self._record = Record()
+        self._record = CaseRecord()
         self._pilots: list[Pilot] = []
         self._pilot = self._connect()
         self._bridge: Bridge | None = None
@@ -67,7 +67,7 @@ class _CaseFlight:
         self._waiting = list(case.timeline)
         self._ticks: list[tuple[float, float]] = []
 
-    def run(self) -> Record:
+    def run(self) -> CaseRecord:
         """Everything from power on to the record."""
         case = self._case
         self._wait_on_ground()
@@ -144,19 +144,19 @@ class _CaseFlight:
         self._stack.callback(self._feed.close)
 
     def _guarded(self, bridge: Bridge, config: BridgeConfig) -> FixSink:
-        """The bridge behind the guardian, as in the companion; there are no pictures here."""
-        if not self._case.guardian.enabled:
+        """The bridge behind the monitor, as in the companion; there are no pictures here."""
+        if not self._case.integrity_monitor.enabled:
             return bridge
         injection = config.injection
-        limits = Limits(
+        limits = IntegrityLimits(
             injection.alert_limit_m,
             injection.time_to_alert_s,
             gnss_is_ours=injection.message == "gps_input",
         )
-        guardian = Guardian(self._case.guardian, limits, bridge)
-        guardian.start()
-        self._stack.callback(guardian.stop)
-        return guardian
+        integrity_monitor = IntegrityMonitor(self._case.integrity_monitor, limits, bridge)
+        integrity_monitor.start()
+        self._stack.callback(integrity_monitor.stop)
+        return integrity_monitor
 
     def _take_off(self) -> None:
         self._pilot.wait_ready()
@@ -188,7 +188,7 @@ class _CaseFlight:
             self._record.events.append((self._now_s, event.label))
             self._do(event)
 
-    def _do(self, event: Event) -> None:
+    def _do(self, event: CaseEvent) -> None:
         if event.fixes:
             self._model = Case.changed(self._model, event)
             self._feed.change(self._model, reset=event.reset)
@@ -215,7 +215,7 @@ class _CaseFlight:
         self._ticks.append((self._now_s, pilot.record.time_s))
         counters = self._bridge.counters() if self._bridge is not None else {}
         self._record.samples.append(
-            Sample(
+            VehicleSample(
                 self._now_s,
                 north,
                 east,

@@ -26,7 +26,7 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Sample:
+class VehicleSample:
     """The flight's state, ten times a second. north, east: true metres from home; vehicle_s: the
     vehicle's own clock since its boot.
     """
@@ -52,7 +52,7 @@ class Doctor:
 
 
 @dataclass
-class Record:
+class CaseRecord:
     """errors: (seconds, north, east) of every EKF position against the truth of its time.
 
     unpaired: as errors, against the newest truth that had arrived, as the reference measured.
@@ -64,7 +64,7 @@ class Record:
 
     errors: list[tuple[float, float, float]] = field(default_factory=list)
     unpaired: list[tuple[float, float, float]] = field(default_factory=list)
-    samples: list[Sample] = field(default_factory=list)
+    samples: list[VehicleSample] = field(default_factory=list)
     texts: list[Text] = field(default_factory=list)
     events: list[tuple[float, str]] = field(default_factory=list)
     refusals: list[str] | None = None
@@ -91,7 +91,7 @@ class Record:
         """North EKF errors (N,) in metres within a span of seconds."""
         return np.array([n for t, n, _ in self.errors if from_s <= t <= to_s])
 
-    def at(self, seconds: float) -> Sample | None:
+    def at(self, seconds: float) -> VehicleSample | None:
         """The first sample at or after a time; the last one where there is none."""
         later = [s for s in self.samples if s.at_s >= seconds]
         return later[0] if later else (self.samples[-1] if self.samples else None)

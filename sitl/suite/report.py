@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sitl.suite.runner import Figures, Row, figures
+from sitl.suite.runner import Figures, ReportRow, figures
 
 _COLOURS = {"pass": "green", "better": "cyan", "FAIL": "red", "ERROR": "red"}
 _GAP_S = 1.0  # in which the EKF reported no position
@@ -32,7 +32,7 @@ _COLUMNS = (
 )
 
 
-def print_row(console: Console, row: Row) -> None:
+def print_row(console: Console, row: ReportRow) -> None:
     """One line as soon as a flight has landed."""
     colour = _COLOURS[row.verdict]
     told = row.error.splitlines()[0] if row.error else "; ".join(_broken(row))
@@ -40,7 +40,7 @@ def print_row(console: Console, row: Row) -> None:
     console.print(f"{line} {escape(told)}", highlight=False)
 
 
-def print_table(console: Console, rows: Sequence[Row]) -> None:
+def print_table(console: Console, rows: Sequence[ReportRow]) -> None:
     """The report as a table."""
     table = Table(*_COLUMNS, title=summary(rows))
     for row in rows:
@@ -50,8 +50,8 @@ def print_table(console: Console, rows: Sequence[Row]) -> None:
     console.print(table)
 
 
-def summary(rows: Iterable[Row]) -> str:
-    """How many of what, and how often the guardian spoke where it had nothing to find."""
+def summary(rows: Iterable[ReportRow]) -> str:
+    """How many of what, and how often the monitor spoke where it had nothing to find."""
     rows = list(rows)
     verdicts = [row.verdict for row in rows]
     counts = (f"{verdicts.count(v)} {v}" for v in _COLOURS if v in verdicts)
@@ -63,7 +63,7 @@ def summary(rows: Iterable[Row]) -> str:
     )
 
 
-def write_report(rows: Sequence[Row], folder: Path) -> None:
+def write_report(rows: Sequence[ReportRow], folder: Path) -> None:
     """suite.md, suite.json and VEHICLE-SCENARIO.png into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "suite.md").write_text(markdown(rows), encoding="utf-8")
@@ -74,7 +74,7 @@ def write_report(rows: Sequence[Row], folder: Path) -> None:
             plot(row, folder / f"{row.vehicle}-{row.case.name}.png")
 
 
-def markdown(rows: Sequence[Row]) -> str:
+def markdown(rows: Sequence[ReportRow]) -> str:
     """The table for a document: EKF errors horizontal, median / p95 / max in metres."""
     lines = [
         "| " + " | ".join(_COLUMNS) + " |",
@@ -87,7 +87,7 @@ def markdown(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def plot(row: Row, path: Path) -> None:
+def plot(row: ReportRow, path: Path) -> None:
     """Horizontal EKF error over time, with the faults and what the vehicle said."""
     record = row.record
     assert record is not None
@@ -119,7 +119,7 @@ def plot(row: Row, path: Path) -> None:
     plt.close(figure)
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: ReportRow) -> tuple[str, ...]:
     reference = row.reference
     wanted = ""
     if reference is not None:
@@ -140,21 +140,21 @@ def _three(values: Iterable[float | None]) -> str:
     return " / ".join("-" if v is None else f"{v:.2f}" for v in values)
 
 
-def _told(row: Row) -> list[str]:
+def _told(row: ReportRow) -> list[str]:
     return [f.what if f.ok else f"NOT: {f.what}" for f in row.findings] + _pace(row)
 
 
-def _broken(row: Row) -> list[str]:
+def _broken(row: ReportRow) -> list[str]:
     return [f.what for f in row.findings if not f.ok] + _pace(row)
 
 
-def _pace(row: Row) -> list[str]:
+def _pace(row: ReportRow) -> list[str]:
     if row.record is None or not row.slow:
         return []
     return [f"machine too slow: {row.record.starved}"]
 
 
-def _as_data(row: Row) -> dict[str, Any]:
+def _as_data(row: ReportRow) -> dict[str, Any]:
     paired: Figures | None = None
     if row.record is not None and row.reference is not None:
         paired = figures(row.record.as_reference(row.reference.from_s, row.reference.to_s))

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.guardian.findings import RULES
+from companion.integrity_monitor.alert_rules import RULES
 from sitl.errors import SimulationError
 from sitl.suite.case import Case
-from sitl.suite.checks import CheckResult, Reference
+from sitl.suite.checks import AsAccurateAs, CheckResult
 from sitl.suite.flight import fly
-from sitl.suite.record import Array, Record
+from sitl.suite.record import Array, CaseRecord
 from sitl.vehicles.process import VehicleKind
 
 PACE_LIMIT = 0.98
@@ -29,12 +29,12 @@ Figures = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Row:
+class ReportRow:
     """One line of the report. record: None where the flight could not be flown; error says why."""
 
     case: Case
     vehicle: VehicleKind
-    record: Record | None
+    record: CaseRecord | None
     findings: tuple[CheckResult, ...]
     error: str = ""
     wall_s: float = 0.0
@@ -61,22 +61,22 @@ class Row:
 
     @property
     def guardian_lines(self) -> tuple[str, ...]:
-        """What the guardian told, with seconds; the bridge's own lines are others."""
+        """What the monitor told, with seconds; the bridge's own lines are others."""
         texts = self.record.texts if self.record is not None else []
         its = [t for t in texts if any(rule.is_line(t.text) for rule in RULES)]
         return tuple(f"{t.at_s:.1f} s: {t.text}" for t in its)
 
     @property
-    def reference(self) -> Reference | None:
+    def reference(self) -> AsAccurateAs | None:
         """The figures to be reproduced, where the case has any."""
-        return next((e for e in self.case.expect if isinstance(e, Reference)), None)
+        return next((e for e in self.case.expect if isinstance(e, AsAccurateAs)), None)
 
     @property
     def measured(self) -> Figures | None:
         """Median, p95 and maximum of the horizontal EKF error over the reference's span."""
         if self.record is None:
             return None
-        span = self.reference or Reference(check="reference", median=1.0)
+        span = self.reference or AsAccurateAs(check="reference", median=1.0)
         return figures(self.record.horizontal(span.from_s, span.to_s))
 
 
@@ -88,20 +88,20 @@ def figures(errors: Array) -> Figures | None:
     return median, p95, largest
 
 
-def judge(case: Case, record: Record) -> tuple[CheckResult, ...]:
+def judge(case: Case, record: CaseRecord) -> tuple[CheckResult, ...]:
     """Every expectation of the case, held against the record."""
     return tuple(expectation.judge(record) for expectation in case.expect)
 
 
-def run_case(case: Case, kind: VehicleKind, seed: int) -> Row:
+def run_case(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
     """Fly and judge one scenario; what goes wrong becomes the row's error."""
     start = time.monotonic()
     try:
         record = fly(case, kind, seed)
     except (SimulationError, OSError) as error:
         text = f"{type(error).__name__}: {error}"
-        return Row(case, kind, None, (), text, time.monotonic() - start)
-    return Row(case, kind, record, judge(case, record), "", time.monotonic() - start)
+        return ReportRow(case, kind, None, (), text, time.monotonic() - start)
+    return ReportRow(case, kind, record, judge(case, record), "", time.monotonic() - start)
 
 
 def run_suite(
@@ -109,8 +109,8 @@ def run_suite(
     kinds: Iterable[VehicleKind],
     jobs: int | None = None,
     seed: int = 1,
-    landed: Callable[[Row], None] = lambda _row: None,
-) -> list[Row]:
+    landed: Callable[[ReportRow], None] = lambda _row: None,
+) -> list[ReportRow]:
     """Fly all cases on all vehicles, `jobs` at a time; rows in the order of the cases.
 
     landed: called with every row as it comes.
@@ -119,7 +119,7 @@ def run_suite(
     wanted = [(case, kind) for kind in kinds for case in cases]
     # Long flights first, so that none of them is alone at the end.
     longest_first = sorted(wanted, key=lambda w: -_expected_s(w[0]))
-    rows: dict[tuple[str, str], Row] = {}
+    rows: dict[tuple[str, str], ReportRow] = {}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs or default_jobs(), context, _end_on_sigterm) as pool:
         try:
@@ -148,7 +148,7 @@ def _end_on_sigterm() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
 
 
-def _fly_in_worker(case: Case, kind: VehicleKind, seed: int) -> Row:
+def _fly_in_worker(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
     """`run_case`; one that is interrupted ends its process, which would else take the next case."""
     try:
         return run_case(case, kind, seed)
@@ -161,14 +161,14 @@ def default_jobs() -> int:
     return 2 * (os.cpu_count() or 1)
 
 
-def _row(future: Future[Row], case: Case, kind: VehicleKind) -> Row:
+def _row(future: Future[ReportRow], case: Case, kind: VehicleKind) -> ReportRow:
     try:
         return future.result()
     except BrokenProcessPool:
-        return Row(case, kind, None, (), "the flight's process died")
+        return ReportRow(case, kind, None, (), "the flight's process died")
     except Exception as error:
         # One flight that breaks must not cost the report of the others.
-        return Row(case, kind, None, (), f"{type(error).__name__}: {error}")
+        return ReportRow(case, kind, None, (), f"{type(error).__name__}: {error}")
 
 
 def _expected_s(case: Case) -> float:

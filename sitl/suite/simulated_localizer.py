@@ -117,7 +117,7 @@ class Observer:
 
 
 class FixSink(Protocol):
-    """Takes fixes: our bridge, or the guardian in front of it."""
+    """Takes fixes: our bridge, or the monitor in front of it."""
 
     def submit(self, fix: VisionFix) -> None:
         """One fix; never blocks."""

@@ -10,15 +10,15 @@ import pytest
 from benchmarks.basin.axes import AXES, STEPS, axis_start, axis_starts, limit, limits
 from benchmarks.basin.axes import table as axes_table
 from benchmarks.basin.repeating import table
-from benchmarks.basin.run import Outcome, random_start, summary
+from benchmarks.basin.run import BasinOutcome, random_start, summary
 from benchmarks.basin.tables import ablation_table, covariance_table
 from localizer.geometry.pose import Pose, so3_exp
 
 TRUTH = Pose(so3_exp([2.0, 0.3, -0.4]), np.array([10.0, -20.0, 120.0]))
 
 
-def outcome(view: int, metres: float, start: str = "yaw 1", variant: str = "ours") -> Outcome:
-    return Outcome(variant, view, start, "day", metres, 0.1, 0.1, 6.0, 10.0)
+def outcome(view: int, metres: float, start: str = "yaw 1", variant: str = "ours") -> BasinOutcome:
+    return BasinOutcome(variant, view, start, "day", metres, 0.1, 0.1, 6.0, 10.0)
 
 
 def test_a_random_start_is_exactly_as_wrong_as_it_says():

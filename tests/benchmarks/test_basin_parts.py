@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.basin.parts import PARTS, Trial, covered, part_of, report, table
+from benchmarks.basin.parts import PARTS, PatchTrial, covered, part_of, report, table
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.types import RenderedView
@@ -39,16 +39,24 @@ def test_outside_of_the_part_there_is_sky_and_no_depth():
 
 
 def test_the_report_counts_those_near_the_truth_and_those_accepted_apart():
-    near, wrong = Trial("half", 0, 0.1, 0.1, 4.0, True), Trial("half", 1, 9.0, 0.1, 90.0, True)
-    line = report("half", [near, near, wrong, Trial("half", 2, 0.2, 0.1, 20.0, False)])
+    near, wrong = (
+        PatchTrial("half", 0, 0.1, 0.1, 4.0, True),
+        PatchTrial("half", 1, 9.0, 0.1, 90.0, True),
+    )
+    line = report("half", [near, near, wrong, PatchTrial("half", 2, 0.2, 0.1, 20.0, False)])
     assert " 66.7 " in line.split("accepted")[0]
     assert "of 3, mean 9.3" in line
     assert " 66.7 " in line.split("accepted")[1]
 
 
 def test_the_table_has_a_row_for_what_was_fitted_and_a_column_a_part():
-    done = [Trial(part, view, 0.1, 0.1, 4.0, True) for part in ("whole", "half") for view in (0, 1)]
-    done += [Trial("half", 3, 0.1, 0.1, 90.0, True), Trial("half", 5, 9.0, 0.1, 90.0, True)]
+    done = [
+        PatchTrial(part, view, 0.1, 0.1, 4.0, True) for part in ("whole", "half") for view in (0, 1)
+    ]
+    done += [
+        PatchTrial("half", 3, 0.1, 0.1, 90.0, True),
+        PatchTrial("half", 5, 9.0, 0.1, 90.0, True),
+    ]
     columns, rows = table("caliterra", done, ["whole", "half"], 25)
     assert columns == ("set", "whole", "half")
     assert [row[0] for row in rows] == [

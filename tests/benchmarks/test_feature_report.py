@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.features.report import (
-    Outcome,
+    PairOutcome,
     difference,
     read_outcomes,
     report,
@@ -21,9 +21,9 @@ from localizer.geometry.pose import Pose
 from localizer.types import RenderedView
 
 
-def outcomes(method: str, metres: list[float], source: str = "made") -> list[Outcome]:
+def outcomes(method: str, metres: list[float], source: str = "made") -> list[PairOutcome]:
     return [
-        Outcome(method, source, 0, k, k // 4, "day" if k % 2 else "night", m, 0.1, 0.02)
+        PairOutcome(method, source, 0, k, k // 4, "day" if k % 2 else "night", m, 0.1, 0.02)
         for k, m in enumerate(metres)
     ]
 

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from benchmarks.protection.__main__ import main
 from benchmarks.protection.flights import FlownPositions, Position, read_flight, report, share
-from mavlink_bridge.errors import RecordError
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import TlogRecorder
 
 BEGIN_NS = 37_456_555_000_000
@@ -103,7 +103,7 @@ def test_what_cannot_be_counted_is_named_and_the_rest_is_written(
     shifted = flown(tmp_path / "ardupilot-map-shifted-15m-5")
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(RecordError, match="shifted"):
+    with pytest.raises(TlogError, match="shifted"):
         read_flight(shifted)
     out = tmp_path / "flights.json"
     arguments = ["protection", "--flights", *map(str, (flight, shifted, empty)), "--out", str(out)]

@@ -8,24 +8,24 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from benchmarks.basin.views import View
+from benchmarks.basin.views import BasinView
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.beginnings import beginnings
 from benchmarks.integrity.report import AGREE, DISTINCT, FOCAL, OURS, WITHOUT, rows
-from benchmarks.integrity.run import Outcome, Registrar, again, read, turn, unseen
+from benchmarks.integrity.run import MapRegistrar, StartOutcome, again, read, turn, unseen
 from localizer.errors import SequenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig
 
-RIGHT = Outcome(
+RIGHT = StartOutcome(
     "quito", 0, "day", "near", 3.0, 3.0, True, metres=0.2, degrees=0.1, off_map_m=0.2,
     overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0, lead=1.0,
 )  # fmt: skip
 WRONG = replace(RIGHT, kind="far", metres=40.0, off_map_m=40.0, votes=9)
 
 
-def of(outcomes: list[Outcome], acceptance: str, name: str = "all"):
+def of(outcomes: list[StartOutcome], acceptance: str, name: str = "all"):
     made = rows(outcomes, IntegrityConfig())
     return next(r for r in made if (r.set, r.acceptance) == (name, acceptance))
 
@@ -81,7 +81,7 @@ def older(tmp_path):
     """A view and its outcomes as an older version kept them: without the newer tests' figures."""
     camera = Camera.from_fov(32, 24, 60.0)
     truth = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
-    view = View(tmp_path / "map", np.zeros((24, 32, 3), np.uint8), truth, camera, "day", 100.0)
+    view = BasinView(tmp_path / "map", np.zeros((24, 32, 3), np.uint8), truth, camera, "day", 100.0)
     path, rows = tmp_path / "quito.jsonl", []
     for begun in beginnings(view, 0, [view], []):
         kept = RIGHT if begun.kind == "near" else WRONG
@@ -102,7 +102,7 @@ def test_of_older_outcomes_what_was_accepted_is_registered_again(older, monkeypa
         repeated.append(begun.kind)
         return replace(kept, focal_gain=-0.03)
 
-    monkeypatch.setattr(Registrar, "repeated", repeat)
+    monkeypatch.setattr(MapRegistrar, "repeated", repeat)
     for _ in range(2):  # the second time nothing is left
         assert again("quito", [view], [view], path, lambda: True) == 0
     assert repeated == ["near"] * 3
@@ -116,7 +116,7 @@ def test_of_older_outcomes_what_was_accepted_is_registered_again(older, monkeypa
 
 def test_outcomes_of_other_beginnings_are_named(older, monkeypatch):
     view, path, _ = older
-    monkeypatch.setattr(Registrar, "repeated", lambda *given: given[-1])
+    monkeypatch.setattr(MapRegistrar, "repeated", lambda *given: given[-1])
     path.write_text(path.read_text().replace('"start_m": 200.0', '"start_m": 250.0'))
     with pytest.raises(SequenceError, match="begin anew"):
         again("quito", [view], [view], path, lambda: True)
@@ -126,7 +126,7 @@ def test_views_that_another_run_has_seen_are_left_out_and_photos_given_again_are
     camera = Camera.from_fov(32, 24, 60.0)
     truth = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
     photos = [
-        View(tmp_path, np.full((24, 32, 3), k, np.uint8), truth, camera, "day", 100.0)
+        BasinView(tmp_path, np.full((24, 32, 3), k, np.uint8), truth, camera, "day", 100.0)
         for k in range(3)
     ]
     seen = tmp_path / "quito.jsonl"

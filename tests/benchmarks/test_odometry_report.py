@@ -3,21 +3,23 @@
 import numpy as np
 import pytest
 
-from benchmarks.odometry.flights import Flown, Step
+from benchmarks.odometry.flights import FlownStretch, OdometryStep
 from benchmarks.odometry.report import fitted_growth, rows
-from benchmarks.odometry.stretches import Plan, make_stretch
+from benchmarks.odometry.stretches import StretchPlan, make_stretch
 
 SIGMA = np.diag([0.05, 0.05, 0.05]) ** 2
 
 
-def step(flown_m: float, error: np.ndarray, covariance: np.ndarray, status: str = "OK") -> Step:
-    return Step(
+def step(
+    flown_m: float, error: np.ndarray, covariance: np.ndarray, status: str = "OK"
+) -> OdometryStep:
+    return OdometryStep(
         status, tuple(error), tuple(map(tuple, covariance)), (flown_m, 0.0, 0.0), flown_m,
         1.0, 0.8, 1.0, 10.0,
     )  # fmt: skip
 
 
-def stretches(scale: float, walk: float, count: int, *, told: bool) -> list[Flown]:
+def stretches(scale: float, walk: float, count: int, *, told: bool) -> list[FlownStretch]:
     """Stretches due east whose errors follow the model of growth; told: so does the covariance."""
     rng = np.random.default_rng(5)
     flown = []
@@ -29,7 +31,7 @@ def stretches(scale: float, walk: float, count: int, *, told: bool) -> list[Flow
             error[:2] += walked
             growth = np.diag([scale**2 * way**2 + walk**2 * way, walk**2 * way, 0.0])
             steps.append(step(way, error, SIGMA + growth * told))
-        flown.append(Flown("somewhere", "day", seed, "map", tuple(steps)))
+        flown.append(FlownStretch("somewhere", "day", seed, "map", tuple(steps)))
     return flown
 
 
@@ -48,7 +50,7 @@ def test_an_honest_covariance_holds_and_a_bold_one_does_not():
 
 
 def test_what_was_not_carried_on_is_counted():
-    lost = Flown("somewhere", "night", 0, "map", (
+    lost = FlownStretch("somewhere", "night", 0, "map", (
         step(100.0, np.zeros(3), SIGMA),
         step(110.0, np.array([30.0, 0, 0]), SIGMA, "LOST"),
     ))  # fmt: skip
@@ -59,7 +61,7 @@ def test_what_was_not_carried_on_is_counted():
 
 
 def test_a_stretch_stays_over_the_area_at_its_speed():
-    plan = Plan(60.0, 2.0, 10.0, 110.0, (150.0, 100.0))
+    plan = StretchPlan(60.0, 2.0, 10.0, 110.0, (150.0, 100.0))
     stretch = make_stretch(plan, "day", 3, 20.0)
     places = np.array([pose.translation for pose in stretch.poses])
     assert (np.abs(places[:, :2]) < [270, 220]).all()  # turning takes its radius

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.protection.patches import Told, main, read_told, table
+from benchmarks.protection.patches import FlightPositions, main, read_told, table
 from companion.errors import RecordError
 
 
-def told(length_m: float, seed: int = 0) -> Told:
+def told(length_m: float, seed: int = 0) -> FlightPositions:
     """Errors of a map in patches of a length, from 40 to 160 m, under 0.1 m of noise."""
     rng = np.random.default_rng(seed)
     shares = np.stack([np.eye(2) * (0.6 / height) ** 2 for height in rng.uniform(40, 160, 800)])
     covariances = np.broadcast_to(np.eye(2) * 0.01, shares.shape)
     roots = np.sqrt(covariances + length_m**2 * shares)
     errors = np.einsum("nij,nj->ni", roots, rng.standard_normal((800, 2)))
-    return Told(f"flight-{seed}", errors, np.array(covariances), shares)
+    return FlightPositions(f"flight-{seed}", errors, np.array(covariances), shares)
 
 
 @pytest.mark.parametrize("length_m", [5.0, 20.0, 40.0])

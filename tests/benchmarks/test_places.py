@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("torch")
 
 from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS, cells, first_frame
-from benchmarks.places.rivals import RIVALS, Answer, Rendered, Setting, unavailable
-from benchmarks.places.run import Plan, chosen_cells
+from benchmarks.places.rivals import RIVALS, Rendered, RivalPose, Setting, unavailable
+from benchmarks.places.run import PlacesPlan, chosen_cells
 from benchmarks.places.table import interval, markdown, measures, read_results, recall_3, write_json
 from benchmarks.places.turns import ToldTurns
 from benchmarks.places.worlds import PLACES, visits
@@ -59,7 +59,7 @@ def test_the_outdated_map_is_of_another_season_and_of_years_before():
 
 def _plan(tmp_path, count=4):
     (tmp_path / "results").mkdir()
-    return Plan(tmp_path, 3, 320, METHODS, tuple(cells()[:count]))
+    return PlacesPlan(tmp_path, 3, 320, METHODS, tuple(cells()[:count]))
 
 
 def _done(plan, cell, method, metres):
@@ -157,7 +157,7 @@ def test_a_rival_is_rendered_for_where_it_predicts_itself_and_not_where_it_is():
 
     def step(view, image, prior, seed):
         pose = Pose(NADIR.rotation, NADIR.translation + np.array([true_m[0], 0.0, 0.0]))
-        return Answer(pose, np.eye(6) * 1e-4)
+        return RivalPose(pose, np.eye(6) * 1e-4)
 
     rival = Rendered(stack, Setting(camera, LocalizerConfig()), step)
     rival.begin(PosePrior(NADIR, np.eye(6), 10**9))

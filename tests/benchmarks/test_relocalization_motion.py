@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.relocalization.counted import cells, one
-from benchmarks.relocalization.motion import Outcome, share, shares, table
+from benchmarks.relocalization.motion import TrialOutcome, share, shares, table
 
-FOUND = Outcome(
+FOUND = TrialOutcome(
     "generated", 0, "day", True, True, True, 90.0, searches=1, found_at=1, wrong=0,
     confirmed_s=1.5, given=3, false=0, worst_m=0.2, cpu_s=2.0,
 )  # fmt: skip
@@ -19,7 +19,7 @@ NEVER = replace(FOUND, trial=2, searches=5, found_at=0, confirmed_s=None, given=
 FALSE = replace(FOUND, trial=3, set="elsewhere", found_at=0, wrong=1, false=2, worst_m=1e6)
 
 
-def row(outcomes: list[Outcome], name: str, light: str = "all") -> dict[str, object]:
+def row(outcomes: list[TrialOutcome], name: str, light: str = "all") -> dict[str, object]:
     return next(r for r in shares(outcomes) if (r["set"], r["light"]) == (name, light))
 
 

@@ -1,4 +1,4 @@
-"""Recorded flights through the guardian of now."""
+"""Recorded flights through the monitor of now."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from benchmarks.protection.__main__ import main
 from benchmarks.protection.replayed import replay
-from mavlink_bridge.errors import RecordError
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.vehicle.origin import offset
 
@@ -65,7 +65,7 @@ def _vehicle(path: Path) -> None:
 
 def test_an_honest_flight_is_quiet_and_its_level_is_what_its_sources_make(tmp_path: Path) -> None:
     found = replay(recorded(tmp_path / "embedded-normal-fast-3"))
-    assert (found.fixes, found.withheld, found.widened, found.told) == (120, 0, 0, {})
+    assert (found.fixes, found.held, found.widened, found.told) == (120, 0, 0, {})
     # sigma 0.1, map 0.28, 0.3 % of 50 m, 10 ms at 5 m/s
     assert found.hpl_m == pytest.approx(3.717 * np.sqrt(0.01 + 0.0784 + 0.0225 + 0.0025), rel=0.01)
     assert found.shares["map"] == pytest.approx(0.691, abs=0.01)
@@ -74,7 +74,7 @@ def test_an_honest_flight_is_quiet_and_its_level_is_what_its_sources_make(tmp_pa
 
 def test_a_jump_is_withheld_and_told_by_the_guardian_of_now(tmp_path: Path) -> None:
     found = replay(recorded(tmp_path / "embedded-jump-3", aside_m=12.0))
-    assert 30 <= found.withheld <= 32
+    assert 30 <= found.held <= 32
     assert found.told == {"jump": 1}
 
 
@@ -83,7 +83,7 @@ def test_what_cannot_be_replayed_is_named_and_the_rest_is_written(
 ) -> None:
     flight, empty = recorded(tmp_path / "embedded-normal-fast-3"), tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(RecordError, match="empty"):
+    with pytest.raises(TlogError, match="empty"):
         replay(empty)
     out = tmp_path / "replayed.json"
     arguments = ["protection", "--replay", str(flight), str(empty), "--out", str(out)]

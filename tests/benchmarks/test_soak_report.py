@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from benchmarks.bridge.soak_line import Fault
-from benchmarks.bridge.soak_report import FIX_HZ, Sample, bounds
+from benchmarks.bridge.soak_line import LineFault
+from benchmarks.bridge.soak_report import FIX_HZ, ProcessSample, bounds
 
 BEGUN = 100.0
 COUNTERS = {"begun": BEGUN} | {
     f"{link}_{what}": 0 for link in ("fc", "ground") for what in ("handler_errors", "failures")
 }
-FAULT = Fault("cut", BEGUN + 50.0, BEGUN + 60.0)
+FAULT = LineFault("cut", BEGUN + 50.0, BEGUN + 60.0)
 
 
-def flown(back_s: float) -> list[Sample]:
+def flown(back_s: float) -> list[ProcessSample]:
     """240 s of which nothing is injected from the fault until `back_s`."""
     made, injected = [], 0
     for t in range(240):
         injected += 0 if 50 <= t < back_s else int(FIX_HZ)
-        made.append(Sample(float(t), 130.0, 9, 20, 5, injected))
+        made.append(ProcessSample(float(t), 130.0, 9, 20, 5, injected))
     return made
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.window.motions import MOTIONS, Step
+from benchmarks.window.motions import MOTIONS, MotionStep
 from benchmarks.window.report import Error, rows
 from benchmarks.window.votes import Vote, Window, elected
 from localizer.geometry.pose import Pose, so3_exp
@@ -66,7 +66,7 @@ def test_votes_are_carried_along_the_flight(motion):
 
 
 def test_a_turn_that_is_not_known_is_a_place_that_is_not_known():
-    step = Step(lambda pose: pose, np.array([100.0, 0.0, 0.0]), np.zeros((6, 6)))
+    step = MotionStep(lambda pose: pose, np.array([100.0, 0.0, 0.0]), np.zeros((6, 6)))
     _, covariance = step.carry(_flight(1)[0], SIGMA)
     assert covariance[1, 1] == pytest.approx(1.0 + 100.0**2 * np.radians(1.0) ** 2)
 

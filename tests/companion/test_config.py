@@ -69,7 +69,10 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"bridge": {"link_timeout_s": 0.01}}, "bridge.link_timeout_s"),
         ({"localizer": {"threads": 10**9}}, "localizer.threads"),
         ({"localizer": {"cache_mib": 10**9}}, "localizer.cache_mib"),
-        ({"localizer": {"integrity": {"gate": float("inf")}}}, "localizer.integrity.gate"),
+        (
+            {"localizer": {"integrity": {"chi2_threshold": float("inf")}}},
+            "localizer.integrity.chi2_threshold",
+        ),
         ({"localizer": {"motion": {"turn_sigma": float("inf")}}}, "localizer.motion.turn_sigma"),
         ({"prior": {"position_sigma_m": float("inf")}}, "prior.position_sigma_m"),
         ({"camera": CAMERA | {"lever_arm_m": [0, float("nan"), 0]}}, "camera.lever_arm_m.1"),
@@ -89,7 +92,10 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"camera": CAMERA | {"settings": {"rate_hz": 1e-300}}}, "camera.settings.rate_hz"),
         ({"record": {"folder": "f", "snapshot_interval_s": 1e300}}, "snapshot_interval_s"),
         ({"localizer": {"motion": {"turn_sigma": 1e300}}}, "turn_sigma: .* equal to 1 "),
-        ({"localizer": {"integrity": {"gate": 1e300}}}, "localizer.integrity.gate"),
+        (
+            {"localizer": {"integrity": {"chi2_threshold": 1e300}}},
+            "localizer.integrity.chi2_threshold",
+        ),
         ({"localizer": {"seed": 10**400}}, "localizer.seed"),
         ({"map": ""}, "map: '.' names no file"),
         ({"record": {"folder": ""}}, "record.folder: '.' names no file"),

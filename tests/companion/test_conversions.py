@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.conversions import Installation, vehicle_prior, vision_fix
+from companion.conversions import CameraExtrinsics, vehicle_prior, vision_fix
 from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -15,7 +15,7 @@ ORIGIN = Geodetic(47.3, 8.5, 450.0)
 FRAME = LocalFrame(ORIGIN)
 LEVER = np.array([0.4, -0.1, 0.2])
 SEPARATION = 47.5
-INSTALLATION = Installation(FRAME, SEPARATION, LEVER)
+INSTALLATION = CameraExtrinsics(FRAME, SEPARATION, LEVER)
 
 
 def _attitude(roll, pitch, yaw, time_ns=0) -> Attitude:

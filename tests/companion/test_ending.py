@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from companion.config import PriorConfig, RecordConfig, TargetConfig
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.ending import joined
 from companion.flight.last_fix import FixMemory
 from companion.flight.recorder import RecordKeeper
 from companion.supervision.pulse import Pulse
-from companion.targets.population import Click
 from companion.targets.reporter import TargetReporter
+from companion.targets.target_manager import Click
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
@@ -96,8 +96,8 @@ def test_a_last_fix_on_a_dead_disk_is_left_there(
     autopilot: Any = SimpleNamespace(rotation=lambda _: DOWN, velocity=np.zeros(3))
     path = tmp_path / "last-fix.json"
     path.write_text("{}")
-    installation = Installation(FRAME, 47.0, np.zeros(3))
-    memory = FixMemory(path, PriorConfig(), autopilot, installation, hang)
+    extrinsics = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
+    memory = FixMemory(path, PriorConfig(), autopilot, extrinsics, hang)
     bundle: Any = None
     memory.start()
     memory.add_estimate(tracked(), bundle)
@@ -118,7 +118,7 @@ def test_a_pulse_that_hangs_never_writes_into_another_file(hang: Hang, tmp_path:
     pulse = Pulse(beats, writing)
     pulse.start()
     assert hang.reached.wait(60.0)
-    assert ends(lambda: pulse.stop(in_order=True))
+    assert ends(lambda: pulse.stop(clean_shutdown=True))
     assert os.read(reading, 100).startswith(b"ending")
     os.fstat(writing)
     os.close(reading)

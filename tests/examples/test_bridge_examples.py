@@ -18,8 +18,8 @@ import pytest
 from companion.config import TargetConfig
 from companion.conversions import target_report
 from companion.targets.clicks import ClickPolicy
-from companion.targets.population import Target
 from companion.targets.reporter import TargetReporter
+from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
@@ -202,7 +202,7 @@ class Clicked:
             self._clicks.add_estimate(estimate)
             self._targets.add_estimate(estimate)
 
-    def _tell(self, target: Target) -> None:
+    def _tell(self, target: TargetEstimate) -> None:
         camera = target.estimate.camera
         self._bridge.report(target_report(target.fix, camera, FRAME, 1))
 

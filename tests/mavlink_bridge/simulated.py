@@ -16,7 +16,7 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.transport import Endpoint
@@ -69,7 +69,7 @@ class Flight:
     """
 
     def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, gate: InjectionGate | None = None, **options: Any
+        self, monkeypatch: pytest.MonkeyPatch, enable: InjectionEnable | None = None, **options: Any
     ) -> None:
         options.setdefault("injection", InjectionConfig(rate_hz=10, delay_ms=100))
         options.setdefault("origin", ORIGIN)
@@ -98,7 +98,7 @@ class Flight:
             self.track,
             self.hint,
             VehicleWatch(say),
-            gate,
+            enable,
             LookAt(config, GEOID, say),
             lambda *told: self.vehicle_texts.append(told),
         )

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.config import BridgeConfig, RcGateConfig, SigningConfig
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig, SigningConfig
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.replay import ReplayWindow
 from mavlink_bridge.link.signing import create_key
@@ -140,8 +140,8 @@ class Orders:
     """A flight in mode rc, and commands of other systems to its components."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
-        self.gate = InjectionGate(RcGateConfig(), lambda _: None)
-        self.flight = Flight(monkeypatch, self.gate, **options)
+        self.enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
+        self.flight = Flight(monkeypatch, self.enable, **options)
         self.flight.run(2.0)
 
     def command(self, system: int, command: int, component: int) -> list[int]:
@@ -169,7 +169,7 @@ def test_orders_of_other_systems_are_denied_and_told_once(
     orders = Orders(monkeypatch)
     for _ in range(3):
         assert orders.command(66, command, component) == [mavlink.MAV_RESULT_DENIED]
-    assert not orders.gate.open
+    assert not orders.enable.open
     told = [text for text in orders.flight.texts if "refused" in text]
     assert told == ["PiLoT: system 66 refused: not in ground_systems"]
     assert orders.command(66, mavlink.MAV_CMD_REQUEST_MESSAGE, 100) != []  # a question
@@ -178,7 +178,7 @@ def test_orders_of_other_systems_are_denied_and_told_once(
 def test_the_ground_stations_order_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     orders = Orders(monkeypatch)
     assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
-    assert orders.gate.open
+    assert orders.enable.open
     second = Orders(monkeypatch, ground_systems=(254, 66))
     assert second.command(66, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
 
@@ -193,7 +193,7 @@ def test_with_signing_an_unsigned_ground_link_gives_no_orders(
     orders.flight.end.components = Components(orders.flight.shared, ground=True)
     assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_DENIED]
     assert "PiLoT: system 255 refused: link not signed" in orders.flight.texts
-    assert not orders.gate.open
+    assert not orders.enable.open
 
 
 def test_state_files_of_two_links_differ(tmp_path: Path) -> None:
@@ -270,7 +270,7 @@ def test_an_order_that_comes_in_the_last_write_is_not_taken_again(
             first.end()
         wrote.set()
 
-    monkeypatch.setattr("mavlink_bridge.whole_file.os.fsync", meanwhile)
+    monkeypatch.setattr("mavlink_bridge.atomic_file.os.fsync", meanwhile)
     assert first.takes(signed(STAMP))
     assert wrote.wait(20.0)
     first.end()

@@ -22,12 +22,12 @@ from pymavlink.generator.mavcrc import x25crc
 from mavlink_bridge.camera.component import TRACKING
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN
-from mavlink_bridge.config import InjectionConfig, InjectionMessage, RcGateConfig
+from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, InjectionMessage
 from mavlink_bridge.errors import FixError
 from mavlink_bridge.flight_controller import FC_WANTED
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.injection.message_maker import InjectionContext
-from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import CameraView, Origin, TargetReport, VisionFix
 from mavlink_bridge.place_hint import PLACE_HINT
@@ -262,8 +262,10 @@ def test_no_parameter_of_a_command_breaks_or_gets_through(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every command that a component of ours knows, from a station that may order."""
-    flight = Attacked(monkeypatch, InjectionGate(RcGateConfig(), lambda _: None), mode="rc")
-    flight.shared.gate.command(mavlink.MAV_CMD_USER_1, 1.0)  # type: ignore[union-attr]
+    flight = Attacked(
+        monkeypatch, InjectionEnable(InjectionEnableConfig(), lambda _: None), mode="rc"
+    )
+    flight.shared.enable.command(mavlink.MAV_CMD_USER_1, 1.0)  # type: ignore[union-attr]
     wrong = []
     for command, field in product(_COMMANDS, ("all", *_PARAMETERS[name])):
         for component, value in product((100, 191, 197), spoilt("float")):

@@ -14,11 +14,11 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import TargetReport, VisionFix
-from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
+from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.flight_controller import FC_WANTED
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.fix_queue import FixQueue
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
 
@@ -566,16 +566,16 @@ def test_what_keeps_vision_from_the_ekf_stands_as_its_trouble(
     """A gimbal 10 degrees off, whose fixes the yaw guard refuses; an EKF that is elsewhere."""
     flight = Flight(monkeypatch)
     flight.run(6.0)
-    assert flight.end.trouble == ""
+    assert flight.end.injection_fault == ""
     flight.yaw_error_rad = 0.17
     flight.run(6.0)
-    assert "not sent: vision yaw differs" in flight.end.trouble
+    assert "not sent: vision yaw differs" in flight.end.injection_fault
     flight.yaw_error_rad = 0.0
     flight.run(12.0)
-    assert flight.end.trouble == ""
+    assert flight.end.injection_fault == ""
     flight.ekf_north_m = 20.0
     flight.run(6.0)
-    assert "20.0 m from what is sent" in flight.end.trouble
+    assert "20.0 m from what is sent" in flight.end.injection_fault
 
 
 def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -623,11 +623,11 @@ def test_answers_to_others_commands_are_not_ours(
 
 def test_no_origin_is_set_while_the_gate_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    gate = InjectionGate(RcGateConfig(), opened.append)
-    flight = Flight(monkeypatch, gate)
+    enable = InjectionEnable(InjectionEnableConfig(), opened.append)
+    flight = Flight(monkeypatch, enable)
     flight.run(15.0)
     assert flight.origin is None
-    assert gate.command(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert enable.command(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED
     flight.run(10.0)
     assert flight.origin is not None
     assert flight.vision()

@@ -12,8 +12,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.targets.numbers import TargetNumbers
-from mavlink_bridge.config import CameraConfig, RcGateConfig
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.config import CameraConfig, InjectionEnableConfig
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.shared import clicked_numbers
 from mavlink_bridge.status import OperatorStatus
@@ -364,12 +364,12 @@ def test_a_click_never_has_a_detected_targets_number() -> None:
 
 
 def test_a_gate_that_chatters_ends_as_the_channel_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    gate = InjectionGate(RcGateConfig(), lambda _: None)
+    enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
     for turn in range(101):
         pulses = [0, 65535, 1, 1900][turn % 4]
-        gate.channels([pulses] * 18)
-        gate.command(mavlink.MAV_CMD_USER_1, (math.nan, math.inf, 0.5, -1.0)[turn % 4])
-    assert gate.open
+        enable.channels([pulses] * 18)
+        enable.command(mavlink.MAV_CMD_USER_1, (math.nan, math.inf, 0.5, -1.0)[turn % 4])
+    assert enable.open
 
 
 def test_no_flood_of_clicks_ends_the_targets_that_are_followed(flight: Flight) -> None:

@@ -19,7 +19,7 @@ from mavlink_bridge.camera.messages import (
 from mavlink_bridge.camera.targets import adsb_vehicle, tracking_geo_status
 from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig
 from mavlink_bridge.injection.encode import (
-    Estimate,
+    EncodedEstimate,
     global_position_sensor,
     gps_input,
     odometry,
@@ -54,12 +54,12 @@ def kind_of(message: Any) -> Any:
     return mavlink.mavlink_map[message.get_msgId()]
 
 
-def estimate() -> Estimate:
+def estimate() -> EncodedEstimate:
     position = PropagatedFix(
         round(EXPOSURE_S * 1e9), LAT, LON, HEIGHT, np.diag([4.0, 4.0, 9.0]),
         np.array([NORTH, EAST, DOWN]), np.eye(3) * 0.25,
     )  # fmt: skip
-    return Estimate(position, NOSE, 0.02, 80, 1, True)
+    return EncodedEstimate(position, NOSE, 0.02, 80, 1, True)
 
 
 REPORT = TargetReport(

@@ -21,9 +21,9 @@ from companion.terminal.steps import READING, shown_count, shown_work
 
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
-    from localizer.map.fetch.catalogue import Source
+    from localizer.map.fetch.catalogue import CatalogueSource
     from localizer.map.fetch.polite import PoliteClient
-    from localizer.map.fetch.raster import Plan
+    from localizer.map.fetch.raster import FetchPlan
     from localizer.map.footprints.footprint import Footprints
 
 _FINEST_M = 0.2  # what a flight at 100 m and a working width of 320 can use, and some more
@@ -42,8 +42,8 @@ HeightProperty = Annotated[
 class _Part:
     """One of the two rasters."""
 
-    source: Source
-    plan: Plan
+    source: CatalogueSource
+    plan: FetchPlan
     client: PoliteClient
     folder: Path
     out: Path
@@ -151,12 +151,12 @@ def sources_command(
     keys: Annotated[bool, typer.Option("--keys", help="what a source's entry may say")] = False,
 ) -> None:
     """The map services that `map fetch` knows, their licences and whom to name."""
-    from localizer.map.fetch.catalogue import Source, load_sources
+    from localizer.map.fetch.catalogue import CatalogueSource, load_sources
 
     console = Console()
     if keys:
         table = Table("key", "meaning", box=SIMPLE_HEAD)
-        for name, info in Source.model_fields.items():
+        for name, info in CatalogueSource.model_fields.items():
             table.add_row(name, escape(info.description or ""))
         console.print(table)
         return
@@ -164,7 +164,7 @@ def sources_command(
         _print_source(console, source)
 
 
-def _print_source(console: Console, source: Source) -> None:
+def _print_source(console: Console, source: CatalogueSource) -> None:
     """Name first and whole, to be copied; what a terminal's width breaks goes on under itself."""
     head = f"{source.name}  ({source.country}, {source.role}, {source.resolution_m:g} m)"
     console.print(head, style="bold", markup=False, highlight=False, soft_wrap=True)
@@ -216,7 +216,7 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
 
 
 def _planned(
-    source: Source, area: Area, resolution: float, most_mb: float, work: Path, role: str
+    source: CatalogueSource, area: Area, resolution: float, most_mb: float, work: Path, role: str
 ) -> _Part:
     from localizer.map.fetch.fetch import make_plan
     from localizer.map.fetch.polite import Manners, PoliteClient

@@ -50,7 +50,7 @@ def plan_command(
 ) -> None:
     """Forecast a mission over its map: exit code 1 if vision will not do, or not all was judged."""
     from companion.planning import page, pictures
-    from companion.planning.judge import Limits
+    from companion.planning.judge import MissionLimits
     from companion.planning.mission import read_mission
     from companion.planning.plan import Question, aim_of, make_plan
     from companion.preflight.map_pin import map_hash
@@ -69,7 +69,7 @@ def plan_command(
     cache = TileCache.open(map_cache or deployment.map)
     made_folder(out, "--out")
     question = replace(
-        Question(mission, conditions, Limits(sigma)),
+        Question(mission, conditions, MissionLimits(sigma)),
         spacing_m=spacing, speed_m_s=speed, pitch_deg=pitch, seek=alternatives,
     )  # fmt: skip
     with shown_count(Console(stderr=True), "places") as count:

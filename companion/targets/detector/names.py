@@ -22,7 +22,7 @@ _FAR = 1e6
 
 
 @dataclass(frozen=True)
-class Sight:
+class LocatedBox:
     """A box on the ground. label: its class; place: (3,) m, world axes."""
 
     label: str
@@ -38,7 +38,7 @@ class _Thing:
     velocity: Array | None = None
     sightings: int = 1
 
-    def cost(self, sight: Sight, time_ns: int) -> float:
+    def cost(self, sight: LocatedBox, time_ns: int) -> float:
         """Metres beside where it should be over what is allowed; above 1: it is another."""
         if sight.label != self.label:
             return _FAR
@@ -50,7 +50,7 @@ class _Thing:
             reach = _NEAR_M + _CHANGES_MPS2 * dt * max(dt, 1.0)
         return float(np.linalg.norm((sight.place - expected)[:2])) / reach
 
-    def seen(self, sight: Sight, time_ns: int) -> None:
+    def seen(self, sight: LocatedBox, time_ns: int) -> None:
         """Take over a new place."""
         dt = max((time_ns - self.time_ns) * 1e-9, 1e-3)
         fresh = (sight.place - self.place) / dt
@@ -67,7 +67,7 @@ class ThingNames:
         self._things: list[_Thing] = []
         self._count: dict[str, int] = {}
 
-    def name(self, sights: list[Sight], time_ns: int) -> list[str | None]:
+    def name(self, sights: list[LocatedBox], time_ns: int) -> list[str | None]:
         """A name for each sight of one picture; None for what is seen for the first time: one
         picture alone may show a thing that is none.
         """

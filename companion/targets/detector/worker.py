@@ -18,7 +18,7 @@ from companion.config import DetectorConfig
 from companion.ending import joined
 from companion.targets.detections import DETECTED, Detection
 from companion.targets.detector.boxes import Box
-from companion.targets.detector.names import Sight, ThingNames
+from companion.targets.detector.names import LocatedBox, ThingNames
 from companion.targets.detector.network import DetectorNetwork
 from companion.targets.pictures import RecentPictures
 from localizer.targets.locate import RayCaster, ray_in_world
@@ -143,7 +143,7 @@ class BoxDetector:
         placed = [
             (box, place) for box in boxes if (place := self._place(box, estimate)) is not None
         ]
-        sights = [Sight(network.name_of(box.label), place) for box, place in placed]
+        sights = [LocatedBox(network.name_of(box.label), place) for box, place in placed]
         names = self._names.name(sights, estimate.exposure_time_ns)
         for (box, _), name in zip(placed, names, strict=True):
             if name is not None:

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
-from localizer.map.building.staging import Record, Staging, StoredTile
+from localizer.map.building.staging import Staging, StoredTile, TileRecord
 from localizer.map.cache.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
 from localizer.map.source import SourceNode, SourceTree
 
@@ -23,7 +23,7 @@ class _Node:
 
     source: SourceNode
     keys: list[int]
-    records: list[Record]
+    records: list[TileRecord]
     children: list[_Node]
 
     @property
@@ -35,7 +35,7 @@ class _Node:
         return any(record.error is not None for record in self.records)
 
 
-def _graft(root: SourceNode, records: dict[int, Record]) -> _Node:
+def _graft(root: SourceNode, records: dict[int, TileRecord]) -> _Node:
     """The tree with records, pruned where a tile is missing.
 
     Where a child of a REPLACE node could not be imported, nothing below the node is used: its
@@ -80,7 +80,7 @@ class Assembled:
 
 
 def assemble(
-    tree: SourceTree, records: dict[int, Record], staged: Staging, frame: LocalFrame
+    tree: SourceTree, records: dict[int, TileRecord], staged: Staging, frame: LocalFrame
 ) -> Assembled:
     """Put the imported tiles in their places in the staging folder."""
     root = _graft(tree.root, records)

@@ -18,8 +18,8 @@ from localizer.map.building.heights import extent_warnings, heights_of
 from localizer.map.building.isolation import call_apart
 from localizer.map.building.options import BuildOptions
 from localizer.map.building.sources import SourceOptions, find_source, read_source
-from localizer.map.building.staging import Record, publish, staging
-from localizer.map.building.workers import ImportJob, Progress, Workers, import_all, tiles_of
+from localizer.map.building.staging import TileRecord, publish, staging
+from localizer.map.building.workers import ImportJob, ImportWorkers, Progress, import_all, tiles_of
 from localizer.map.cache.cache import Manifest
 from localizer.map.importers.georeference import Georeference
 from localizer.map.source import FlatTree, SourceNode, SourceTree
@@ -91,7 +91,7 @@ def build_tree(
     }
     with staging(Path(out), parameters, overwrite=options.overwrite) as staged:
         job = ImportJob(staged, frame, lift, rules)
-        how = Workers(
+        how = ImportWorkers(
             options.workers or os.cpu_count() or 1,
             apart=options.is_apart,
             scheduler=options.scheduler,
@@ -133,7 +133,7 @@ def _dated(imagery_date: str | None) -> dict[str, str]:
     return {"imagery_date": imagery_date}
 
 
-def _failures(root: SourceNode, records: dict[int, Record]) -> dict[str, str]:
+def _failures(root: SourceNode, records: dict[int, TileRecord]) -> dict[str, str]:
     named = enumerate(tiles_of(root))
     return {t.name: e for k, t in named if (e := records[k].error) is not None}
 

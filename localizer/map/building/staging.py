@@ -44,7 +44,7 @@ class StoredTile:
 
 
 @dataclass(frozen=True)
-class Record:
+class TileRecord:
     """What became of one source tile: the files made of it, or why there are none."""
 
     tiles: tuple[StoredTile, ...]
@@ -57,12 +57,12 @@ class Staging:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def record(self, key: int) -> Record | None:
+    def record(self, key: int) -> TileRecord | None:
         """The record of a source tile that is finished, its files present."""
         try:
             data = json.loads(self._record_path(key).read_bytes())
             tiles = tuple(_stored_from_json(t) for t in data["tiles"])
-            record = Record(tiles, data["error"])
+            record = TileRecord(tiles, data["error"])
         except (OSError, ValueError, TypeError, KeyError):
             return None
         for part, tile in enumerate(record.tiles):
@@ -75,7 +75,7 @@ class Staging:
         """Where a source tile's part lies while the build runs."""
         return self.folder / "parts" / f"{key // 1000:04d}" / f"{key:07d}-{part}.safetensors"
 
-    def store(self, key: int, meshes: list[SourceMesh]) -> Record:
+    def store(self, key: int, meshes: list[SourceMesh]) -> TileRecord:
         """Write a source tile's meshes (positions: ENU metres) and then its record."""
         self.tile_path(key, 0).parent.mkdir(parents=True, exist_ok=True)
         tiles = []
@@ -83,13 +83,13 @@ class Staging:
             data, stored = stored_tile(mesh)
             _write(self.tile_path(key, part), data)
             tiles.append(stored)
-        return self._finish(key, Record(tuple(tiles)))
+        return self._finish(key, TileRecord(tuple(tiles)))
 
-    def reject(self, key: int, reason: str) -> Record:
+    def reject(self, key: int, reason: str) -> TileRecord:
         """Record that a source tile could not be imported."""
-        return self._finish(key, Record((), reason))
+        return self._finish(key, TileRecord((), reason))
 
-    def _finish(self, key: int, record: Record) -> Record:
+    def _finish(self, key: int, record: TileRecord) -> TileRecord:
         path = self._record_path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(path, json.dumps(asdict(record)).encode())

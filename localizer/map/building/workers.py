@@ -16,7 +16,7 @@ import numpy as np
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
 from localizer.map.building.isolation import call_apart, confine, out_of_memory
-from localizer.map.building.staging import Record, Staging
+from localizer.map.building.staging import Staging, TileRecord
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
 from localizer.map.source import SourceMesh, SourceNode, TileSource
@@ -33,7 +33,7 @@ class ImportJob:
     lift_m: float
     rules: ImportRules = DEFAULT_RULES
 
-    def run(self, key: int, tile: TileSource) -> Record:
+    def run(self, key: int, tile: TileSource) -> TileRecord:
         """Import one tile; a bad one is recorded, not raised."""
         try:
             meshes = [self._to_enu(m) for m in tile.load() if len(m.faces)]
@@ -43,7 +43,7 @@ class ImportJob:
             return self.staged.reject(key, out_of_memory(self.rules))
         return self.staged.store(key, meshes)
 
-    def run_in_time(self, key: int, tile: TileSource) -> Record:
+    def run_in_time(self, key: int, tile: TileSource) -> TileRecord:
         """`run` in a process of a pool, which dies when the time is up: a decoder that does not
         come back cannot be stopped otherwise.
         """
@@ -69,7 +69,7 @@ class ImportJob:
 
 
 @dataclass(frozen=True)
-class Workers:
+class ImportWorkers:
     """Who imports. count: of processes; apart: in processes of their own, even one; scheduler:
     address of a Dask scheduler instead.
     """
@@ -86,12 +86,12 @@ def tiles_of(root: SourceNode) -> Iterator[TileSource]:
 
 
 def import_all(
-    root: SourceNode, job: ImportJob, workers: Workers, progress: Progress
-) -> dict[int, Record]:
+    root: SourceNode, job: ImportJob, workers: ImportWorkers, progress: Progress
+) -> dict[int, TileRecord]:
     """Records of every source tile, by its place in `tiles_of` order. progress: called here, in the
     caller's thread, with the number of tiles that are done and of all.
     """
-    records: dict[int, Record] = {}
+    records: dict[int, TileRecord] = {}
     todo: list[tuple[int, TileSource]] = []
     for key, tile in enumerate(tiles_of(root)):
         done = job.staged.record(key)
@@ -115,14 +115,14 @@ def import_all(
 
 def _run_here(
     job: ImportJob, todo: Iterable[tuple[int, TileSource]]
-) -> Iterator[tuple[int, Record]]:
+) -> Iterator[tuple[int, TileRecord]]:
     for key, tile in todo:
         yield key, job.run(key, tile)
 
 
 def _run_dask(
     job: ImportJob, todo: list[tuple[int, TileSource]], address: str
-) -> Iterator[tuple[int, Record]]:
+) -> Iterator[tuple[int, TileRecord]]:
     try:
         from distributed import Client, as_completed
     except ImportError as error:
@@ -141,14 +141,14 @@ def _run_dask(
                 running.add(client.submit(_numbered, job, *item, pure=False))
 
 
-def _numbered(job: ImportJob, key: int, tile: TileSource) -> tuple[int, Record]:
+def _numbered(job: ImportJob, key: int, tile: TileSource) -> tuple[int, TileRecord]:
     return key, job.run(key, tile)
 
 
 def _run_pool(
     job: ImportJob, todo: list[tuple[int, TileSource]], workers: int
-) -> Iterator[tuple[int, Record]]:
-    pending: dict[Future[Record], tuple[int, TileSource]] = {}
+) -> Iterator[tuple[int, TileRecord]]:
+    pending: dict[Future[TileRecord], tuple[int, TileSource]] = {}
     queue = iter(todo)
     suspects: list[tuple[int, TileSource]] = []
     pool = worker_pool(min(workers, max(1, len(todo))), job.rules)
@@ -177,7 +177,7 @@ def _run_pool(
         yield item[0], _run_alone(job, *item)
 
 
-def _run_alone(job: ImportJob, key: int, tile: TileSource) -> Record:
+def _run_alone(job: ImportJob, key: int, tile: TileSource) -> TileRecord:
     """A tile that was in flight when a worker died: does it kill this one too?"""
     try:
         return call_apart(job.run, key, tile, rules=job.rules, what="its decoder")

@@ -23,7 +23,7 @@ SHIPPED = Path(__file__).with_name("sources.yaml")
 _MOST_BYTES = 1 << 20
 
 
-class Source(BaseModel):
+class CatalogueSource(BaseModel):
     """One service. A key that is not known here is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -61,7 +61,7 @@ class Source(BaseModel):
     parallel: int = Field(4, ge=1, le=8, description="requests under way at once, at most")
 
     @model_validator(mode="after")
-    def _holds(self) -> Source:
+    def _holds(self) -> CatalogueSource:
         west, south, east, north = self.bounds
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
             raise ValueError("bounds: west, south, east, north in degrees")
@@ -92,15 +92,17 @@ class Source(BaseModel):
         return (east - west) * (north - south)
 
 
-def load_sources(more: tuple[Path, ...] = (), shipped: Path = SHIPPED) -> tuple[Source, ...]:
+def load_sources(
+    more: tuple[Path, ...] = (), shipped: Path = SHIPPED
+) -> tuple[CatalogueSource, ...]:
     """The shipped file's sources, and those of other files, which replace shipped ones of the same
     name. `MapFetchError` names what does not hold, and what is refused.
     """
-    found: dict[str, Source] = {}
+    found: dict[str, CatalogueSource] = {}
     for path in (shipped, *more):
         for entry in _entries(path):
             try:
-                source = Source.model_validate(entry)
+                source = CatalogueSource.model_validate(entry)
             except ValidationError as error:
                 first = error.errors()[0]
                 where = ".".join(str(part) for part in first["loc"])
@@ -126,7 +128,9 @@ def _entries(path: Path) -> list[Any]:
     return entries
 
 
-def choose(sources: tuple[Source, ...], area: Area, role: str, name: str | None = None) -> Source:
+def choose(
+    sources: tuple[CatalogueSource, ...], area: Area, role: str, name: str | None = None
+) -> CatalogueSource:
     """The source of that name, else the finest whose bounds hold the area. role: imagery, or
     heights, which takes a surface before a terrain and a world's model only as the last resort.
     """

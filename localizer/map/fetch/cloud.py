@@ -24,10 +24,10 @@ from rasterio.warp import transform_bounds
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, utm_zone
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.heights import UNITS, metres_of
 from localizer.map.fetch.polite import PoliteClient, shown
-from localizer.map.fetch.raster import Grid, Piece, Plan, cut, grid_over
+from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, cut, grid_over
 from localizer.map.importers.raster_file import offline
 
 NODATA = -32768.0
@@ -134,9 +134,9 @@ class CloudFile:
 
 
 def plan_files(
-    source: Source, area: Area, resolution_m: float, files: Sequence[CloudFile],
+    source: CatalogueSource, area: Area, resolution_m: float, files: Sequence[CloudFile],
     client: PoliteClient,
-) -> Plan:  # fmt: skip
+) -> FetchPlan:  # fmt: skip
     """Windows of the files that meet an area. The grid is the files' own where they share it."""
     wanted = [f for f in files if area.meets(f.bounds)]
     if not wanted:
@@ -161,10 +161,10 @@ def plan_files(
     size = _HEIGHT_BYTES if source.has_heights else _PICTURE_BYTES
     expected = size * grid.width * grid.height
     requests = len(there) + math.ceil(expected / _BLOCK)
-    return Plan(grid, tuple(pieces), size, requests, lacking)
+    return FetchPlan(grid, tuple(pieces), size, requests, lacking)
 
 
-def degree_files(source: Source, area: Area) -> list[CloudFile]:
+def degree_files(source: CatalogueSource, area: Area) -> list[CloudFile]:
     """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file. A degree that
     is all sea has no file, nor has some land whose heights are not public: nothing says which.
     """
@@ -182,7 +182,7 @@ def degree_files(source: Source, area: Area) -> list[CloudFile]:
 
 def _grid_of(
     files: Sequence[CloudFile], area: Area, resolution_m: float, client: PoliteClient
-) -> Grid:
+) -> FetchGrid:
     """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
     crs, transform = _lie_of(files[0], client)
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
@@ -213,7 +213,7 @@ def _name(url: str) -> str:
     return url.rpartition("/")[2].partition("?")[0]
 
 
-def _meets(window: Grid, file: CloudFile) -> bool:
+def _meets(window: FetchGrid, file: CloudFile) -> bool:
     west, south, east, north = transform_bounds(
         window.crs.to_wkt(), "EPSG:4326", *window.bounds, densify_pts=21
     )
@@ -248,7 +248,7 @@ def check_depth(name: str, dtype: str) -> None:
 
 
 def _window(
-    source: Source, window: Grid, files: Sequence[CloudFile], client: PoliteClient
+    source: CatalogueSource, window: FetchGrid, files: Sequence[CloudFile], client: PoliteClient
 ) -> bytes | None:
     """The first file that knows a pixel gives it."""
     bands = 1 if source.has_heights else 3
@@ -266,7 +266,7 @@ def _window(
 
 
 def _of_file(
-    source: Source, window: Grid, url: str, client: PoliteClient
+    source: CatalogueSource, window: FetchGrid, url: str, client: PoliteClient
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """A window's bands (n, height, width) of one file, and where it knows them."""
     bands = 1 if source.has_heights else 3
@@ -293,7 +293,7 @@ def _of_file(
             raise failed[0]
 
 
-def _warped(data: Any, window: Grid, how: Resampling, source: Source) -> WarpedVRT:
+def _warped(data: Any, window: FetchGrid, how: Resampling, source: CatalogueSource) -> WarpedVRT:
     own = CRS(data.crs)
     flat = own.sub_crs_list[0] if own.is_compound else own
     options: dict[str, Any] = {}
@@ -307,7 +307,7 @@ def _warped(data: Any, window: Grid, how: Resampling, source: Source) -> WarpedV
     )  # fmt: skip
 
 
-def as_geotiff(bands: np.ndarray, known: np.ndarray, window: Grid) -> bytes:
+def as_geotiff(bands: np.ndarray, known: np.ndarray, window: FetchGrid) -> bytes:
     """A piece as a file. bands: (n, height, width); known: where they hold."""
     heights = bands.dtype == np.float32
     values = np.where(known, bands, NODATA if heights else 0).astype(bands.dtype)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import degree_files, plan_files
 from localizer.map.fetch.mosaic import assemble, check_piece
 from localizer.map.fetch.polite import PoliteClient
-from localizer.map.fetch.raster import Piece, Plan
+from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.fetch.stac import stac_files
 from localizer.map.fetch.tiles import plan_tiles
 from localizer.map.fetch.web_map import plan_blocks
@@ -28,7 +28,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FetchEstimate:
     """What fetching would take."""
 
     requests: int
@@ -37,7 +37,9 @@ class Estimate:
     pixels: tuple[int, int]
 
 
-def make_plan(source: Source, area: Area, resolution_m: float, client: PoliteClient) -> Plan:
+def make_plan(
+    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+) -> FetchPlan:
     """All pieces. It may ask the service what it has (capabilities, a catalogue, a file's head)."""
     if source.kind in ("wms", "wcs"):
         return plan_blocks(source, area, resolution_m, client)
@@ -50,15 +52,15 @@ def make_plan(source: Source, area: Area, resolution_m: float, client: PoliteCli
     return plan_files(source, area, resolution_m, files, client)
 
 
-def estimate(source: Source, plan: Plan) -> Estimate:
+def estimate(source: CatalogueSource, plan: FetchPlan) -> FetchEstimate:
     """Before anything large is asked for."""
     seconds = max(plan.requests / source.rate_per_s, plan.bytes / _LINE_BYTES_PER_S)
     size = plan.grid.width, plan.grid.height
-    return Estimate(plan.requests, plan.bytes, seconds, size)
+    return FetchEstimate(plan.requests, plan.bytes, seconds, size)
 
 
 def fetch(
-    source: Source, plan: Plan, folder: Path, out: Path, client: PoliteClient,
+    source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path, client: PoliteClient,
     progress: Progress = lambda _done, _total: None,
 ) -> float:  # fmt: skip
     """The raster `out`. Pieces that lie in the folder from a run that was cut off are not asked for
@@ -98,7 +100,7 @@ def fetch(
     return known
 
 
-def _keep(source: Source, piece: Piece, folder: Path, client: PoliteClient) -> None:
+def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: PoliteClient) -> None:
     """A piece becomes a file when it is whole; an empty one says that there is nothing."""
     data = piece.get(client)
     if data is not None:
@@ -109,7 +111,7 @@ def _keep(source: Source, piece: Piece, folder: Path, client: PoliteClient) -> N
     os.replace(partial, path)
 
 
-def _claim(source: Source, plan: Plan, folder: Path) -> None:
+def _claim(source: CatalogueSource, plan: FetchPlan, folder: Path) -> None:
     """The folder belongs to this plan: another's pieces are not mixed in."""
     told = {
         "source": source.model_dump(mode="json"), "crs": plan.grid.crs.to_wkt(),

@@ -8,7 +8,7 @@ from typing import Any
 from pyproj import CRS
 
 from localizer.errors import GeoreferenceError, MapFetchError, MapSourceError
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.importers.height_crs import stated_heights
 from localizer.map.importers.raster_file import HeightBand, height_band
 from localizer.map.importers.rules import DEFAULT_RULES
@@ -17,7 +17,7 @@ UNITS = ("m",)
 """Of what is written: a CRS in feet would else be asked for the heights' unit."""
 
 
-def metres_of(source: Source, name: str, data: Any, crs: CRS) -> HeightBand:
+def metres_of(source: CatalogueSource, name: str, data: Any, crs: CRS) -> HeightBand:
     """How a file's numbers become metres: its unit, scale and offset. data: as rasterio opens it;
     crs: where it has none of its own. `MapFetchError` where nothing tells the unit, or where it
     says another datum than the source.

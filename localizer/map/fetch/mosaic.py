@@ -17,10 +17,10 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from localizer.errors import MapFetchError
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import NODATA, check_depth
 from localizer.map.fetch.heights import UNITS, metres_of
-from localizer.map.fetch.raster import Piece, Plan
+from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.importers.raster_file import offline
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -28,7 +28,7 @@ _LARGER, _MOST_BANDS = 4, 16  # than asked for, of what says its own place; of a
 _LOWEST_M, _HIGHEST_M = -1000.0, 9500.0
 
 
-def assemble(source: Source, plan: Plan, folder: Path, out: Path) -> float:
+def assemble(source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path) -> float:
     """Write the raster; what no piece has is masked. Returns the share of it that is known."""
     grid, heights = plan.grid, source.has_heights
     profile: dict[str, Any] = {
@@ -65,7 +65,7 @@ def assemble(source: Source, plan: Plan, folder: Path, out: Path) -> float:
     return known_pixels / (grid.width * grid.height)
 
 
-def check_piece(source: Source, piece: Piece, data: bytes) -> None:
+def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
     """`MapFetchError` for what is no whole image, of more than 8 bits, or not of the size that was
     asked for.
     """
@@ -94,7 +94,7 @@ def check_piece(source: Source, piece: Piece, data: bytes) -> None:
         )
 
 
-def _require_size(source: Source, piece: Piece, size: tuple[int, int], bands: int) -> None:
+def _require_size(source: CatalogueSource, piece: Piece, size: tuple[int, int], bands: int) -> None:
     """Before it is unpacked: of a few bytes some formats make gigabytes."""
     wanted = piece.width, piece.height
     large = piece.placed and max(size) > _LARGER * max(wanted)
@@ -110,7 +110,7 @@ def _picture(data: bytes) -> Image.Image:
     return Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP"))
 
 
-def _place(source: Source, plan: Plan, piece: Piece, data: bytes, file: Any) -> int:
+def _place(source: CatalogueSource, plan: FetchPlan, piece: Piece, data: bytes, file: Any) -> int:
     """Write a piece where it belongs; returns how many pixels it knows."""
     grid = plan.grid
     if data[:4] in _TIFF:
@@ -137,7 +137,9 @@ def _place(source: Source, plan: Plan, piece: Piece, data: bytes, file: Any) -> 
     return int(known.sum())
 
 
-def _values(source: Source, plan: Plan, piece: Piece, image: Any) -> tuple[np.ndarray, np.ndarray]:
+def _values(
+    source: CatalogueSource, plan: FetchPlan, piece: Piece, image: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """(bands, height, width), and where they are known."""
     wanted = 1 if source.has_heights else 3
     if piece.placed and image.crs is not None and not image.transform.is_identity:

@@ -42,7 +42,7 @@ class Manners:
 
 
 @dataclass(frozen=True)
-class Answer:
+class HttpAnswer:
     """What came. status: 200 or 206."""
 
     status: int
@@ -94,18 +94,18 @@ class PoliteClient:
         url: str,
         headers: Mapping[str, str] | None = None,
         missing: Collection[int] = (),
-    ) -> Answer:
+    ) -> HttpAnswer:
         """The answer to a GET, redirections followed, repeated while the server is busy. missing:
         statuses that mean that there is nothing, and are an answer, too.
         """
         return self._followed(_Request(url, headers or {}), missing)
 
-    def post(self, url: str, document: object) -> Answer:
+    def post(self, url: str, document: object) -> HttpAnswer:
         """The answer to a POST of a JSON document, as of `get`."""
         body = json.dumps(document).encode()
         return self._followed(_Request(url, {"Content-Type": "application/json"}, body), ())
 
-    def _followed(self, request: _Request, missing: Collection[int]) -> Answer:
+    def _followed(self, request: _Request, missing: Collection[int]) -> HttpAnswer:
         for _ in range(_MOST_REDIRECTS + 1):
             require_allowed(request.url)
             answer = self._patiently(request, missing)
@@ -116,7 +116,7 @@ class PoliteClient:
             request = replace(request, url=there, body=body)
         raise MapFetchError(f"{shown(request.url)}: redirected more than {_MOST_REDIRECTS} times")
 
-    def _patiently(self, request: _Request, missing: Collection[int]) -> Answer:
+    def _patiently(self, request: _Request, missing: Collection[int]) -> HttpAnswer:
         url = request.url
         wait_s, why = _FIRST_WAIT_S, ""
         for attempt in range(_TRIES):
@@ -146,7 +146,7 @@ class PoliteClient:
         if due > now:
             self._sleep(due - now)
 
-    def _once(self, request: _Request) -> Answer:
+    def _once(self, request: _Request) -> HttpAnswer:
         url, headers = request.url, {"User-Agent": _AGENT, **request.headers}
         reply = self._pool.request(
             "GET" if request.body is None else "POST", url, headers=headers, body=request.body,
@@ -163,7 +163,7 @@ class PoliteClient:
             reply.release_conn()
         kind = reply.headers.get("content-type", "").split(";")[0].strip().lower()
         known = {name.lower(): value for name, value in reply.headers.items()}
-        return Answer(int(reply.status), kind, bytes(data), known)
+        return HttpAnswer(int(reply.status), kind, bytes(data), known)
 
     def _count(self, size: int) -> None:
         with self._lock:

@@ -17,7 +17,7 @@ _MOST_PIECES = 200_000
 
 
 @dataclass(frozen=True)
-class Grid:
+class FetchGrid:
     """Pixels in a CRS. left, top: of the first pixel's corner; pixel: (east, south), CRS units."""
 
     crs: CRS
@@ -38,10 +38,10 @@ class Grid:
         """From column and row to the CRS."""
         return Affine(self.pixel[0], 0.0, self.left, 0.0, -self.pixel[1], self.top)
 
-    def window(self, column: int, row: int, width: int, height: int) -> Grid:
+    def window(self, column: int, row: int, width: int, height: int) -> FetchGrid:
         """A part of it."""
         left, top = self.left + column * self.pixel[0], self.top - row * self.pixel[1]
-        return Grid(self.crs, left, top, self.pixel, width, height)
+        return FetchGrid(self.crs, left, top, self.pixel, width, height)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -67,13 +67,13 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FetchPlan:
     """All that is needed of one source. bytes_per_pixel: of what is sent, a guess; requests: of all
     pieces, a guess where a piece takes several. lacking: names of files that the server does not
     have: nothing is known where they would be.
     """
 
-    grid: Grid
+    grid: FetchGrid
     pieces: tuple[Piece, ...]
     bytes_per_pixel: float
     requests: int
@@ -90,18 +90,18 @@ def grid_over(
     pixel: tuple[float, float],
     crs: CRS,
     origin: tuple[float, float] = (0.0, 0.0),
-) -> Grid:
+) -> FetchGrid:
     """The pixels that cover bounds; their corners lie at multiples of a pixel from an origin."""
     left, bottom, right, top = bounds
     first = math.floor((left - origin[0]) / pixel[0]), math.floor((origin[1] - top) / pixel[1])
     last = math.ceil((right - origin[0]) / pixel[0]), math.ceil((origin[1] - bottom) / pixel[1])
-    return Grid(
+    return FetchGrid(
         crs, origin[0] + first[0] * pixel[0], origin[1] - first[1] * pixel[1], pixel,
         max(last[0] - first[0], 1), max(last[1] - first[1], 1),
     )  # fmt: skip
 
 
-def cut(grid: Grid, side: int) -> list[tuple[int, int, int, int]]:
+def cut(grid: FetchGrid, side: int) -> list[tuple[int, int, int, int]]:
     """Column, row, width and height of pieces with at most `side` pixels a side."""
     count = math.ceil(grid.width / side) * math.ceil(grid.height / side)
     if count > _MOST_PIECES:

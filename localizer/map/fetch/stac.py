@@ -11,7 +11,7 @@ from urllib.parse import urlencode, urljoin
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile
 from localizer.map.fetch.polite import PoliteClient, shown
 from localizer.map.fetch.terms import require_allowed
@@ -21,7 +21,7 @@ _PAGE = 100  # items that are asked for at once; a service may give fewer
 _TIFFS = ("image/tiff", "image/vnd.stac.geotiff")
 
 
-def stac_files(source: Source, area: Area, client: PoliteClient) -> list[CloudFile]:
+def stac_files(source: CatalogueSource, area: Area, client: PoliteClient) -> list[CloudFile]:
     """The asset of each item that meets the area; of items of one place the newest comes first."""
     try:
         import pystac
@@ -52,11 +52,11 @@ def stac_files(source: Source, area: Area, client: PoliteClient) -> list[CloudFi
     return files
 
 
-def _is_api(source: Source) -> bool:
+def _is_api(source: CatalogueSource) -> bool:
     return not source.url.lower().split("?")[0].endswith(".json")
 
 
-def _asset(source: Source, item: Any) -> Any:
+def _asset(source: CatalogueSource, item: Any) -> Any:
     if source.asset:
         return next((a for k, a in item.assets.items() if fnmatchcase(k, source.asset)), None)
     for asset in item.assets.values():
@@ -65,7 +65,7 @@ def _asset(source: Source, item: Any) -> Any:
     return None
 
 
-def _searched(source: Source, area: Area, client: PoliteClient) -> Iterator[Any]:
+def _searched(source: CatalogueSource, area: Area, client: PoliteClient) -> Iterator[Any]:
     """Item Search of the STAC API, page by page: by GET, or by POST where only that is offered."""
     import pystac
 
@@ -112,7 +112,7 @@ class _Page:
         return None
 
 
-def _first_page(source: Source, area: Area, client: PoliteClient) -> _Page:
+def _first_page(source: CatalogueSource, area: Area, client: PoliteClient) -> _Page:
     box = [round(v, 7) for v in (area.west, area.south, area.east, area.north)]
     home = source.url.rstrip("/")
     landing = json.loads(client.get(home).data)
@@ -130,7 +130,7 @@ def _first_page(source: Source, area: Area, client: PoliteClient) -> _Page:
     return _Page.got(f"{there}?{urlencode(parameters)}", None, client)
 
 
-def _walked(source: Source, area: Area, client: PoliteClient) -> Iterator[Any]:
+def _walked(source: CatalogueSource, area: Area, client: PoliteClient) -> Iterator[Any]:
     """A static catalogue, but not what lies elsewhere or in another collection."""
     import pystac
     from pystac.stac_io import DefaultStacIO

@@ -14,9 +14,16 @@ from pyproj.exceptions import CRSError
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.polite import PoliteClient, shown
-from localizer.map.fetch.raster import Piece, Plan, cut, grid_over, metres_per_unit, north_first
+from localizer.map.fetch.raster import (
+    FetchPlan,
+    Piece,
+    cut,
+    grid_over,
+    metres_per_unit,
+    north_first,
+)
 from localizer.map.fetch.terms import require_allowed
 from localizer.map.fetch.xml import parsed, texts
 
@@ -43,7 +50,9 @@ class Level:
     south_first: bool = False
 
 
-def plan_tiles(source: Source, area: Area, resolution_m: float, client: PoliteClient) -> Plan:
+def plan_tiles(
+    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+) -> FetchPlan:
     """The tiles over an area, of the level that is about as fine as wished."""
     if source.kind == "wmts":
         level = _wmts_level(source, area, resolution_m, client)
@@ -71,10 +80,10 @@ def plan_tiles(source: Source, area: Area, resolution_m: float, client: PoliteCl
             at = tile * width - column, tile_row * height - row
             get = partial(_tile, url)
             pieces.append(Piece(f"{tile}-{tile_row}", *at, width, height, get))
-    return Plan(grid, tuple(pieces), _BYTES, len(pieces))
+    return FetchPlan(grid, tuple(pieces), _BYTES, len(pieces))
 
 
-def _mercator_level(source: Source, area: Area, resolution_m: float) -> Level:
+def _mercator_level(source: CatalogueSource, area: Area, resolution_m: float) -> Level:
     crs, side = CRS.from_epsg(3857), source.tile_px
     coarsest = 2 * _HALF_M / side * metres_per_unit(crs, area.centre[0])[0]
     zoom = math.ceil(math.log2(max(coarsest / (_SLACK * resolution_m), 1.0)))
@@ -87,7 +96,9 @@ def _mercator_level(source: Source, area: Area, resolution_m: float) -> Level:
     return Level(crs, -_HALF_M, _HALF_M, pixel, (side, side), count, address, south_first)
 
 
-def _wmts_level(source: Source, area: Area, resolution_m: float, client: PoliteClient) -> Level:
+def _wmts_level(
+    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+) -> Level:
     service = _capabilities(source, client)
     layer = service.contents.get(source.layer)
     if layer is None:
@@ -113,7 +124,7 @@ def _wmts_level(source: Source, area: Area, resolution_m: float, client: PoliteC
     )  # fmt: skip
 
 
-def _capabilities(source: Source, client: PoliteClient) -> Any:
+def _capabilities(source: CatalogueSource, client: PoliteClient) -> Any:
     try:
         from owslib.wmts import WebMapTileService
     except ImportError as error:
@@ -131,7 +142,7 @@ def _capabilities(source: Source, client: PoliteClient) -> Any:
         raise MapFetchError(f"{shown(url)}: no capabilities of a WMTS: {texts(data)}") from error
 
 
-def _matrix_set(source: Source, service: Any, layer: Any) -> tuple[str, CRS]:
+def _matrix_set(source: CatalogueSource, service: Any, layer: Any) -> tuple[str, CRS]:
     known = {}
     for name in layer.tilematrixsetlinks:
         if name in service.tilematrixsets:
@@ -153,7 +164,9 @@ def _matrix_set(source: Source, service: Any, layer: Any) -> tuple[str, CRS]:
     )
 
 
-def _wmts_address(source: Source, service: Any, layer: Any, matrix_set: str, matrix: str) -> str:
+def _wmts_address(
+    source: CatalogueSource, service: Any, layer: Any, matrix_set: str, matrix: str
+) -> str:
     style = source.style or next(
         (name for name, style in layer.styles.items() if style.get("isDefault")),
         next(iter(layer.styles), "default"),

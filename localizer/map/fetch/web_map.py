@@ -10,12 +10,12 @@ from pyproj import CRS
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.polite import PoliteClient, shown
 from localizer.map.fetch.raster import (
-    Grid,
+    FetchGrid,
+    FetchPlan,
     Piece,
-    Plan,
     cut,
     grid_over,
     metres_per_unit,
@@ -27,7 +27,9 @@ _JPEG_BYTES, _HEIGHT_BYTES = 0.4, 4.0
 _MARGIN = 2  # pixels of a coverage that is cut by its own grid, so that no seam stays
 
 
-def plan_blocks(source: Source, area: Area, resolution_m: float, client: PoliteClient) -> Plan:
+def plan_blocks(
+    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+) -> FetchPlan:
     """WMS GetMap or WCS GetCoverage for each block of a grid in the source's CRS."""
     crs = CRS(source.crs)
     per_unit = metres_per_unit(crs, area.centre[0])
@@ -47,10 +49,10 @@ def plan_blocks(source: Source, area: Area, resolution_m: float, client: PoliteC
         placed = source.kind == "wcs"
         pieces.append(Piece(f"{column}-{row}", column, row, width, height, get, placed))
     size = _HEIGHT_BYTES if source.has_heights else _JPEG_BYTES
-    return Plan(grid, tuple(pieces), size, len(pieces))
+    return FetchPlan(grid, tuple(pieces), size, len(pieces))
 
 
-def wms_url(source: Source, window: Grid) -> str:
+def wms_url(source: CatalogueSource, window: FetchGrid) -> str:
     """GetMap; OGC 06-042. Version 1.3.0 names a CRS's axes in its own order."""
     version = source.version or "1.3.0"
     left, bottom, right, top = window.bounds
@@ -70,7 +72,7 @@ def wms_url(source: Source, window: Grid) -> str:
     )  # fmt: skip
 
 
-def wcs_1_url(source: Source, window: Grid) -> str:
+def wcs_1_url(source: CatalogueSource, window: FetchGrid) -> str:
     """GetCoverage of 1.0.0 (OGC 03-065r6): a rectangle, east first, in so many pixels."""
     bounds = ",".join(f"{v:.10g}" for v in window.bounds)
     return _with(
@@ -84,7 +86,7 @@ def wcs_1_url(source: Source, window: Grid) -> str:
     )  # fmt: skip
 
 
-def wcs_2_url(source: Source, window: Grid, axes: tuple[str, str]) -> str:
+def wcs_2_url(source: CatalogueSource, window: FetchGrid, axes: tuple[str, str]) -> str:
     """GetCoverage of 2.0.1 (OGC 09-147r3): by its own pixels, with some more about them."""
     left, bottom, right, top = window.bounds
     east, south = (_MARGIN * p for p in window.pixel)
@@ -102,7 +104,7 @@ def wcs_2_url(source: Source, window: Grid, axes: tuple[str, str]) -> str:
     return url + "".join(f"&SUBSET={n}({low:.10g},{high:.10g})" for n, low, high in subsets)
 
 
-def _axes(source: Source, client: PoliteClient) -> tuple[str, str]:
+def _axes(source: CatalogueSource, client: PoliteClient) -> tuple[str, str]:
     """Names of easting and northing: as the file says, or as the coverage does."""
     if source.axes is not None or source.version.startswith("1."):
         return source.axes or ("", "")

@@ -60,7 +60,7 @@ MIN_CELLS = 16  # of a tile's side
 
 
 @dataclass(frozen=True)
-class Grid:
+class HeightGrid:
     """The quadtree's geometry. crs: projected, metres, as WKT; left, top: of the first vertex;
     step: (east, south) metres between vertices of the finest level; cells: a tile's side.
     """
@@ -81,7 +81,7 @@ class RasterTile:
 
     dsm: Path
     ortho: Path
-    grid: Grid
+    grid: HeightGrid
     level: int
     column: int
     row: int
@@ -291,7 +291,7 @@ def _kind(data: DatasetReader) -> str:
     )
 
 
-def _grid(dsm: DatasetReader, ortho: DatasetReader) -> Grid:
+def _grid(dsm: DatasetReader, ortho: DatasetReader) -> HeightGrid:
     crs = _metric_crs(dsm)
     if _flat_crs(dsm) == crs and not dsm.transform.b and not dsm.transform.d:
         step = abs(dsm.transform.a), abs(dsm.transform.e)
@@ -309,7 +309,7 @@ def _grid(dsm: DatasetReader, ortho: DatasetReader) -> Grid:
     cells = min(cells, TEXELS)
     span = max((right - left) / step[0], (top - bottom) / step[1]) / cells
     levels = 1 + max(0, math.ceil(math.log2(max(span, 1.0))))
-    return Grid(crs.to_wkt(), left + step[0] / 2, top - step[1] / 2, step, cells, levels)
+    return HeightGrid(crs.to_wkt(), left + step[0] / 2, top - step[1] / 2, step, cells, levels)
 
 
 def _flat_crs(data: DatasetReader) -> CRS:

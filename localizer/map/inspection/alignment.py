@@ -21,7 +21,7 @@ _LEAST_PEAK = 4.0  # of the best shift's correlation over the others', in their 
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ImageryOffset:
     """east_m, north_m: by how much the picture lies beside the surface; peak: how clear that is, in
     standard deviations; edges: cells of the surface with a step. known: whether it can be said.
     """
@@ -42,7 +42,7 @@ class Alignment:
         return float(np.hypot(self.east_m, self.north_m))
 
 
-def alignment_of(mosaic: Mosaic) -> Alignment:
+def alignment_of(mosaic: Mosaic) -> ImageryOffset:
     """The shift of the picture at which its edges lie best on the surface's steps.
 
     Good to about a metre: walls that lean in the picture draw it to one side. Without colours
@@ -60,10 +60,10 @@ def alignment_of(mosaic: Mosaic) -> Alignment:
     steps &= inner > 0
     edges = int(steps.sum())
     if edges < _LEAST_EDGES or min(size) <= 4 * reach:
-        return Alignment(0.0, 0.0, 0.0, edges)
+        return ImageryOffset(0.0, 0.0, 0.0, edges)
     picture = _colour_edges(rgb)
     if float(np.percentile(picture, 97)) < _LEAST_COLOUR:
-        return Alignment(0.0, 0.0, 0.0, edges)
+        return ImageryOffset(0.0, 0.0, 0.0, edges)
     picture = np.minimum(picture, np.percentile(picture, 97)) - cv2.blur(picture, (41, 41))
     surface = steps.astype(np.float32) - cv2.blur(steps.astype(np.float32), (41, 41))
     core = surface[reach:-reach, reach:-reach]
@@ -74,7 +74,7 @@ def alignment_of(mosaic: Mosaic) -> Alignment:
     far = np.hypot(*(np.indices(match.shape) - np.reshape((row, column), (2, 1, 1)))) > 6
     peak = float((match[row, column] - match[far].mean()) / max(float(match[far].std()), 1e-9))
     dx, dy = _between(match, int(row), int(column))
-    return Alignment((dx - reach) * _CELL_M, -(dy - reach) * _CELL_M, peak, edges)
+    return ImageryOffset((dx - reach) * _CELL_M, -(dy - reach) * _CELL_M, peak, edges)
 
 
 def _colour_edges(rgb: Float32) -> Float32:

@@ -13,7 +13,7 @@ from localizer.errors import MapCacheError
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.tile import facing_fault, vector_area
-from localizer.map.inspection.alignment import Alignment, alignment_of
+from localizer.map.inspection.alignment import ImageryOffset, alignment_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
 from localizer.map.inspection.usable import Usable, usable_part
 from localizer.types import Image
@@ -40,7 +40,7 @@ class Grade(Enum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class MapFinding:
     """One question about a map. name: what; found: with units; grade; words: what it means."""
 
     name: str
@@ -68,7 +68,7 @@ class MapCheck:
     about the map; usable: the largest part of it without gaps, blanks and coarse texels.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[MapFinding, ...]
     pictures: dict[str, Image]
     size_m: tuple[float, float]
     usable: Usable | None
@@ -194,7 +194,7 @@ def _flat_share(mosaic: Mosaic) -> float:
     return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0) / max(known.sum(), 1))
 
 
-def _intact(cache: TileCache) -> list[Finding]:
+def _intact(cache: TileCache) -> list[MapFinding]:
     """Whether all tiles can be read, of which the pictures need one level; and which way is up."""
     damaged: list[str] = []
     area: Array = np.zeros(3)
@@ -217,23 +217,23 @@ def _intact(cache: TileCache) -> list[Finding]:
     found = f"{len(damaged)} of {len(cache.tile_ids)} tiles"
     words = f"build it again: {damaged[0]}" if damaged else "each as its hash says"
     return [
-        Finding("damaged", found, Grade.BAD if damaged else Grade.GOOD, words),
-        Finding("ground", "faces up", Grade.GOOD, "as it should be")
+        MapFinding("damaged", found, Grade.BAD if damaged else Grade.GOOD, words),
+        MapFinding("ground", "faces up", Grade.GOOD, "as it should be")
         if fault is None
-        else Finding("ground", fault, Grade.BAD, "build it again with another --up-axis"),
+        else MapFinding("ground", fault, Grade.BAD, "build it again with another --up-axis"),
     ]
 
 
-def _source_finding(cache: TileCache) -> list[Finding]:
+def _source_finding(cache: TileCache) -> list[MapFinding]:
     """What the build doubted and did not stop for."""
     warnings = cache.manifest.warnings
     if not warnings:
         return []
     more = f"; and {len(warnings) - 1} more (`map info`)" if len(warnings) > 1 else ""
-    return [Finding("build warnings", str(len(warnings)), Grade.ADVICE, warnings[0] + more)]
+    return [MapFinding("build warnings", str(len(warnings)), Grade.ADVICE, warnings[0] + more)]
 
 
-def _coverage(mosaic: Mosaic, gaps: NDArray[np.bool_]) -> Finding:
+def _coverage(mosaic: Mosaic, gaps: NDArray[np.bool_]) -> MapFinding:
     share = float(1 - gaps.mean())
     rows, columns = gaps.shape
     found = (
@@ -241,22 +241,22 @@ def _coverage(mosaic: Mosaic, gaps: NDArray[np.bool_]) -> Finding:
         f"{columns * mosaic.gsd_m:.0f} x {rows * mosaic.gsd_m:.0f} m"
     )
     if share >= _LEAST_COVERED:
-        return Finding("coverage", found, Grade.GOOD, "fly where the map is, with its margin")
+        return MapFinding("coverage", found, Grade.GOOD, "fly where the map is, with its margin")
     words = "less than half of its rectangle is covered: look whether the mission's part is"
-    return Finding("coverage", found, Grade.ADVICE, words)
+    return MapFinding("coverage", found, Grade.ADVICE, words)
 
 
-def _holes_finding(mosaic: Mosaic, holes: NDArray[np.bool_]) -> Finding:
+def _holes_finding(mosaic: Mosaic, holes: NDArray[np.bool_]) -> MapFinding:
     share = float(holes.sum() / max((~np.isnan(mosaic.height)).sum(), 1))
     count = cv2.connectedComponents(holes.astype(np.uint8), connectivity=4)[0] - 1
     found = f"{count} of {_LEAST_HOLE_M2:.0f} m² or more, {100 * share:.2f} % of the area"
     if share > _MOST_HOLES:
-        return Finding("holes", found, Grade.BAD, "views over them have little to match")
+        return MapFinding("holes", found, Grade.BAD, "views over them have little to match")
     words = "small ones do no harm" if count else "none"
-    return Finding("holes", found, Grade.GOOD, words)
+    return MapFinding("holes", found, Grade.GOOD, words)
 
 
-def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> Finding:
+def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> MapFinding:
     share = float(blank.sum() / max((~np.isnan(mosaic.height)).sum(), 1))
     found = f"{100 * share:.2f} % of the area"
     if share > _MOST_BLANK:
@@ -264,58 +264,60 @@ def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> Finding:
             "surface without a picture (plain white or black, or a colour without a texture): the "
             "source lacks imagery there"
         )
-        return Finding("without picture", found, Grade.BAD, words)
+        return MapFinding("without picture", found, Grade.BAD, words)
     if (flat := _flat_share(mosaic)) > _MOST_FLAT:
         words = "plain colours: the picture shows nothing to match"
-        return Finding("without picture", f"{100 * flat:.0f} % of the area", Grade.BAD, words)
-    return Finding("without picture", found, Grade.GOOD, "as it should be")
+        return MapFinding("without picture", f"{100 * flat:.0f} % of the area", Grade.BAD, words)
+    return MapFinding("without picture", found, Grade.GOOD, "as it should be")
 
 
-def _texels(cache: TileCache, use: Use) -> Finding:
+def _texels(cache: TileCache, use: Use) -> MapFinding:
     gsd = _leaf_gsd(cache)
     if not len(gsd) and not cache.manifest.gsd_m:
-        return Finding("texel size", "none", Grade.BAD, "no tile has a picture")
+        return MapFinding("texel size", "none", Grade.BAD, "no tile has a picture")
     typical = float(np.median(gsd)) if len(gsd) else cache.manifest.gsd_m
     ratio = typical / use.pixel_m
     found = f"{typical:.2f} m (median), a working pixel {use.pixel_m:.2f} m at {use.height_m:.0f} m"
     if ratio <= _COARSE:
-        return Finding("texel size", found, Grade.GOOD, f"{ratio:.1f} working pixels")
+        return MapFinding("texel size", found, Grade.GOOD, f"{ratio:.1f} working pixels")
     words = f"{ratio:.1f} working pixels: the map is blurred beside the video; fly higher"
-    return Finding("texel size", found, Grade.ADVICE if ratio <= _TOO_COARSE else Grade.BAD, words)
+    return MapFinding(
+        "texel size", found, Grade.ADVICE if ratio <= _TOO_COARSE else Grade.BAD, words
+    )
 
 
-def _date(cache: TileCache) -> Finding:
+def _date(cache: TileCache) -> MapFinding:
     date = cache.manifest.build.get("imagery_date")
     if date:
         words = "what was built or felled since costs accuracy"
-        return Finding("imagery of", str(date), Grade.GOOD, words)
+        return MapFinding("imagery of", str(date), Grade.GOOD, words)
     words = "give `map build` --imagery-date; what was built or felled since costs accuracy"
-    return Finding("imagery of", "not known", Grade.ADVICE, words)
+    return MapFinding("imagery of", "not known", Grade.ADVICE, words)
 
 
-def _seam_finding(seams: list[Seam]) -> Finding:
+def _seam_finding(seams: list[Seam]) -> MapFinding:
     seen = [s for s in seams if s.seen]
     found = f"{len(seen)} of {len(seams)} borders of tiles"
     if not seen:
-        return Finding("seams", found, Grade.GOOD, "none show")
+        return MapFinding("seams", found, Grade.GOOD, "none show")
     worst = max(seen, key=lambda s: s.height_m / _SEAM_M + s.grey / _SEAM_GREY)
     words = f"the worst steps by {worst.height_m:.2f} m and {worst.grey:.0f} grey values"
-    return Finding("seams", found, Grade.ADVICE, words)
+    return MapFinding("seams", found, Grade.ADVICE, words)
 
 
-def _shift(shift: Alignment) -> Finding:
+def _shift(shift: ImageryOffset) -> MapFinding:
     name = "picture on surface"
     if not shift.known:
         words = f"{shift.edges} cells with a step: too few, or they do not meet; flat land"
-        return Finding(name, "cannot be told", Grade.GOOD, words)
+        return MapFinding(name, "cannot be told", Grade.GOOD, words)
     found = f"{shift.east_m:+.1f} m east, {shift.north_m:+.1f} m north (peak {shift.peak:.0f})"
     if shift.distance_m <= _SHIFT_M:
-        return Finding(name, found, Grade.GOOD, "together, to about a metre")
+        return MapFinding(name, found, Grade.GOOD, "together, to about a metre")
     words = (
         f"the picture lies {shift.distance_m:.1f} m beside its surface: roofs are painted on the "
         "ground. Check the CRS of orthophoto and surface, or take a true orthophoto"
     )
-    return Finding(name, found, Grade.BAD, words)
+    return MapFinding(name, found, Grade.BAD, words)
 
 
 def _leaf_gsd(cache: TileCache) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from localizer.registration.backend import LevelProblem, LMSettings, Refinement
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.compiler import Image, compile_kernels
 from localizer.registration.cuda.driver import Arena, Device, Kernels
-from localizer.registration.whole import WholeRegistration
+from localizer.registration.device_registration import DeviceRegistration
 
 FEW = 16  # hypotheses at most for which larger blocks pay: they leave multiprocessors idle anyway
 
@@ -79,7 +79,7 @@ class CudaBackend:
             R, t, scores, visible / problem.points.shape[1], int(state["evaluations"])
         )
 
-    def whole(self) -> WholeRegistration:
+    def whole(self) -> DeviceRegistration:
         """The whole schedule on this device (`WholeBackend`)."""
         from localizer.registration.cuda.registration import CudaRegistration
 

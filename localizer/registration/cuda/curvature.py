@@ -13,7 +13,7 @@ from localizer.registration.cpu.reference import in_view, project, projection_ja
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.memory import PROBES, FrameMemory
-from localizer.registration.cuda.steps import Step
+from localizer.registration.cuda.steps import KernelLaunch
 from localizer.types import Float32
 
 
@@ -39,7 +39,7 @@ def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) ->
 def winner_curvature(
     backend: CudaBackend,
     memory: FrameMemory,
-    refining: Step,
+    refining: KernelLaunch,
     channels: int,
     pose: tuple[Array, Array],
     motion: Array,

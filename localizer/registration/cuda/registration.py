@@ -11,14 +11,14 @@ from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import CovarianceSums
 from localizer.registration.cpu.reference import prior_terms
 from localizer.registration.cuda.backend import CudaBackend
-from localizer.registration.cuda.schedule import CudaSchedule, Search
+from localizer.registration.cuda.schedule import CudaSchedule, DeviceSearchResult
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.result import Found, Registration, failure, registration
+from localizer.registration.result import Registration, SearchSurvivors, failure, registration
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
 
 class CudaRegistration:
-    """`WholeRegistration` on a `CudaBackend`."""
+    """`DeviceRegistration` on a `CudaBackend`."""
 
     def __init__(self, backend: CudaBackend) -> None:
         self._schedule = CudaSchedule(backend)
@@ -60,7 +60,9 @@ def _local_constraint(constraint: PoseConstraint | None, origin: Array) -> Quadr
     return QuadraticPrior(Pose(R[0], t[0]), constraint.information, 1.0)
 
 
-def _found(search: Search, constraint: QuadraticPrior | None, cell_px: float) -> Found:
+def _found(
+    search: DeviceSearchResult, constraint: QuadraticPrior | None, cell_px: float
+) -> SearchSurvivors:
     prior_hessian, weight = np.zeros((6, 6)), 0.0
     if constraint is not None:
         weight = search.prior_weight
@@ -70,7 +72,7 @@ def _found(search: Search, constraint: QuadraticPrior | None, cell_px: float) ->
         search.hessian, search.meat, search.isotropic, search.cells, cell_px,
         prior_hessian, search.motion, search.anchors, search.share, search.curvature,
     )  # fmt: skip
-    return Found(
+    return SearchSurvivors(
         search.rotations,
         search.translations,
         search.scores,

@@ -37,7 +37,7 @@ from localizer.registration.cuda.memory import PROBES, FrameMemory
 from localizer.registration.cuda.steps import (
     COVARIANCE_ANCHORS,
     KERNELS,
-    Shape,
+    GraphShape,
     launches,
     refining,
 )
@@ -45,7 +45,7 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
 
 @dataclass(frozen=True)
-class Search:
+class DeviceSearchResult:
     """What the device found. rotations (K, 3, 3), translations (K, 3): the survivors, camera from
     local, best first, the first one sharpened; scores (K,) before that, and overlaps (K,); K is 0
     without overlap. hessian to curvature: as in `CovarianceSums`;
@@ -79,7 +79,7 @@ class CudaSchedule:
     def __init__(self, backend: CudaBackend, *, timed: bool = False) -> None:
         self._backend, self._device = backend, backend.device
         self._timed = timed
-        self._graph: tuple[Shape, Graph] | None = None
+        self._graph: tuple[GraphShape, Graph] | None = None
 
     def run(
         self,
@@ -91,7 +91,7 @@ class CudaSchedule:
         config: JNGOConfig,
         motion: PosePrior | None = None,
         constraint: QuadraticPrior | None = None,
-    ) -> Search:
+    ) -> DeviceSearchResult:
         """Refine, prune and sharpen a swarm (rotations, translations), camera_from_local.
 
         The query's features may be `DeviceArray`s, which are read in place. constraint: its weight
@@ -105,7 +105,7 @@ class CudaSchedule:
             memory = self._memory(len(channels), len(swarm[0]), config, len(anchors.points_world))
             self._upload(memory, query, camera, anchors, origin, swarm, config, motion, constraint)
             cell_px = config.correlation_px / query.levels[-1].stride
-            shape = Shape(
+            shape = GraphShape(
                 config, len(swarm[0]), channels, constraint is not None, cell_px,
                 backend.arena.generation,
             )  # fmt: skip
@@ -129,13 +129,13 @@ class CudaSchedule:
 
     def _with_curvature(
         self,
-        found: Search,
-        shape: Shape,
+        found: DeviceSearchResult,
+        shape: GraphShape,
         memory: FrameMemory,
         level: int,
         seen: LevelProblem,
         scale: float,
-    ) -> Search:
+    ) -> DeviceSearchResult:
         """The result with motion, counts and curvature. seen: the level's geometry; scale: of its
         loss.
         """
@@ -162,7 +162,7 @@ class CudaSchedule:
             curvature=curvature,
         )
 
-    def _captured(self, shape: Shape, memory: FrameMemory) -> Graph:
+    def _captured(self, shape: GraphShape, memory: FrameMemory) -> Graph:
         if self._graph is not None and self._graph[0] == shape:
             return self._graph[1]
         if self._graph is not None:
@@ -174,7 +174,7 @@ class CudaSchedule:
         self._graph = shape, graph
         return graph
 
-    def _enqueue(self, shape: Shape, memory: FrameMemory) -> None:
+    def _enqueue(self, shape: GraphShape, memory: FrameMemory) -> None:
         for step in launches(shape, memory, self._device.multiprocessors):
             kernels = self._backend.kernels(shape.channels[step.level])
             kernels.launch(step.kernel, step.blocks, step.threads, step.arguments)
@@ -220,7 +220,7 @@ class CudaSchedule:
 
     def _collect(
         self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
-    ) -> tuple[Search, float]:
+    ) -> tuple[DeviceSearchResult, float]:
         """What came back, without motion, counts and curvature; the scale of the last loss."""
         block = np.empty(memory.result_size, np.uint8)
         self._device.download(block, memory.prior)
@@ -239,7 +239,7 @@ class CudaSchedule:
         weight = read(memory.prior, layout.PRIOR)["weight"]
         total = max(float(state["total"]), 1e-30)
         variance = float(state["square_sum"]) / max(float(state["scale_sum"]), 1e-12) / channels
-        search = Search(
+        search = DeviceSearchResult(
             read(int(swarm["rotations"]), np.float64, (count, 3, 3)).copy(),
             read(int(swarm["translations"]), np.float64, (count, 3)).copy(),
             read(int(swarm["scores"]), np.float64, (count,)).copy(),

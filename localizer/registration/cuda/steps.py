@@ -22,7 +22,7 @@ _FINITE_BLOCKS_PER_MULTIPROCESSOR = 4
 
 
 @dataclass(frozen=True)
-class Shape:
+class GraphShape:
     """What a captured graph depends on."""
 
     config: JNGOConfig
@@ -40,7 +40,7 @@ KERNELS = (
 
 
 @dataclass(frozen=True)
-class Step:
+class KernelLaunch:
     """One launch of the graph; level: whose channels it is compiled for."""
 
     kernel: str
@@ -50,7 +50,9 @@ class Step:
     arguments: NDArray[np.void]
 
 
-def launches(shape: Shape, memory: FrameMemory, multiprocessors: int) -> Iterator[Step]:
+def launches(
+    shape: GraphShape, memory: FrameMemory, multiprocessors: int
+) -> Iterator[KernelLaunch]:
     """The launches, in order (docs/explanation/registration.md, section 7)."""
     c, searched = shape.config, len(shape.config.iterations)
     levels = len(shape.channels)
@@ -58,7 +60,7 @@ def launches(shape: Shape, memory: FrameMemory, multiprocessors: int) -> Iterato
         finite = np.zeros((), dtype=layout.FINITE)
         finite["level"], finite["state"] = memory.level(k), memory.state
         blocks = _FINITE_BLOCKS_PER_MULTIPROCESSOR * multiprocessors
-        yield Step("all_finite", k, blocks, _SMALL_THREADS, finite)
+        yield KernelLaunch("all_finite", k, blocks, _SMALL_THREADS, finite)
     alive, source = shape.hypotheses, 0
     keep = (*c.keep[: searched - 1], c.hypotheses)
     for k in range(searched):
@@ -72,7 +74,7 @@ def launches(shape: Shape, memory: FrameMemory, multiprocessors: int) -> Iterato
     yield from _sharpening(shape, memory)
 
 
-def _sharpening(shape: Shape, memory: FrameMemory) -> Iterator[Step]:
+def _sharpening(shape: GraphShape, memory: FrameMemory) -> Iterator[KernelLaunch]:
     """The winner's last steps and the sums at its pose."""
     c, searched, levels = shape.config, len(shape.config.iterations), len(shape.channels)
     final, wanted = memory.swarms[2], c.swarm_anchors[-1]
@@ -88,7 +90,7 @@ def _sharpening(shape: Shape, memory: FrameMemory) -> Iterator[Step]:
             yield from _weighing(shape, memory, k, winner, 1, anchors)
         median = finish.copy()
         median["level"], median["wanted"] = memory.level(k), wanted
-        yield Step("median_residual", k, 1, _FEW_THREADS, median)
+        yield KernelLaunch("median_residual", k, 1, _FEW_THREADS, median)
         for factor in scales[k - searched + 1]:
             settings = replace(
                 c.settings, scale=LEAST_SCALE, redescending=True, damping=c.sharpen_damping
@@ -100,13 +102,13 @@ def _sharpening(shape: Shape, memory: FrameMemory) -> Iterator[Step]:
     sums["level"], sums["redescending"] = memory.level(last), redescending
     if c.sharpen:
         sums["wanted"] = COVARIANCE_ANCHORS
-    yield Step("covariance_sums", last, 1, _FEW_THREADS, sums)
+    yield KernelLaunch("covariance_sums", last, 1, _FEW_THREADS, sums)
     quality["level"] = memory.level(searched - 1)
-    yield Step("quality", searched - 1, 1, _FEW_THREADS, quality)
+    yield KernelLaunch("quality", searched - 1, 1, _FEW_THREADS, quality)
 
 
 def refining(
-    shape: Shape,
+    shape: GraphShape,
     memory: FrameMemory,
     level: int,
     swarm: NDArray[np.void],
@@ -117,7 +119,7 @@ def refining(
     *,
     factor: float = 0.0,
     free: bool = False,
-) -> Step:
+) -> KernelLaunch:
     """Launch of the LM kernel; free: without the prior and not counted."""
     arguments = np.zeros((), dtype=layout.REFINE)
     arguments["level"], arguments["state"] = memory.level(level), memory.state
@@ -126,12 +128,17 @@ def refining(
     set_loss(arguments, settings, iterations)
     arguments["factor"], arguments["counted"] = factor, not free
     name, threads = ("refine_few", _FEW_THREADS) if alive <= FEW else ("refine_many", _MANY_THREADS)
-    return Step(name, level, alive, threads, arguments)
+    return KernelLaunch(name, level, alive, threads, arguments)
 
 
 def _weighing(
-    shape: Shape, memory: FrameMemory, level: int, swarm: NDArray[np.void], alive: int, wanted: int
-) -> Iterator[Step]:
+    shape: GraphShape,
+    memory: FrameMemory,
+    level: int,
+    swarm: NDArray[np.void],
+    alive: int,
+    wanted: int,
+) -> Iterator[KernelLaunch]:
     """Score without the prior, then weigh it by the best score."""
     c = shape.config
     yield refining(shape, memory, level, swarm, alive, wanted, c.settings, 0, free=True)
@@ -140,17 +147,17 @@ def _weighing(
     arguments["scores"] = swarm["scores"]
     arguments["share"], arguments["least_score"] = c.prior_weight, LEAST_SCORE
     arguments["limit"] = alive
-    yield Step("weigh_prior", level, 1, _SMALL_THREADS, arguments)
+    yield KernelLaunch("weigh_prior", level, 1, _SMALL_THREADS, arguments)
 
 
 def _selecting(
-    shape: Shape,
+    shape: GraphShape,
     memory: FrameMemory,
     level: int,
     source: int,
     target: int,
     keep: int,
-) -> Step:
+) -> KernelLaunch:
     """Order and prune; the prediction has a say in the last order only."""
     last = level == len(shape.config.iterations) - 1
     arguments = np.zeros((), dtype=layout.SELECT)
@@ -161,4 +168,4 @@ def _selecting(
     arguments["alive"], arguments["projected"] = memory.alive, memory.projected
     arguments["distinct"], arguments["least_score"] = shape.config.distinct_px, LEAST_SCORE
     arguments["wanted"], arguments["keep"] = shape.config.swarm_anchors[level], keep
-    return Step("select_hypotheses", level, 1, _SMALL_THREADS, arguments)
+    return KernelLaunch("select_hypotheses", level, 1, _SMALL_THREADS, arguments)

@@ -31,7 +31,7 @@ STEPS = 48  # of a day
 _SOLAR = 1100.0  # W/m2 above the air, at the sensor's latitude and season
 
 
-class Cover(IntEnum):
+class ThermalCover(IntEnum):
     """Kinds of surface that heat differently; rows of `_COVERS`."""
 
     SOIL = 0
@@ -107,7 +107,7 @@ class ThermalDay:
         """(covers, STEPS): kelvin now per W/m2 that came during each half-hour before."""
         omega = 2 * np.pi * np.arange(STEPS // 2 + 1) / 86400.0
         inertia = _COVERS[:, 2].copy()
-        inertia[Cover.SOIL] *= 1.0 + self.wet  # water in it stores heat
+        inertia[ThermalCover.SOIL] *= 1.0 + self.wet  # water in it stores heat
         exchange = self.exchange()[:, None]
         out: Array = np.fft.irfft(1.0 / (exchange + inertia[:, None] * np.sqrt(1j * omega)), STEPS)
         return out
@@ -115,7 +115,7 @@ class ThermalDay:
     def heating(self) -> Array:
         """Of each cover: share of the absorbed sun that heats, the rest evaporates water."""
         share = _COVERS[:, 3].copy()
-        share[Cover.SOIL] = 0.5 * self.wet
+        share[ThermalCover.SOIL] = 0.5 * self.wet
         left: Array = 1.0 - share
         return left
 
@@ -155,7 +155,7 @@ def draw_thermal_day(rng: np.random.Generator, condition: str) -> ThermalDay:
 def crossover_hour(day: ThermalDay, *, morning: bool) -> float:
     """When level, open grass, soil and asphalt look most alike, of the morning or the evening."""
     hours = np.arange(6.0, 11.0, 0.25) if morning else np.arange(16.5, 19.75, 0.25)
-    kinds = [Cover.SOIL, Cover.GRASS, Cover.CROWN, Cover.ASPHALT]
+    kinds = [ThermalCover.SOIL, ThermalCover.GRASS, ThermalCover.CROWN, ThermalCover.ASPHALT]
     spread = [float(np.ptp(level_surfaces(_at(day, h))[kinds])) for h in hours]
     return float(hours[int(np.argmin(spread))])
 

@@ -45,7 +45,7 @@ class Land:
 
 
 @dataclass(frozen=True)
-class Light:
+class SkyLight:
     """Sun and sky. sun: (3,) unit vector towards the sun; the intensities multiply albedo."""
 
     sun: tuple[float, float, float]
@@ -73,7 +73,7 @@ class LitScene:
     mips: Float32
     prism: NDArray[np.int32]
     facades: Float32
-    light: Light
+    light: SkyLight
     sky: tuple[float, float, float]
     cell_m: float
 
@@ -91,7 +91,7 @@ def compose(land: Land, prisms: Sequence[Prism]) -> Scene:
 
 def light_scene(
     scene: Scene,
-    light: Light,
+    light: SkyLight,
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
     *,
@@ -130,7 +130,7 @@ def openness(height: Float32) -> Float32:
 def textured(
     scene: Scene,
     texture: Float32,
-    light: Light,
+    light: SkyLight,
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
 ) -> LitScene:

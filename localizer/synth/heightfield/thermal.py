@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from localizer.synth.appearance.thermal import (
     SPAN_K,
-    Cover,
+    ThermalCover,
     ThermalDay,
     day_apparent,
     half_hours,
 )
 from localizer.synth.heightfield.scene import (
-    Light,
     LitScene,
     Prism,
     Scene,
+    SkyLight,
     cast_shadows,
     openness,
     textured,
@@ -45,13 +45,13 @@ def thermal_scene(
     # A photo's brightness is no albedo: pale pavement still takes up more than half.
     absorbs = 1.0 - np.clip(scene.albedo.mean(-1), 0.05, 0.45)
     # Polished metal takes up less than its grey says.
-    absorbs = np.where(cover == Cover.METAL, 0.4 * absorbs, absorbs).astype(np.float32)
+    absorbs = np.where(cover == ThermalCover.METAL, 0.4 * absorbs, absorbs).astype(np.float32)
     open_sky = openness(scene.height).astype(np.float32)
     by_sun = _warmed(scene, cover, day, absorbs, open_sky)
     apparent = np.zeros(cover.shape, np.float32)
     for kind in np.unique(cover):
         here = cover == kind
-        every = day_apparent(day, np.broadcast_to(by_sun[here], (len(Cover), by_sun[here].size)),
+        every = day_apparent(day, np.broadcast_to(by_sun[here], (len(ThermalCover), by_sun[here].size)),
                              open_sky[here])  # fmt: skip
         apparent[here] = every[kind]
     apparent += _texture(cover, scene, rng) + _engines(scene, prisms, rng)
@@ -68,7 +68,7 @@ def thermal_scene(
     facades[:, 3] = 0.0  # panes are as cold as the wall is seldom; left out
     gain = float(np.median(sunny / base)) - 1.0 if len(base) > 1 else 0.0
     # The marcher shades walls by 0.8 ambient + direct * cosine.
-    light = Light(sun, max(gain, 0.0), 1.25)
+    light = SkyLight(sun, max(gain, 0.0), 1.25)
     lit_facades = Scene(scene.height, scene.albedo, scene.prism, facades, scene.cell_m)
     texture = np.repeat(grey(apparent)[..., None], 3, axis=2)
     return textured(lit_facades, texture, light, (_COLD, _COLD, _COLD))
@@ -77,31 +77,31 @@ def thermal_scene(
 def covers(
     scene: Scene, prisms: Sequence[Prism], lasting: Float32, rng: np.random.Generator
 ) -> NDArray[np.int8]:
-    """(n, n): the `Cover` of every cell, by colour, height and what stands there."""
+    """(n, n): the `ThermalCover` of every cell, by colour, height and what stands there."""
     red, green, blue = (cv2.GaussianBlur(scene.albedo[..., c], (0, 0), 1.0) for c in range(3))
     grey = (red + green + blue) / 3
     leafy = green - np.maximum(red, blue) > 0.02 * grey
-    cover = np.where(leafy, Cover.GRASS, Cover.SOIL).astype(np.int8)
+    cover = np.where(leafy, ThermalCover.GRASS, ThermalCover.SOIL).astype(np.int8)
     high = scene.height - cv2.GaussianBlur(scene.height, (0, 0), max(3.0 / scene.cell_m, 1.5)) > 0.3
-    cover[(leafy & (grey < 0.22)) | (high & leafy)] = Cover.CROWN
+    cover[(leafy & (grey < 0.22)) | (high & leafy)] = ThermalCover.CROWN
     watery = (blue > red * 1.15) & (grey < 0.32) & (lasting < 0.5)
     cover[cv2.morphologyEx(watery.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5))) > 0] = (
-        Cover.WATER
+        ThermalCover.WATER
     )
-    cover[(lasting > 0.5) & (scene.prism == 0)] = Cover.ASPHALT
-    kinds = np.array([Cover.SOIL, *(_roof(p, rng) for p in prisms)], np.int8)
+    cover[(lasting > 0.5) & (scene.prism == 0)] = ThermalCover.ASPHALT
+    kinds = np.array([ThermalCover.SOIL, *(_roof(p, rng) for p in prisms)], np.int8)
     return np.where(scene.prism > 0, kinds[scene.prism], cover).astype(np.int8)
 
 
-def _roof(prism: Prism, rng: np.random.Generator) -> Cover:
+def _roof(prism: Prism, rng: np.random.Generator) -> ThermalCover:
     bare = rng.random() < _METAL_SHARE
     if prism.height_m < _CAR_M and prism.window_m == 0.0:
-        return Cover.CAR
+        return ThermalCover.CAR
     red, green, blue = prism.roof
     if red > 1.15 * blue:
-        return Cover.TILES
+        return ThermalCover.TILES
     bright = (red + green + blue) / 3 > 0.45
-    return Cover.METAL if bright and bare else Cover.BITUMEN
+    return ThermalCover.METAL if bright and bare else ThermalCover.BITUMEN
 
 
 def _warmed(
@@ -155,16 +155,18 @@ def _walls(
     from the sun warmed them, by what they still hold of it.
     """
     answers, hours = day.answers(), half_hours(day)
-    held = answers[Cover.WALL] * [day.beam(h) for h in hours]
+    held = answers[ThermalCover.WALL] * [day.beam(h) for h in hours]
     suns = np.array([day.sun(h) for h in hours])
     flat = (held[:, None] * suns[:, :2]).sum(axis=0)
     strength = float(np.hypot(*flat))
     direction = flat / max(strength, 1e-9)
     count = len(scene.facades)
     tone = 1.0 - np.clip(scene.facades[:, :3].mean(axis=1), 0.05, 0.8)
-    scattered = float(answers[Cover.WALL] @ [day.scattered(h) for h in hours]) * 0.5
+    scattered = float(answers[ThermalCover.WALL] @ [day.scattered(h) for h in hours]) * 0.5
     # A wall sees half the sky, and half ground that is about as warm as itself.
-    shade = day_apparent(day, np.full((len(Cover), 1), 0.7 * scattered), 0.5)[Cover.WALL, 0]
+    shade = day_apparent(day, np.full((len(ThermalCover), 1), 0.7 * scattered), 0.5)[
+        ThermalCover.WALL, 0
+    ]
     leak = rng.uniform(0.0, 1.5, count)
     walls = np.stack([shade + leak, shade + leak + tone * strength], axis=1)
     return walls.astype(np.float32), (float(direction[0]), float(direction[1]), 0.0)

@@ -46,7 +46,7 @@ class FacadeStyle(IntEnum):
 
 
 @dataclass(frozen=True)
-class Light:
+class WindowLight:
     """Light of one window of the world. ceiling: (h, w) float32 height below which a point is in
     shadow; ambient: (h, w) float32 visible share of the sky at the ground; top-left corner (west,
     north), `gsd_m` per pixel; sun: unit vector (3,); season: dryness, crop, leaf.

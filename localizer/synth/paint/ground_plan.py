@@ -51,7 +51,7 @@ class Regions:
 
 
 @dataclass(frozen=True)
-class Shape:
+class PlanShape:
     """A polygon (width 0) or a stroke of a line with round joins; points (N, 2) ENU metres."""
 
     points: Array
@@ -67,7 +67,7 @@ class GroundPlan:
     _material: list[int] = field(default_factory=list)
     _tint: list[Array] = field(default_factory=list)
     _shape: list[tuple[float, float, float]] = field(default_factory=list)
-    _layers: dict[int, list[Shape]] = field(default_factory=dict)
+    _layers: dict[int, list[PlanShape]] = field(default_factory=dict)
 
     def region(
         self, material: Material, *, angle: float = 0.0, spacing: float = 1.0, vary: float = 0.06
@@ -82,11 +82,13 @@ class GroundPlan:
 
     def polygon(self, layer: int, points: ArrayLike, region: int) -> None:
         """Fill a polygon (N, 2)."""
-        self._layers.setdefault(layer, []).append(Shape(np.asarray(points, float), 0.0, region))
+        self._layers.setdefault(layer, []).append(PlanShape(np.asarray(points, float), 0.0, region))
 
     def stroke(self, layer: int, points: ArrayLike, width_m: float, region: int) -> None:
         """Draw a line (N, 2) of a width in metres."""
-        self._layers.setdefault(layer, []).append(Shape(np.asarray(points, float), width_m, region))
+        self._layers.setdefault(layer, []).append(
+            PlanShape(np.asarray(points, float), width_m, region)
+        )
 
     def regions(self) -> Regions:
         """The finished tables."""
@@ -96,12 +98,12 @@ class GroundPlan:
             np.array(self._shape, np.float32),
         )
 
-    def shapes(self) -> list[Shape]:
+    def shapes(self) -> list[PlanShape]:
         """All shapes, bottom layer first."""
         return [shape for layer in sorted(self._layers) for shape in self._layers[layer]]
 
 
-def shape_bounds(shapes: list[Shape]) -> Array:
+def shape_bounds(shapes: list[PlanShape]) -> Array:
     """(S, 4) west, south, east, north of every shape with its width."""
     rows = []
     for shape in shapes:
@@ -112,7 +114,7 @@ def shape_bounds(shapes: list[Shape]) -> Array:
 
 
 def rasterize(
-    shapes: Iterable[Shape], west: float, north: float, gsd_m: float, shape: tuple[int, int]
+    shapes: Iterable[PlanShape], west: float, north: float, gsd_m: float, shape: tuple[int, int]
 ) -> NDArray[np.uint16]:
     """Region ids (H, W) of a window whose top-left corner is (west, north)."""
     out = np.zeros(shape, np.uint16)

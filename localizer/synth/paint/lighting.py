@@ -9,8 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
-from localizer.synth.config import Look
-from localizer.synth.paint.covers import Light
+from localizer.synth.config import VisitLook
+from localizer.synth.paint.covers import WindowLight
 
 DSM_GSD_M = 0.5
 SHADOW_REACH_M = 90.0
@@ -90,8 +90,8 @@ def make_light(
     dsm_west: float,
     dsm_north: float,
     window: tuple[int, int, int, int],
-    look: Look,
-) -> Light:
+    look: VisitLook,
+) -> WindowLight:
     """Light of a window (top, left, height, width; pixels of the surface model).
 
     dsm, ground: (H, W) heights with and without what stands on the ground.
@@ -115,7 +115,7 @@ def make_light(
     for sigma_m, weight in ((1.0, 0.05), (3.5, 0.045), (9.0, 0.03)):
         closed += weight * cv2.GaussianBlur(above, (0, 0), sigma_m / DSM_GSD_M)[view]
     ambient = (1.0 / (1.0 + closed * 1.6)).astype(np.float32)
-    return Light(
+    return WindowLight(
         ceiling=ceiling,
         ambient=ambient,
         west=dsm_west + left * DSM_GSD_M,

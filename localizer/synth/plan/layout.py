@@ -22,7 +22,7 @@ from localizer.synth.plan.country import (
     plan_riverside,
 )
 from localizer.synth.plan.houses import plan_houses
-from localizer.synth.plan.plan import URBAN, Target, Trees, WorldPlan, Zone
+from localizer.synth.plan.plan import URBAN, PlannedTarget, Trees, WorldPlan, Zone
 from localizer.synth.plan.planner import (
     CROSS,
     LAYER_BASE,
@@ -244,7 +244,7 @@ def _roads(planner: Planner) -> tuple[Array, ...]:
     return tuple(roads)
 
 
-def _targets(planner: Planner) -> tuple[Target, ...]:
+def _targets(planner: Planner) -> tuple[PlannedTarget, ...]:
     """Static points near the middle: a crossing, a flat roof, a corner of a pitch (or a node)."""
     terrain, net = planner.terrain, planner.net
     degree = np.bincount([n for s in net.streets for n in (s.a, s.b)], minlength=len(net.nodes))
@@ -260,7 +260,7 @@ def _targets(planner: Planner) -> tuple[Target, ...]:
     corners = planner.corners or [net.nodes[int(np.argsort(score)[1])]]
     pitch = min(corners, key=lambda c: float(np.linalg.norm(c)))
     points.append(("pitch corner", _on_ground(terrain, pitch)))
-    return tuple(Target(name, p) for name, p in points)
+    return tuple(PlannedTarget(name, p) for name, p in points)
 
 
 def _roof_point(buildings: list[Building]) -> Array | None:

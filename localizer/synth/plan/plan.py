@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import Building
 from localizer.synth.config import WorldConfig
-from localizer.synth.paint.ground_plan import Regions, Shape
+from localizer.synth.paint.ground_plan import PlanShape, Regions
 from localizer.synth.plan.terrain import Terrain
 
 
@@ -64,7 +64,7 @@ class Hedge:
 
 
 @dataclass(frozen=True)
-class Target:
+class PlannedTarget:
     """A named static point on a surface, ENU metres (3,)."""
 
     name: str
@@ -80,11 +80,11 @@ class WorldPlan:
     config: WorldConfig
     terrain: Terrain
     regions: Regions
-    shapes: list[Shape]
+    shapes: list[PlanShape]
     buildings: list[Building]
     trees: Trees
     hedges: list[Hedge]
     slots: Array
-    targets: tuple[Target, ...]
+    targets: tuple[PlannedTarget, ...]
     roads: tuple[Array, ...]
     sites: tuple[Building, ...] = ()

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import LEAF, MID, NEAR_LEVELS, ROOT, TOP
 from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
-from localizer.synth.paint.covers import Light, new_image
+from localizer.synth.paint.covers import WindowLight, new_image
 from localizer.synth.paint.ground import light_ground, paint_albedo
-from localizer.synth.paint.ground_plan import Material, Shape, rasterize, shape_bounds
+from localizer.synth.paint.ground_plan import Material, PlanShape, rasterize, shape_bounds
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light
 from localizer.synth.tiles.charts import ChartedMesh, pack
 from localizer.synth.tiles.objects import StandingObjects
-from localizer.synth.tiles.scene import Scene
+from localizer.synth.tiles.scene import TileScene
 from localizer.synth.tiles.terrain_mesh import terrain_mesh
 from localizer.synth.tiles.write import TileNode, glb_bytes
 from localizer.synth.visits.noise import noise
@@ -40,7 +40,7 @@ _IS_SOFT = np.isin(np.arange(len(Material)), _SOFT)  # by material: its fine tex
 
 
 @dataclass(frozen=True)
-class Part:
+class TilePart:
     """What a finished tile hands up to the next coarser one. ground: its image at twice the texel
     size of that tile's; mesh: what coarser levels still show; node: itself.
     """
@@ -56,7 +56,7 @@ class Part:
 class Baker:
     """Paints the tiles of one scene into a folder. Belongs to one process."""
 
-    scene: Scene
+    scene: TileScene
     folder: Path
     _bounds: Array = field(init=False)
     _standing: StandingObjects = field(init=False)
@@ -67,7 +67,7 @@ class Baker:
         self._slopes = self.scene.plan.terrain.gradient()
         self._standing = StandingObjects(self.scene)
 
-    def block(self, column: int, row: int) -> Part:
+    def block(self, column: int, row: int) -> TilePart:
         """Paint and write the four leaves and the middle tile of a block; count from south-west."""
         half = self.scene.plan.config.half_m
         west, south = column * BLOCK_M - half, row * BLOCK_M - half
@@ -89,7 +89,7 @@ class Baker:
         mesh = mesh.at_level(MID | TOP | ROOT).halved()
         middle = self.write(MID, (column, row), west, north, image, mesh)
         middle.children = leaves
-        return Part([middle], half_size(image), mesh.at_level(TOP | ROOT).halved(), west, north)
+        return TilePart([middle], half_size(image), mesh.at_level(TOP | ROOT).halved(), west, north)
 
     def write(
         self, level: int, place: tuple[int, int], west: float, north: float, ground: Image,
@@ -139,7 +139,7 @@ class Baker:
             return float(max(3.0, 0.8 * radius))  # cars, hedges, chimneys, dormers
         return float(self.scene.plan.trees.height[inside].max(initial=3.0))
 
-    def _light(self, west: float, north: float) -> Light:
+    def _light(self, west: float, north: float) -> WindowLight:
         scene = self.scene
         margin = _LIGHT_MARGIN_M
         left = max(0, int((west - margin - scene.west) / DSM_GSD_M))
@@ -151,13 +151,13 @@ class Baker:
         look = scene.visit.look
         return make_light(scene.dsm, scene.ground, scene.west, scene.north, window, look)
 
-    def _ground(self, west: float, north: float, light: Light) -> Image:
+    def _ground(self, west: float, north: float, light: WindowLight) -> Image:
         plan = self.scene.plan
         n = round(BLOCK_M / LEAF_GSD_M)
         b = self._bounds
         near = (b[:, 0] < west + BLOCK_M) & (b[:, 2] > west)
         near &= (b[:, 1] < north) & (b[:, 3] > north - BLOCK_M)
-        shapes: list[Shape] = [plan.shapes[k] for k in np.flatnonzero(near)]
+        shapes: list[PlanShape] = [plan.shapes[k] for k in np.flatnonzero(near)]
         region = rasterize(shapes, west, north, LEAF_GSD_M, (n, n))
         albedo = self._albedo(region, west, north, light)
         out = new_image(n, n)
@@ -169,7 +169,7 @@ class Baker:
         survey = self.scene.visit.survey
         return out if survey is None else survey.photographed(out, LEAF_GSD_M)
 
-    def _albedo(self, region: NDArray[np.uint16], west: float, north: float, light: Light
+    def _albedo(self, region: NDArray[np.uint16], west: float, north: float, light: WindowLight
                 ) -> Float32:  # fmt: skip
         """Colours (n, n, 3) of a block's ground, 0 to 255, with what grew anew at this visit."""
         albedo = self._painted(region, west, north, light, np.zeros(2))
@@ -187,7 +187,12 @@ class Baker:
         return np.asarray(wet * scale, np.float32)
 
     def _painted(
-        self, region: NDArray[np.uint16], west: float, north: float, light: Light, moved: Array
+        self,
+        region: NDArray[np.uint16],
+        west: float,
+        north: float,
+        light: WindowLight,
+        moved: Array,
     ) -> Float32:
         out = np.empty((*region.shape, 3), np.float32)
         regions = self.scene.plan.regions
@@ -227,6 +232,6 @@ def start_worker(scene_file: Path, folder: Path) -> None:
         _baker[:] = [Baker(pickle.load(file), folder)]
 
 
-def bake_block(place: tuple[int, int]) -> tuple[tuple[int, int], Part]:
+def bake_block(place: tuple[int, int]) -> tuple[tuple[int, int], TilePart]:
     """Paint one block in a worker process."""
     return place, _baker[0].block(*place)

@@ -7,12 +7,12 @@ import cv2
 from localizer.synth.buildings.model import ROOT, TOP
 from localizer.synth.config import BLOCK_M, TOP_M
 from localizer.synth.paint.covers import new_image
-from localizer.synth.tiles.bake import Baker, Part, half_size
+from localizer.synth.tiles.bake import Baker, TilePart, half_size
 from localizer.synth.tiles.charts import ChartedMesh
 from localizer.synth.tiles.write import TileNode
 
 
-def assemble_top(baker: Baker, column: int, row: int, parts: list[Part]) -> Part:
+def assemble_top(baker: Baker, column: int, row: int, parts: list[TilePart]) -> TilePart:
     """Write the 400 m tile over four blocks."""
     half = baker.scene.plan.config.half_m
     west, north = column * TOP_M - half, (row + 1) * TOP_M - half
@@ -24,10 +24,10 @@ def assemble_top(baker: Baker, column: int, row: int, parts: list[Part]) -> Part
     mesh = ChartedMesh.merged([p.mesh for p in parts])
     node = baker.write(TOP, (column, row), west, north, image, mesh)
     node.children = [child for p in parts for child in p.nodes]
-    return Part([node], half_size(half_size(image)), mesh.at_level(ROOT).halved(2), west, north)
+    return TilePart([node], half_size(half_size(image)), mesh.at_level(ROOT).halved(2), west, north)
 
 
-def assemble_root(baker: Baker, parts: list[Part]) -> TileNode:
+def assemble_root(baker: Baker, parts: list[TilePart]) -> TileNode:
     """Write the tile over the whole world, with trees painted on its ground."""
     half = baker.scene.plan.config.half_m
     n = parts[0].ground.shape[0]

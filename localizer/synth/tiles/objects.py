@@ -11,11 +11,11 @@ from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
 from localizer.synth.buildings.model import NEAR_LEVELS, Building, Surface
 from localizer.synth.config import LEAF_GSD_M, LEAF_M
-from localizer.synth.paint.covers import Cover, Light, new_image
+from localizer.synth.paint.covers import Cover, WindowLight, new_image
 from localizer.synth.paint.facades import paint_surface
 from localizer.synth.tiles.charts import ChartedMesh
 from localizer.synth.tiles.props import CAR_COLOURS, car_image, car_shape
-from localizer.synth.tiles.scene import Scene, car_positions, hedge_quads
+from localizer.synth.tiles.scene import TileScene, car_positions, hedge_quads
 from localizer.synth.tiles.vegetation import crown_images, tree_meshes
 
 _MAX_CHART_PX = 800
@@ -25,7 +25,7 @@ _CAR_PX_PER_M = 16
 class StandingObjects:
     """The objects of a scene by leaf tile; an object belongs to the tile of its middle."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: TileScene) -> None:
         self._scene = scene
         self._leaf_buildings: dict[tuple[int, int], list[Building]] = defaultdict(list)
         for building in scene.buildings:
@@ -35,7 +35,7 @@ class StandingObjects:
         column, row = np.floor((xy + self._scene.plan.config.half_m) / LEAF_M).astype(int)
         return int(column), int(row)
 
-    def on_leaf(self, leaf: tuple[int, int], light: Light) -> ChartedMesh:
+    def on_leaf(self, leaf: tuple[int, int], light: WindowLight) -> ChartedMesh:
         """The mesh of a leaf tile, (column, row) from south-west, with its painted charts."""
         parts = [
             self._surface(s, light) for b in self._leaf_buildings.get(leaf, ()) for s in build(b)
@@ -46,7 +46,7 @@ class StandingObjects:
         parts.append(self._cars(west, south, light))
         return ChartedMesh.merged([p for p in parts if len(p.faces)])
 
-    def _surface(self, surface: Surface, light: Light) -> ChartedMesh:
+    def _surface(self, surface: Surface, light: WindowLight) -> ChartedMesh:
         width, length = surface.extent
         gsd = max(LEAF_GSD_M, max(width, length) / _MAX_CHART_PX)
         out = new_image(max(2, int(np.ceil(length / gsd))), max(2, int(np.ceil(width / gsd))))
@@ -68,7 +68,7 @@ class StandingObjects:
             np.full(len(faces), surface.levels, np.uint8), (out,),
         )  # fmt: skip
 
-    def _hedges(self, west: float, south: float, light: Light) -> list[ChartedMesh]:
+    def _hedges(self, west: float, south: float, light: WindowLight) -> list[ChartedMesh]:
         parts = []
         for hedge in self._scene.plan.hedges:
             middle = (hedge.a + hedge.b) / 2
@@ -91,7 +91,9 @@ class StandingObjects:
                 parts.append(self._surface(surface, light))
         return parts
 
-    def _trees(self, leaf: tuple[int, int], west: float, south: float, light: Light) -> ChartedMesh:
+    def _trees(
+        self, leaf: tuple[int, int], west: float, south: float, light: WindowLight
+    ) -> ChartedMesh:
         trees = self._scene.plan.trees
         xy = trees.xy
         inside = (xy[:, 0] >= west) & (xy[:, 0] < west + LEAF_M)
@@ -110,7 +112,7 @@ class StandingObjects:
         look = self._scene.visit.look
         return tree_meshes(trees, chosen, z, shaded, crown_images(rng, look, light))
 
-    def _cars(self, west: float, south: float, light: Light) -> ChartedMesh:
+    def _cars(self, west: float, south: float, light: WindowLight) -> ChartedMesh:
         cars = self._scene.cars
         inside = (cars[:, 0] >= west) & (cars[:, 0] < west + LEAF_M)
         inside &= (cars[:, 1] >= south) & (cars[:, 1] < south + LEAF_M)

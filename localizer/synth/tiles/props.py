@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import TileMesh, build_mips
-from localizer.synth.config import SURVEY, Look
+from localizer.synth.config import SURVEY, VisitLook
 from localizer.types import Image
 
 CAR_LENGTH_M, CAR_WIDTH_M, CAR_HEIGHT_M = 4.5, 1.84, 1.5
@@ -79,7 +79,7 @@ def car_shape() -> PropShape:
     return _shape(quads)
 
 
-def car_image(colour: tuple[int, int, int], seed: int, look: Look = SURVEY) -> Image:
+def car_image(colour: tuple[int, int, int], seed: int, look: VisitLook = SURVEY) -> Image:
     """Top and side view of a car as one texture, (64, 72, 3), with even light from above."""
     rng = np.random.default_rng([seed, 5])
     height, width = round(4.0 * _PX_PER_M), round(CAR_LENGTH_M * _PX_PER_M)

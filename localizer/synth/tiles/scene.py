@@ -24,7 +24,7 @@ _DSM_MARGIN_M = 20.0
 
 
 @dataclass(frozen=True)
-class Scene:
+class TileScene:
     """One visit to a planned world: what stands there, and the surface model that throws shadows.
 
     plan: with the visit's changes. cars: (C, 4) x, y, heading, seed; dsm, ground: (H, W) float32
@@ -41,7 +41,7 @@ class Scene:
     north: float
 
 
-def make_scene(plan: WorldPlan, visit: Visit) -> Scene:
+def make_scene(plan: WorldPlan, visit: Visit) -> TileScene:
     """Change what changed, fill parking places, take away gone buildings, and model the surface."""
     look = visit.look
     if visit.changes is not None:
@@ -81,7 +81,7 @@ def make_scene(plan: WorldPlan, visit: Visit) -> Scene:
         shape = car_shape()
         body = car_positions(plan.terrain, cars, shape)[:, shape.faces].reshape(-1, 3, 3)
         raise_surface(dsm, body, -half, half, DSM_GSD_M)
-    return Scene(plan, visit, buildings, cars, dsm, ground, -half, half)
+    return TileScene(plan, visit, buildings, cars, dsm, ground, -half, half)
 
 
 def _fan(polygon: Array) -> Array:

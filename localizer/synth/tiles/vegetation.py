@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import LEAF, MID, TOP
-from localizer.synth.config import Look
-from localizer.synth.paint.covers import Light, new_image
+from localizer.synth.config import VisitLook
+from localizer.synth.paint.covers import WindowLight, new_image
 from localizer.synth.paint.crowns import paint_crown
 from localizer.synth.plan.plan import Hedge, Trees
 from localizer.synth.tiles.charts import ChartedMesh
@@ -50,7 +50,7 @@ _SPIRE = _rings([(0.42, 0.55), (1.0, 0.10)], 6)
 _BLOB = _rings([(0.95, 0.45)], 5)
 
 
-def crown_images(rng: np.random.Generator, look: Look, light: Light) -> list[Image]:
+def crown_images(rng: np.random.Generator, look: VisitLook, light: WindowLight) -> list[Image]:
     """Crown textures: broadleaf in light and in shade, then conifers in light and in shade."""
     images = []
     for conifer in (False, True):

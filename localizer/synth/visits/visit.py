@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from localizer.synth.config import SURVEY, Look, WorldConfig
+from localizer.synth.config import SURVEY, VisitLook, WorldConfig
 from localizer.synth.visits.changes import Changes
 from localizer.synth.visits.survey import SurveyErrors
 
@@ -20,17 +20,17 @@ class Visit:
     """
 
     name: str
-    look: Look
+    look: VisitLook
     changes: Changes | None = None
     survey: SurveyErrors | None = None
 
 
-def draw_look(rng: np.random.Generator) -> Look:
+def draw_look(rng: np.random.Generator) -> VisitLook:
     """A visit on a random day: sun, season, traffic, a few buildings gone."""
     strength = rng.uniform(0.0, 1.0)
     warm = rng.uniform(0.8, 1.05)
     sky = 0.75 - 0.42 * strength
-    return Look(
+    return VisitLook(
         sun_azimuth_deg=float(rng.uniform(0, 360)),
         sun_elevation_deg=float(rng.uniform(12, 65)),
         sun_rgb=(0.95 * strength, 0.9 * strength * warm**0.5, 0.85 * strength * warm),

@@ -113,7 +113,7 @@ class ShardStream:
         config = self._config
         if size is not None:
             config = replace(config, crop=size.crop, batch=size.batch)
-        samples: list[Sample] = []
+        samples: list[TrainingSample] = []
         keys: list[Key] = []
         for _ in range(_MOST_DRAWS * config.batch):
             key = self._draw(step, rng)
@@ -169,7 +169,7 @@ class ShardStream:
 
 
 @dataclass(frozen=True)
-class Sample:
+class TrainingSample:
     """One augmented crop pair; arrays as in `localizer.training.losses.Batch`, without B."""
 
     reference: Image
@@ -182,7 +182,7 @@ class Sample:
     K_query: Float32
 
 
-def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
+def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> TrainingSample | None:
     """Weather on the query, windows that see the same ground, anchors; None without overlap."""
     query, reference = pair.query, pair.reference
     if config.appearance:
@@ -194,7 +194,9 @@ def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sam
     return window_pair(replace(pair, reference=reference, query=query), config, rng)
 
 
-def window_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
+def window_pair(
+    pair: Pair, config: LoaderConfig, rng: np.random.Generator
+) -> TrainingSample | None:
     """Windows of a degraded pair that see the same ground, with anchors; None without overlap."""
     width, height = config.crop
     camera, reference, query = pair.camera, pair.reference, pair.query
@@ -223,7 +225,7 @@ def window_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> S
         return None
     order = np.r_[np.flatnonzero(visible)[: int(0.85 * config.anchors)], np.flatnonzero(~visible)]
     order = np.r_[order, np.flatnonzero(visible)[int(0.85 * config.anchors) :]][: config.anchors]
-    sample = Sample(
+    sample = TrainingSample(
         reference[ry : ry + height, rx : rx + width],
         query[qy : qy + height, qx : qx + width],
         points[order].astype(np.float32),
@@ -243,12 +245,12 @@ def survey_appearance(rng: np.random.Generator) -> Appearance | None:
     return replace(sample_appearance(rng, "day"), motion_blur_px=0.0, extinction_per_m=0.0)
 
 
-def mirrored(sample: Sample) -> Sample:
+def mirrored(sample: TrainingSample) -> TrainingSample:
     """The same pair seen in a mirror: images flipped, x negated in both camera frames."""
     width = sample.query.shape[1]
     M = np.diag([-1.0, 1.0, 1.0, 1.0])
     flip = np.array([-1.0, 1.0], np.float32)
-    return Sample(
+    return TrainingSample(
         sample.reference[:, ::-1],
         sample.query[:, ::-1],
         sample.points * np.array([-1, 1, 1], np.float32),
@@ -261,7 +263,7 @@ def mirrored(sample: Sample) -> Sample:
     )
 
 
-def collate(samples: list[Sample]) -> Batch:
+def collate(samples: list[TrainingSample]) -> Batch:
     """Stack samples into tensors."""
     images = np.stack([s.reference for s in samples] + [s.query for s in samples])
     # channels_last tensors corrupt memory in torch 2.13's CPU backward pass.

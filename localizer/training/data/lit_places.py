@@ -10,8 +10,8 @@ import numpy as np
 
 from localizer.synth.heightfield.scene import LitScene
 from localizer.training.data.pairs import (
+    FlightDay,
     SceneConfig,
-    Visit,
     draw_place,
     draw_visit,
     lived_scene,
@@ -25,7 +25,7 @@ class PlaceVisits:
     """A place as it was surveyed, and on the days of several flights."""
 
     survey: LitScene
-    days: tuple[tuple[LitScene, Visit, bool], ...]
+    days: tuple[tuple[LitScene, FlightDay, bool], ...]
     source: str
 
 

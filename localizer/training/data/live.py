@@ -24,7 +24,7 @@ from localizer.synth.appearance.model_torch import apply_appearance
 from localizer.synth.heightfield.render_torch import ScenePool, render
 from localizer.training.data.batches import (
     LoaderConfig,
-    Sample,
+    TrainingSample,
     collate,
     survey_appearance,
     tamed,
@@ -114,7 +114,7 @@ class LiveStream:
         rng = np.random.default_rng(key)
         noise = torch.Generator(self._pool.device)
         noise.manual_seed(int(rng.integers(2**62)))
-        samples: list[Sample] = []
+        samples: list[TrainingSample] = []
         while len(samples) < self._loader.batch:
             missing = self._loader.batch - len(samples)
             for pair in self.pairs(step, int(missing * _SPARE) + 1, rng, noise):

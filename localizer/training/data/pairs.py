@@ -21,8 +21,8 @@ from localizer.synth.appearance.thermal import THERMAL_CONDITIONS, draw_thermal_
 from localizer.synth.heightfield.render import render
 from localizer.synth.heightfield.scene import (
     Land,
-    Light,
     LitScene,
+    SkyLight,
     compose,
     height_at,
     light_scene,
@@ -34,7 +34,7 @@ from localizer.training.places.changes import coarse_mesh, plain_walls
 from localizer.training.places.land import generated_place, photo_place
 from localizer.training.places.objects import new_buildings, parked_cars
 from localizer.training.places.photos import PhotoLibrary
-from localizer.training.places.place import Place
+from localizer.training.places.place import TrainingPlace
 from localizer.training.places.seasons import season_shift
 from localizer.training.places.styles import LAMPS, STYLES, SUNNY, styled_ground, styled_light
 from localizer.types import Float32, Image
@@ -92,7 +92,7 @@ class SceneConfig:
 
 
 @dataclass(frozen=True)
-class Visit:
+class FlightDay:
     """The day of a flight: weather or light (of `CONDITIONS`), buildings gone and new, vegetation
     of another season (None: drawn), and one of `STYLES` or None.
     """
@@ -109,7 +109,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
     place, source = draw_place(rng, config, library)
     survey = survey_scene(rng, place, config)
     lived: LitScene | None = None
-    visit, season = Visit("day", False, None), False
+    visit, season = FlightDay("day", False, None), False
     for k in range(config.references):
         if lived is None or k % config.queries_per_light == 0:
             if config.conditions:
@@ -134,7 +134,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
 
 def draw_place(
     rng: np.random.Generator, config: SceneConfig, library: PhotoLibrary | None
-) -> tuple[Place, str]:
+) -> tuple[TrainingPlace, str]:
     """A place, and where its ground is from: "photo" or "generated"."""
     n = config.cells
     cell = float(np.exp(rng.uniform(*np.log(config.cell_m))))
@@ -143,9 +143,9 @@ def draw_place(
     return generated_place(rng, n, cell), "generated"
 
 
-def draw_visit(rng: np.random.Generator, styles: float = 0.0) -> Visit:
+def draw_visit(rng: np.random.Generator, styles: float = 0.0) -> FlightDay:
     """The day of a training flight. styles: as of `SceneConfig`."""
-    visit = Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
+    visit = FlightDay(draw_condition(rng), bool(rng.random() < 0.4), None)
     if styles > 0.0 and rng.random() < styles:
         style = str(rng.choice(STYLES))
         weather = "night" if style == LAMPS else "day" if style in SUNNY else visit.weather
@@ -173,7 +173,7 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
     return warped, inside & same & (pair.reference_depth > 0)
 
 
-def survey_scene(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitScene:
+def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneConfig) -> LitScene:
     """The map: the place on the day of the survey, as a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
     if not config.shared_detail:
@@ -192,9 +192,9 @@ def survey_scene(rng: np.random.Generator, place: Place, config: SceneConfig) ->
 
 def lived_scene(
     rng: np.random.Generator,
-    place: Place,
-    visit: Visit,
-    light: Light | None,
+    place: TrainingPlace,
+    visit: FlightDay,
+    light: SkyLight | None,
     shared_detail: bool,
 ) -> tuple[LitScene, bool]:
     """The place on the day of the flight, and whether that is another season than the map's; a
@@ -237,16 +237,16 @@ def lived_scene(
     return light_scene(compose(land, prisms), light or sun, _sky(rng, condition)), season
 
 
-def _car_count(rng: np.random.Generator, place: Place) -> int:
+def _car_count(rng: np.random.Generator, place: TrainingPlace) -> int:
     return int(rng.integers(0, 250)) if place.land.cell_m < 0.9 else 0
 
 
-def _sun(rng: np.random.Generator, elevation_deg: float, direct: float) -> Light:
+def _sun(rng: np.random.Generator, elevation_deg: float, direct: float) -> SkyLight:
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(elevation_deg)
     flat = np.cos(elevation)
     sun = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))
     strength = direct * rng.uniform(0.7, 1.1)
-    return Light((float(sun[0]), float(sun[1]), float(sun[2])), strength, 1.15 - 0.7 * strength)
+    return SkyLight((float(sun[0]), float(sun[1]), float(sun[2])), strength, 1.15 - 0.7 * strength)
 
 
 def _sky(rng: np.random.Generator, condition: str) -> tuple[float, float, float]:
@@ -259,17 +259,17 @@ def draw_condition(rng: np.random.Generator) -> str:
     return str(rng.choice(CONDITIONS, p=(0.42, 0.15, 0.17, 0.1, 0.08, 0.08)))
 
 
-def visit_of(rng: np.random.Generator, condition: str) -> Visit:
+def visit_of(rng: np.random.Generator, condition: str) -> FlightDay:
     """The visit of a test condition: a weather or one of `STYLES` alone, `SEASON` or `OUTDATED` on
     a day, or any weather together with both (`COMBINED`).
     """
     if condition == COMBINED:
-        return Visit(str(rng.choice(CONDITIONS)), True, True)
+        return FlightDay(str(rng.choice(CONDITIONS)), True, True)
     if condition in STYLES:
-        return Visit("night" if condition == LAMPS else "day", False, False, condition)
+        return FlightDay("night" if condition == LAMPS else "day", False, False, condition)
     if condition in (SEASON, OUTDATED):
-        return Visit("day", condition == OUTDATED, condition == SEASON)
-    return Visit(condition, False, False)
+        return FlightDay("day", condition == OUTDATED, condition == SEASON)
+    return FlightDay(condition, False, False)
 
 
 def draw_views(

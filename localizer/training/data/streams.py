@@ -13,12 +13,12 @@ from localizer.training.data.pairs import SceneConfig
 from localizer.training.data.seeds import FIRST_WORLD_SEED
 from localizer.training.data.shards import PhotoSource, shard_path, world_shard_paths
 from localizer.training.data.sizes import Size
-from localizer.training.distributed import Workers
+from localizer.training.distributed import TrainingProcess
 
 
 def open_stream(
     config: TrainConfig,
-    workers: Workers,
+    workers: TrainingProcess,
     generating: Future[None] | None,
     hard: HardPairs | None = None,
 ) -> ShardStream | LiveStream:

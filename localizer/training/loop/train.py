@@ -16,7 +16,7 @@ from localizer.training.checkpoint import fill, read_checkpoint, write_checkpoin
 from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.data.batches import ShardStream
 from localizer.training.data.streams import hard_pairs, open_stream
-from localizer.training.distributed import Workers
+from localizer.training.distributed import TrainingProcess
 from localizer.training.loop.distill import Teacher, distillation_loss
 from localizer.training.loop.log import append
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
@@ -37,7 +37,7 @@ class Trainer:
         self.config = config
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.optimizer.threads)
-        self.workers = Workers.from_environment()
+        self.workers = TrainingProcess.from_environment()
         self.device = self.workers.device
         self.model = build(config.model).to(self.device).train()
         if config.warm_start is not None:

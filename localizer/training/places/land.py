@@ -11,7 +11,7 @@ from localizer.synth.heightfield.scene import Land, Prism
 from localizer.synth.visits.noise import noise
 from localizer.synth.visits.texture import hard_surfaces
 from localizer.training.places.objects import building, buildings_along, plant, with_ground_color
-from localizer.training.places.place import Place
+from localizer.training.places.place import TrainingPlace
 from localizer.types import Float32
 
 # RGB albedo of the land-cover classes: grass, crop, forest floor, soil, water, meadow.
@@ -28,7 +28,7 @@ _COVER = np.array(
 )
 
 
-def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> Place:
+def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> TrainingPlace:
     """Parcels, forest, water, a street net with buildings along it, scattered farms."""
     height = noise(n, rng, 2, 5, 0.42) * _relief(rng, n, cell_m)
     cover, albedo = _parcels(rng, n)
@@ -47,12 +47,12 @@ def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> Place:
         cv2.fillConvexPoly(blocked, np.rint(b.corners).astype(np.int32), 1)
     plant(rng, height, albedo, (cover == 2) & (blocked == 0), blocked, cell_m)
     land = Land(height.astype(np.float32), np.clip(albedo, 0.02, 1).astype(np.float32), cell_m)
-    return Place(land, buildings, roads, _with_roofs(lasting, buildings))
+    return TrainingPlace(land, buildings, roads, _with_roofs(lasting, buildings))
 
 
 def photo_place(
     rng: np.random.Generator, n: int, cell_m: float, layers: list[NDArray[np.uint8]]
-) -> Place:
+) -> TrainingPlace:
     """Real textures (each (n, n, 3) uint8, the same ground at different dates) over relief."""
     albedos = [(layer.astype(np.float32) / 255.0) * 0.85 for layer in layers]
     height = noise(n, rng, 2, 5, 0.4) * _relief(rng, n, cell_m)
@@ -68,7 +68,7 @@ def photo_place(
     kept = [with_ground_color(b, layers[0], rng) for b in buildings]
     land = Land(height.astype(np.float32), np.clip(albedos[0], 0.02, 1.2), cell_m)
     others = tuple(np.clip(a, 0.02, 1.2) for a in albedos[1:])
-    return Place(land, kept, [], _with_roofs(hard_surfaces(layers[0]), kept), others)
+    return TrainingPlace(land, kept, [], _with_roofs(hard_surfaces(layers[0]), kept), others)
 
 
 def _with_roofs(lasting: Float32, prisms: list[Prism]) -> Float32:

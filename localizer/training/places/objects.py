@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.synth.heightfield.scene import Prism
-from localizer.training.places.place import Place
+from localizer.training.places.place import TrainingPlace
 from localizer.types import Float32
 
 
-def parked_cars(rng: np.random.Generator, place: Place, count: int) -> list[Prism]:
+def parked_cars(rng: np.random.Generator, place: TrainingPlace, count: int) -> list[Prism]:
     """Cars beside roads, or anywhere where there are none."""
     n, cell = place.land.height.shape[0], place.land.cell_m
     cars = []
@@ -31,7 +31,7 @@ def parked_cars(rng: np.random.Generator, place: Place, count: int) -> list[Pris
     return cars
 
 
-def new_buildings(rng: np.random.Generator, place: Place, count: int) -> list[Prism]:
+def new_buildings(rng: np.random.Generator, place: TrainingPlace, count: int) -> list[Prism]:
     """Buildings where the map has none: what was built since."""
     n, cell = place.land.height.shape[0], place.land.cell_m
     return [building(rng, rng.uniform(0, n, 2), rng.uniform(0, np.pi), cell) for _ in range(count)]

@@ -9,7 +9,7 @@ from localizer.types import Float32
 
 
 @dataclass(frozen=True)
-class Place:
+class TrainingPlace:
     """A training place. seasons: albedos of the same ground at other dates, where the data has
     them; lasting: (n, n) in 0..1, one where the fine texture stays: roads, roofs, pavement.
     """

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from localizer.synth.heightfield.scene import Light
+from localizer.synth.heightfield.scene import SkyLight
 from localizer.synth.visits.noise import noise
-from localizer.training.places.place import Place
+from localizer.training.places.place import TrainingPlace
 from localizer.types import Float32
 
 LAMPS = "lamp-lit night"
@@ -31,12 +31,14 @@ class StyledLight:
     (n, n) light of lamps, in units of the sun's, None for none.
     """
 
-    light: Light
+    light: SkyLight
     sunlit: Float32 | None = None
     glow: Float32 | None = None
 
 
-def styled_ground(albedo: Float32, place: Place, style: str, rng: np.random.Generator) -> Float32:
+def styled_ground(
+    albedo: Float32, place: TrainingPlace, style: str, rng: np.random.Generator
+) -> Float32:
     """The ground (n, n, 3) under one of `STYLES`; as it is under those of light alone."""
     n, cell = albedo.shape[0], place.land.cell_m
     soft = (1.0 - place.lasting)[..., None]
@@ -71,7 +73,7 @@ def styled_ground(albedo: Float32, place: Place, style: str, rng: np.random.Gene
 
 
 def styled_light(
-    light: Light, place: Place, style: str, rng: np.random.Generator
+    light: SkyLight, place: TrainingPlace, style: str, rng: np.random.Generator
 ) -> StyledLight:  # fmt: skip
     """The light of a day under one of `STYLES`; as it is under those of the ground alone."""
     n, cell = place.land.height.shape[0], place.land.cell_m
@@ -80,7 +82,7 @@ def styled_light(
         flat = np.cos(up)
         sun = (float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(up)))
         # Exposed for level ground, so what faces the sun is overexposed.
-        return StyledLight(Light(sun, float(rng.uniform(0.25, 0.5) / np.sin(up)), 0.5))
+        return StyledLight(SkyLight(sun, float(rng.uniform(0.25, 0.5) / np.sin(up)), 0.5))
     if style == "cloud shadows":
         cells = max(int(n * cell / rng.uniform(60, 400)), 1) + 1
         field = noise(n, rng, cells, 3, 0.45)
@@ -88,12 +90,12 @@ def styled_light(
         through = np.clip(0.5 + edge / rng.uniform(0.1, 0.5), rng.uniform(0.05, 0.25), 1)
         return StyledLight(replace(light, direct=1.0, ambient=0.4), through.astype(np.float32))
     if style == LAMPS:
-        dark = Light(light.sun, 0.0, float(rng.uniform(0.12, 0.35)))
+        dark = SkyLight(light.sun, 0.0, float(rng.uniform(0.12, 0.35)))
         return StyledLight(dark, glow=_lamps(place, n, cell, rng))
     return StyledLight(light)
 
 
-def _standing(place: Place) -> Float32:
+def _standing(place: TrainingPlace) -> Float32:
     """(n, n): where the ground rises over what is about it: crowns, not meadows."""
     height, cell = place.land.height, place.land.cell_m
     rise = height - cv2.erode(cv2.GaussianBlur(height, (0, 0), 0.7), np.ones((9, 9)))
@@ -101,7 +103,7 @@ def _standing(place: Place) -> Float32:
     return np.asarray(np.clip((rise - steep) / 0.8, 0, 1), np.float32)
 
 
-def _lamps(place: Place, n: int, cell: float, rng: np.random.Generator) -> Float32:
+def _lamps(place: TrainingPlace, n: int, cell: float, rng: np.random.Generator) -> Float32:
     glow = np.zeros((n, n), np.float32)
     pace = rng.uniform(*_LAMP_M) / cell
     roads = place.roads or [rng.uniform(0, n, (2, 2)).astype(np.float32) for _ in range(3)]

@@ -73,7 +73,7 @@ def sqrt_controller(error: float, gain: float, limit: float) -> float:
 
 
 @dataclass(frozen=True)
-class Limits:
+class ControlLimits:
     """Speeds in m/s, accelerations in m/s² (WPNAV_*)."""
 
     speed: float
@@ -103,7 +103,7 @@ class Carrot:
         """Whether the target itself has reached the leg's end."""
         return self.position == self.end
 
-    def move(self, vehicle: Vector, limits: Limits, dt: float) -> None:
+    def move(self, vehicle: Vector, limits: ControlLimits, dt: float) -> None:
         """Advance along the leg; it waits when the vehicle lags by more than its stopping way."""
         leg = tuple(e - s for s, e in zip(self.start, self.end, strict=True))
         length = sqrt(sum(c * c for c in leg))
@@ -132,7 +132,7 @@ class Carrot:
         self.acceleration = (n * rate, e * rate, d * rate)
 
 
-def _along(direction: tuple[float, ...], limits: Limits) -> tuple[float, float]:
+def _along(direction: tuple[float, ...], limits: ControlLimits) -> tuple[float, float]:
     """Greatest speed and acceleration along a unit NED direction."""
     horizontal, down = hypot(direction[0], direction[1]), direction[2]
     speed, acceleration = 1e3, 1e3
@@ -165,7 +165,7 @@ class PositionController:
         limit = _MAX_YAW_RATE * dt
         self.yaw_rad = wrap_pi(self.yaw_rad + min(max(error, -limit), limit))
 
-    def velocity_for(self, error: Vector, feedforward: Vector, limits: Limits) -> Vector:
+    def velocity_for(self, error: Vector, feedforward: Vector, limits: ControlLimits) -> Vector:
         """Velocity target (NED m/s) for a position error (NED m) and the target's own velocity."""
         distance = hypot(error[0], error[1])
         pull = sqrt_controller(distance, _POSITION_P, limits.acceleration)

@@ -7,7 +7,7 @@ from math import atan2, cos, hypot, radians
 
 import numpy as np
 
-from sitl.embedded.control.controller import Carrot, Limits, PositionController, Vector
+from sitl.embedded.control.controller import Carrot, ControlLimits, PositionController, Vector
 from sitl.embedded.control.mode import RcInput
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.parameters import Parameters
@@ -41,13 +41,13 @@ class Guidance:
         return euler(self.estimator.output[0:4])[2]
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ControlLimits:
         """Speeds and accelerations of the present mode."""
         p = self.parameters
         speed = self.speed_override or p["WPNAV_SPEED"] / 100.0
         if self.returning and p["RTL_SPEED"] > 0:
             speed = p["RTL_SPEED"] / 100.0
-        return Limits(
+        return ControlLimits(
             speed,
             p["WPNAV_SPEED_UP"] / 100.0,
             p["WPNAV_SPEED_DN"] / 100.0,

@@ -31,7 +31,7 @@ _IGNORE_HORIZONTAL_ACCURACY = 64
 _NO_HDOP = 99.99
 
 
-class Injection:
+class ExternalNavInput:
     """State of the vision and MAVLink-GPS inputs."""
 
     def __init__(self, parameters: Parameters, estimator: Estimator) -> None:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from companion.settings_file import SettingsError, read_settings, validated
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
-from sitl.demo.scenario import CameraSpec, Leg, Scenario, ScenarioError
+from sitl.demo.scenario import CameraSpec, Scenario, ScenarioError, ScenarioLeg
 
 LOOP_SCENARIOS = Path(__file__).parents[2] / "scenarios" / "loop"
 
@@ -25,7 +25,7 @@ class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Picture(_Model):
+class VideoFault(_Model):
     """A fault of the picture for some seconds; see `PictureFault`."""
 
     kind: PictureFaultKind
@@ -62,7 +62,7 @@ class Load(_Model):
     for_s: float = Field(gt=0, le=300)
 
 
-class PlaceHint(_Model):
+class OperatorHint(_Model):
     """The operator tells the companion where the vehicle is, off_north_m beside it."""
 
     radius_m: float = Field(gt=0, le=5000)
@@ -78,11 +78,11 @@ class LoopEvent(_Model):
     """
 
     at_s: float = Field(ge=0)
-    picture: Picture | None = None
+    picture: VideoFault | None = None
     zoom: Zoom | None = None
     drag: Drag | None = None
     load: Load | None = None
-    hint: PlaceHint | None = None
+    hint: OperatorHint | None = None
     start: bool = False
     kill: bool = False
     hang: bool = False
@@ -112,12 +112,12 @@ class Expectation(_Model):
     """What must hold between the start and the end of the recorded part.
 
     told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
-    guardian that stands) at latest so long after it began. never_modes: flight modes that must not
+    monitor that stands) at latest so long after it began. never_modes: flight modes that must not
     be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
     injects: and some are injected. back_within_s: of a kill or a hang, injected again.
     repeats: how often the companion may say the same, figures aside. ends_tracking: the last health
     is ok. says: parts of texts that must come from the companion.
-    silent: no warning text, no finding of the guardian, and a health that is ok throughout.
+    silent: no warning text, no finding of the monitor, and a health that is ok throughout.
     """
 
     beyond_m: float = Field(10.0, gt=0)
@@ -197,7 +197,9 @@ class LoopCase(_Model):
     def scenario(self) -> Scenario:
         """The demo's scenario that this flight begins with."""
         legs = tuple(
-            Leg(east_m=east, north_m=north, height_m=self.height_m, gimbal_pitch_deg=_PITCH_DEG)
+            ScenarioLeg(
+                east_m=east, north_m=north, height_m=self.height_m, gimbal_pitch_deg=_PITCH_DEG
+            )
             for east, north in self.corners_m
         )
         if self.honest:

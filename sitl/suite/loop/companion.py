@@ -22,7 +22,7 @@ _FRESH_S = 2.0  # a health report that is written every second
 @dataclass(frozen=True)
 class Health:
     """The newest ``health.json``: level and text, its age in seconds (infinite without one), names
-    of the guardian's findings that stand, localized frames per second, whose report it is, and its
+    of the monitor's findings that stand, localized frames per second, whose report it is, and its
     shadow score.
     """
 
@@ -114,8 +114,8 @@ class LoopCompanion:
         except (OSError, ValueError):
             return Health()
         age_s = (time.monotonic_ns() - int(report["time_ns"])) * 1e-9
-        guardian = report.get("guardian") or {}
-        findings = tuple(guardian.get("findings", {}))
+        integrity_monitor = report.get("guardian") or {}
+        findings = tuple(integrity_monitor.get("findings", {}))
         return Health(
             str(report["level"]), str(report["text"]), age_s, findings, float(report["rate_hz"]),
             int(report["pid"]), str(report["shadow"]),

@@ -30,7 +30,7 @@ from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
-from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong, Zoom
+from sitl.suite.loop.case import LoopCase, LoopEvent, OperatorHint, Wrong, Zoom
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import Back, LoopRecord, LoopSample, LoopText
@@ -295,7 +295,7 @@ class _LoopFlight:
         )
         self._pilot.link.sleep(1.0)
 
-    def _tell_place(self, hint: PlaceHint) -> None:
+    def _tell_place(self, hint: OperatorHint) -> None:
         place = self._pilot.record.truth.location.offset(hint.off_north_m, 0.0, 0.0)
         self._pilot.link.send(
             mavlink.MAVLink_command_int_message(

@@ -25,7 +25,7 @@ class LoopSample:
     """A moment of the recorded part, seconds since it began.
 
     error_m: the EKF's horizontal error, infinite while it reports no position. level, health: the
-    companion's health; age_s: of that report; findings: of its guardian, that stand; rate_hz:
+    companion's health; age_s: of that report; findings: of its monitor, that stand; rate_hz:
     localized frames. mode: the autopilot's.
     """
 

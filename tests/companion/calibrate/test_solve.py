@@ -10,18 +10,18 @@ import pytest
 import yaml
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.evidence import Evidence, Sighted, changed_camera
+from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
+from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
 from companion.calibrate.flight import Calibrated
 from companion.calibrate.pictures import Parts
 from companion.calibrate.proposal import (
-    Change,
+    SettingChange,
     blind_spots,
     changed,
     changes,
     require_flown_with,
     write_changed,
 )
-from companion.calibrate.said import OFFSETS_S, Said
 from companion.calibrate.solve import solve
 from companion.config import load_config
 from companion.errors import ConfigError
@@ -37,7 +37,7 @@ ERRORS[u.MOUNT] = np.radians([2.0, -1.5, 1.0])
 ERRORS[u.SHIFT], ERRORS[u.BEND] = (1.5, -2.0, 0.4), (0.01, -0.005, 0.0, 0.0)
 
 
-def frames(rich: bool, count: int = 40, seed: int = 1) -> list[Sighted]:
+def frames(rich: bool, count: int = 40, seed: int = 1) -> list[CalibrationFrame]:
     """A flight with turns, heights and gimbal angles, or straight ahead looking down."""
     rng = np.random.default_rng(seed)
     camera = changed_camera(TOLD, ERRORS)
@@ -58,10 +58,10 @@ def frames(rich: bool, count: int = 40, seed: int = 1) -> list[Sighted]:
             body.append(up @ matrix_from_euler(0.05, 0.02, yaw))
             camera_.append(up @ matrix_from_euler(0.0, pitch, yaw))
             place.append(place0 + speed * offset)
-        said = Said(np.array(camera_), np.array(body), np.array(place))
+        window = AutopilotWindow(np.array(camera_), np.array(body), np.array(place))
         i = np.argmin(np.abs(OFFSETS_S + ERRORS[u.LATE]))
-        R = said.camera[i] @ mount @ GIMBAL_FROM_CAMERA @ so3_exp(rng.normal(0, 1e-3, 3))
-        C = said.place[i] + ERRORS[u.SHIFT] + rng.normal(0, 0.05, 3)
+        R = window.camera[i] @ mount @ GIMBAL_FROM_CAMERA @ so3_exp(rng.normal(0, 1e-3, 3))
+        C = window.place[i] + ERRORS[u.SHIFT] + rng.normal(0, 0.05, 3)
         pixels = rng.uniform(20, (620, 460), (60, 2))
         rays = camera.rays(pixels) @ R.T
         ground = rng.uniform(0.0, 6.0, 60)
@@ -70,12 +70,12 @@ def frames(rich: bool, count: int = 40, seed: int = 1) -> list[Sighted]:
         seen = pixels[keep] + rng.normal(0, 0.2, (int(keep.sum()), 2))
         parts = Parts(points[keep], seen, np.broadcast_to(np.eye(2), (int(keep.sum()), 2, 2)))
         pose = Pose(so3_exp(rng.normal(0, 0.01, 3)) @ R, C + rng.normal(0, 0.5, 3))
-        made.append(Sighted(round(t0 * 1e9), pose, parts, said))
+        made.append(CalibrationFrame(round(t0 * 1e9), pose, parts, window))
     return made
 
 
-def found_of(sighted: list[Sighted]) -> Calibrated:
-    solution = solve(Evidence(sighted, TOLD, np.eye(3), np.zeros(3)))
+def found_of(sighted: list[CalibrationFrame]) -> Calibrated:
+    solution = solve(CalibrationProblem(sighted, TOLD, np.eye(3), np.zeros(3)))
     return Calibrated(
         TOLD, np.eye(3), np.zeros(3), solution, solution.covariance, 1.0, solution.pixel_sigma,
         len(sighted), 1, 0.5, (),
@@ -107,7 +107,12 @@ def test_what_a_flight_straight_ahead_cannot_tell_is_said(rich: Calibrated):
 
 def test_a_flight_without_places_tells_optics_and_mounting_only():
     blind = [
-        Sighted(f.time_ns, f.pose, f.parts, Said(f.said.camera, f.said.body, f.said.place * np.nan))
+        CalibrationFrame(
+            f.time_ns,
+            f.pose,
+            f.parts,
+            AutopilotWindow(f.window.camera, f.window.body, f.window.place * np.nan),
+        )
         for f in frames(rich=True)
     ]
     found = found_of(blind)
@@ -134,7 +139,7 @@ def test_the_deployment_is_changed_and_the_old_one_kept(rich: Calibrated, tmp_pa
     assert kept.read_text() == before
     after = load_config(path)
     assert after.camera.model.fx == pytest.approx(500.0 * np.exp(0.025), rel=0.003)
-    assert after.camera.settings.stamps_late_ms == pytest.approx(120.0, abs=10.0)
+    assert after.camera.settings.time_offset_ms == pytest.approx(120.0, abs=10.0)
     assert after.bridge.camera.mount_pitch_deg == pytest.approx(-1.5, abs=0.2)
     assert after.camera.calibrated is not None
     dated = after.camera.model_copy(update={"calibrated": None})
@@ -155,7 +160,7 @@ def test_what_makes_no_deployment_is_not_written(tmp_path: Path):
     """A flight that tells little may say a lens that the next start would refuse."""
     path = deployment(tmp_path)
     before = path.read_text()
-    wanted = (Change(("camera", "model", "cx"), 320.0, 6000.0),)
+    wanted = (SettingChange(("camera", "model", "cx"), 320.0, 6000.0),)
     with pytest.raises(ConfigError, match=r"nothing was changed.*(\n.*)*cx 6000 is far"):
         write_changed(path, wanted, "calibrated")
     assert path.read_text() == before
@@ -168,7 +173,7 @@ def test_another_flights_deployment_is_not_written_over(rich: Calibrated, tmp_pa
     require_flown_with(path, wanted)
     write_changed(path, wanted, "calibrated")
     require_flown_with(path, wanted)  # the same flight again
-    remounted = (Change(("bridge", "camera", "mount_pitch_deg"), None, -8.0),)
+    remounted = (SettingChange(("bridge", "camera", "mount_pitch_deg"), None, -8.0),)
     write_changed(path, remounted, "mounted anew")
     with pytest.raises(ConfigError, match=r"mount_pitch_deg is -8.0, .* flown with 0.0"):
         require_flown_with(path, wanted)

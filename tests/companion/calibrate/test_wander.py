@@ -45,17 +45,17 @@ def said_and_true(wander: Wander | AttitudeWander) -> tuple[Array, Array]:
     whiten = wander.whitened(np.eye(size).reshape(-1, 3, size), TIMES_S, WHITE)
     columns = np.concatenate([np.broadcast_to(np.eye(3), (len(up), 3, 3)), up[..., None]], axis=2)
     x = whiten @ columns.reshape(size, 4)
-    said = np.linalg.inv(x.T @ x)
-    gain = said @ x.T @ whiten
-    return np.sqrt(np.diag(said)), np.sqrt(np.diag(gain @ true_covariance(sources) @ gain.T))
+    window = np.linalg.inv(x.T @ x)
+    gain = window @ x.T @ whiten
+    return np.sqrt(np.diag(window)), np.sqrt(np.diag(gain @ true_covariance(sources) @ gain.T))
 
 
 def test_what_is_said_of_mounting_and_heading_is_as_unsure_as_it_is():
     """By axis of the camera alone, the heading was said twice as surely as it is."""
     _, up = axes()
     by_axis = Wander(np.hypot([PITCH, 0.5 * HEADING, ROLL], [0, 0, HEADING]), np.full(3, MEMORY_S))
-    said, true = said_and_true(by_axis)
-    assert true[3] > 1.5 * said[3]
+    window, true = said_and_true(by_axis)
+    assert true[3] > 1.5 * window[3]
     sigmas = np.array([PITCH, 1e-6, ROLL, HEADING, 1e-6])
     said_better, true_better = said_and_true(AttitudeWander(sigmas, MEMORY_S, up))
     assert said_better == pytest.approx(true_better, rel=1e-3)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration_watch.config import CalibrationLimits
-from companion.calibration_watch.sighting import Sighting
+from companion.calibration_watch.observation import CalibrationObservation
 from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.guardian.inertial import GRAVITY, InertialTrack
+from companion.integrity_monitor.inertial import GRAVITY, InertialTrack
 from localizer.geometry.pose import matrix_from_euler, so3_exp
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, GimbalAttitude, InertialSample, VehicleState
@@ -197,7 +197,7 @@ class Flown:
         self._slow = self._slow * np.exp(-h / 2.0) + 0.1 * np.sqrt(h) * noise[:3]
         self._wander = self._wander + np.array([0.1, 0.1, 0.2]) * np.sqrt(h) * noise[3:]
 
-    def _sighting(self, at_s: float) -> Sighting:
+    def _sighting(self, at_s: float) -> CalibrationObservation:
         wrong = self.wrong
         seen_s = at_s - (wrong.late_s if at_s >= wrong.late_from_s else 0.0)
         where, yaw = self._where(seen_s), self._yaw(seen_s)
@@ -218,7 +218,7 @@ class Flown:
         right = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         turned = so3_exp(right * off[1]) @ so3_exp(np.array([0.0, 0.0, off[2]])) @ camera
         turned = so3_exp(0.003 * self._rng.standard_normal(3)) @ turned
-        return Sighting(
+        return CalibrationObservation(
             round(at_s * 1e9),
             (*place, GROUND + where[2] - down + noise[2]),
             0.1,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.calibration_watch.config import CalibrationLimits
-from companion.calibration_watch.sighting import Sighting
+from companion.calibration_watch.observation import CalibrationObservation
 from companion.calibration_watch.watch import CalibrationFigures
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
@@ -112,7 +112,7 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
     """
 
     class Doubted(Flown):
-        def _sighting(self, at_s: float) -> Sighting:
+        def _sighting(self, at_s: float) -> CalibrationObservation:
             if at_s == 20.0:
                 self.watch.doubt_stamps(20_000_000_000)
             return super()._sighting(at_s)
@@ -233,7 +233,7 @@ def test_pictures_that_come_again_are_forgotten() -> None:
     """A loop of 5 s from 40 s on, found 3.5 s later: until then other places were taken in."""
 
     class Looped(Flown):
-        def _sighting(self, at_s: float) -> Sighting:
+        def _sighting(self, at_s: float) -> CalibrationObservation:
             if at_s < 40.0:
                 return super()._sighting(at_s)
             if at_s >= 43.5:

@@ -27,7 +27,7 @@ def map_cache(small_assets):
 INTERRUPTED_IN_A_CALLBACK = """
 import ctypes, os, signal, sys
 import companion.flight.recorder
-import companion.flight.table
+import companion.flight.component_table
 from companion.cli.commands import main
 
 number, part = getattr(signal, sys.argv.pop()), sys.argv.pop()
@@ -37,7 +37,7 @@ def make(*_):
     print("went on", flush=True)
     raise SystemExit(1)
 
-module = {"build_localizer": companion.flight.table, "write_manifest": companion.flight.recorder}
+module = {"build_localizer": companion.flight.component_table, "write_manifest": companion.flight.recorder}
 setattr(module[part], part, make)
 main()
 """

@@ -35,7 +35,7 @@ from localizer.types import (
 )
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.vehicle.mission import Waypoint
+from mavlink_bridge.vehicle.mission import MissionWaypoint
 
 CAMERA = Camera.from_fov(480, 360, 65.0)
 HEIGHT_M = 80.0
@@ -66,7 +66,8 @@ class Flight:
         corners = [(0.0, 0.0), (0.0, 60.0), (60.0, 60.0)]
         places = [self.cache.frame.position([e, n, 0.0]) for e, n in corners]
         self.mission = tuple(
-            Waypoint(i, place.latitude_deg, place.longitude_deg) for i, place in enumerate(places)
+            MissionWaypoint(i, place.latitude_deg, place.longitude_deg)
+            for i, place in enumerate(places)
         )
         self.health = {
             "level": "ok", "text": "localization tracking", "rate_hz": self.hz,

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.console.pictures import Picture, View, map_at_pose, page_message
-from companion.live.protocol import Decoder
+from companion.console.pictures import OverlayFrame, ReferenceImage, map_at_pose, page_message
+from companion.live.protocol import MessageDecoder
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
@@ -40,8 +40,8 @@ def _difference(found, wanted):
 def test_the_map_is_carried_to_the_estimated_pose(views):
     """Followed at every fourth pixel only; what is rendered there is the truth."""
     reference, truth = views
-    view = View(reference.rgb, reference.depth, CAMERA, reference.world_from_camera)
-    picture = Picture(truth.rgb, CAMERA, truth.world_from_camera, view)
+    view = ReferenceImage(reference.rgb, reference.depth, CAMERA, reference.world_from_camera)
+    picture = OverlayFrame(truth.rgb, CAMERA, truth.world_from_camera, view)
     half = (CAMERA.width // 2, CAMERA.height // 2)
     wanted = cv2.resize(truth.rgb, half, interpolation=cv2.INTER_AREA)
     carried = _difference(map_at_pose(picture), wanted)
@@ -58,7 +58,7 @@ def _message(flight_image: np.ndarray, camera: Camera):
     }  # fmt: skip
     text = json.dumps(shown).encode()
     data = struct.pack(">II", len(text), flight_image.nbytes) + text + flight_image.tobytes()
-    (message,) = Decoder().feed(data)
+    (message,) = MessageDecoder().feed(data)
     return message
 
 

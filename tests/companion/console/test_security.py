@@ -28,7 +28,7 @@ from uvicorn.server import ServerState
 
 from companion.console.records import Records
 from companion.console.security import MOST_BODY, Guarded, read_token
-from companion.console.server import Site, make_application
+from companion.console.server import ConsoleSite, make_application
 from companion.console.serving import HurriedProtocol, Server
 from companion.console.source import Newest
 from companion.console.tiles import TileName
@@ -86,7 +86,7 @@ def site(tmp_path, deployment, small_assets):
         (record / "snapshots").mkdir(parents=True, exist_ok=True)
         (record / "record.json").write_text(json.dumps({"utc_ns": 5}))
         (record / "events.csv").write_text("time_ns,level,text\n")
-        return Site(
+        return ConsoleSite(
             ConsoleConfig(**config), source or Still(), small_assets.map_cache,
             Records(flights), deployment, token,
         )  # fmt: skip

@@ -18,9 +18,9 @@ import pytest
 from companion.config import parse_config
 from companion.errors import ConfigError, ReportError, StreamOpenError
 from companion.flight.app import Companion
+from companion.flight.component_table import COMPONENTS
+from companion.flight.components import Component
 from companion.flight.feed import Feed
-from companion.flight.parts import Part
-from companion.flight.table import PARTS
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import without_figures
@@ -85,7 +85,7 @@ def test_a_restart_whose_stick_is_gone_goes_on_without_a_record(small_assets, tm
     with pytest.raises(ReportError, match=r"record\.folder .*cannot be written"):
         Companion(config).run()
     with pytest.raises(StreamOpenError):
-        Companion(config, again=True).run()
+        Companion(config, restart=True).run()
 
 
 class _InterruptedWait:
@@ -118,8 +118,8 @@ def test_the_order_to_stop_takes_no_lock(small_assets):
     )
     feed, orders, interrupted = _StubFeed(), [], _InterruptedWait()
     feed.ended = interrupted
-    parts = [p for p in PARTS if p.name == "map"]
-    companion = Companion(config, [*parts, Part("feed", Feed, lambda _: feed)])
+    parts = [p for p in COMPONENTS if p.name == "map"]
+    companion = Companion(config, [*parts, Component("feed", Feed, lambda _: feed)])
     interrupted.interrupt = lambda: orders.append(companion.stop())
     companion.run()
     assert orders == [True]
@@ -133,10 +133,10 @@ def test_a_restart_without_its_deployment_file_tells_the_operator(small_assets, 
     feed, bridge, said = _StubFeed(), object.__new__(Bridge), []
     bridge.say = lambda severity, text: said.append((severity, text))  # type: ignore[method-assign]
     parts = [
-        *(p for p in PARTS if p.name == "map"),
-        Part("feed", Feed, lambda _: feed), Part("bridge", Bridge, lambda _: bridge),
+        *(p for p in COMPONENTS if p.name == "map"),
+        Component("feed", Feed, lambda _: feed), Component("bridge", Bridge, lambda _: bridge),
     ]  # fmt: skip
-    companion = Companion(config, parts, again=True, lost_settings=lost)
+    companion = Companion(config, parts, restart=True, lost_settings=lost)
     feed.ended.interrupt = companion.stop
     with caplog.at_level(logging.WARNING):
         companion.run()
@@ -176,12 +176,12 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
     feed.ended = threading.Event()
     feed.ended.set()
     feed.error = StreamOpenError("gone") if fails == "feed" else None
-    part = Part(
+    part = Component(
         "memory", _Memory, lambda _: memory, start=lambda _: None,
-        stop=lambda made: made.log.append("stop"), leave=lambda made: made.log.append("leave"),
+        stop=lambda made: made.log.append("stop"), hand_over=lambda made: made.log.append("leave"),
     )  # fmt: skip
-    parts = [p for p in PARTS if p.name == "map"]
-    parts += [part, Part("feed", Feed, lambda _: feed, start=fail)]
+    parts = [p for p in COMPONENTS if p.name == "map"]
+    parts += [part, Component("feed", Feed, lambda _: feed, start=fail)]
     with (
         pytest.raises(OSError, match="no more")
         if fails == "start"
@@ -192,7 +192,11 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
 
 
 def test_the_gate_the_last_fix_and_what_forbids_are_what_is_left():
-    assert {p.name for p in PARTS if p.leave is not None} == {"bridge", "guardian", "last fix"}
+    assert {p.name for p in COMPONENTS if p.hand_over is not None} == {
+        "bridge",
+        "guardian",
+        "last fix",
+    }
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
@@ -202,7 +206,7 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
         bridge.say(6, "PiLoT: last words")
         bridge.stop()
 
-    parts = [replace(p, stop=stop_with_last_words) if p.kind is Bridge else p for p in PARTS]
+    parts = [replace(p, stop=stop_with_last_words) if p.kind is Bridge else p for p in COMPONENTS]
     for i in range(25):  # 5 s of flight
         cv2.imwrite(str(tmp_path / f"{i:02}.png"), np.full((120, 160, 3), 3 * i, np.uint8))
     threads = set(threading.enumerate())

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.flight.health import Besides, HealthMonitor
+from companion.flight.health import HealthInputs, HealthMonitor
 from companion.sources import StreamState
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
@@ -20,9 +20,9 @@ from mavlink_bridge.messages import HealthLevel, without_figures
 
 
 class FakeBridge:
-    def __init__(self, connected, trouble=""):
+    def __init__(self, connected, injection_fault=""):
         self._connected = connected
-        self.trouble = trouble
+        self.injection_fault = injection_fault
         self.told = []
         self.said = []
 
@@ -33,7 +33,7 @@ class FakeBridge:
         return SimpleNamespace(connected=self._connected)
 
     def set_health(self, level, text, *, tell):
-        known = text.startswith(("vision not used", "withheld"))  # told by bridge and guardian
+        known = text.startswith(("vision not used", "withheld"))  # told by bridge and monitor
         assert tell is (self._connected and not known)  # as is a silent vehicle
         self.told.append((level, text))
 
@@ -44,12 +44,14 @@ class FakeBridge:
         return SimpleNamespace(line=lambda: "no comparison yet")
 
 
-def _one_report(folder, state, connected, tracking=None, frames_in=0, trouble="", **options):
+def _one_report(
+    folder, state, connected, tracking=None, frames_in=0, injection_fault="", **options
+):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
-    bridge, events = FakeBridge(connected, trouble), []
+    bridge, events = FakeBridge(connected, injection_fault), []
     monitor = HealthMonitor(
         lambda: EngineHealth(frames_in=frames_in), bridge, lambda: state,
-        lambda *e: events.append(e), folder, Besides(**options),
+        lambda *e: events.append(e), folder, HealthInputs(**options),
     )  # fmt: skip
     if tracking is not None:
         monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}, last_fix_ns=None))
@@ -97,22 +99,34 @@ def test_what_is_waited_for_is_told(tmp_path):
 
 def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
     """Found on ArduPilot: the yaw guard refused every fix, LAND without a position, health ok."""
-    trouble = "not sent: vision yaw differs from the autopilot's by +8.7 deg"
+    injection_fault = "not sent: vision yaw differs from the autopilot's by +8.7 deg"
     told, _ = _one_report(
-        tmp_path, StreamState.LIVE, True, tracking=TrackingState.TRACKING, trouble=trouble
+        tmp_path,
+        StreamState.LIVE,
+        True,
+        tracking=TrackingState.TRACKING,
+        injection_fault=injection_fault,
     )
-    assert told[-1] == (HealthLevel.DEGRADED, f"vision not used: {trouble}")
+    assert told[-1] == (HealthLevel.DEGRADED, f"vision not used: {injection_fault}")
     lost, _ = _one_report(
-        tmp_path, StreamState.LIVE, True, tracking=TrackingState.LOST, trouble=trouble
+        tmp_path,
+        StreamState.LIVE,
+        True,
+        tracking=TrackingState.LOST,
+        injection_fault=injection_fault,
     )
     assert lost[-1][0] is HealthLevel.FAILED  # the worse news
 
 
 def test_tracking_that_the_guardian_withholds_is_a_failure(tmp_path):
     """The heartbeat says CRITICAL: nobody has a position of ours."""
-    guardian = SimpleNamespace(reason="withheld: frozen", level=None, standing=list)
+    integrity_monitor = SimpleNamespace(reason="withheld: frozen", level=None, standing=list)
     told, _ = _one_report(
-        tmp_path, StreamState.LIVE, True, tracking=TrackingState.TRACKING, guardian=guardian
+        tmp_path,
+        StreamState.LIVE,
+        True,
+        tracking=TrackingState.TRACKING,
+        integrity_monitor=integrity_monitor,
     )
     assert told[-1] == (HealthLevel.FAILED, "withheld: frozen")
 
@@ -146,9 +160,9 @@ def test_a_disk_that_stands_still_keeps_the_health_from_nobody(tmp_path, monkeyp
     )
     monitor.start()
     assert stands.wait(30.0)
-    told, turn_ns = len(bridge.told), monitor.turn_ns
+    told, last_tick_ns = len(bridge.told), monitor.last_tick_ns
     assert sleep_until(lambda: len(bridge.told) >= told + 3, 30.0)
-    assert monitor.turn_ns > turn_ns
+    assert monitor.last_tick_ns > last_tick_ns
     goes_on.set()
     monitor.stop()
 
@@ -188,7 +202,7 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
         monitor = HealthMonitor(
             partial(EngineHealth, frames_in=9, searching=searching, search_hangs=hangs), bridge,
             lambda: StreamState.LIVE, lambda *_: None, tmp_path,
-            Besides(position_sigma_m=lambda: 20.0),
+            HealthInputs(position_sigma_m=lambda: 20.0),
         )  # fmt: skip
         monitor.add_estimate(lost)
         monitor.start()
@@ -218,7 +232,7 @@ def test_that_a_loss_cannot_be_searched_is_told_before_it_comes(
         bridge = FakeBridge(True)
         monitor = HealthMonitor(
             partial(EngineHealth, search_hangs=hangs), bridge, lambda: StreamState.LIVE,
-            lambda *_: None, tmp_path, Besides(search_lacks=lambda: lacks),
+            lambda *_: None, tmp_path, HealthInputs(search_lacks=lambda: lacks),
         )  # fmt: skip
         monitor.add_estimate(SimpleNamespace(state=state, stage_ms={}, last_fix_ns=None))
         monitor.start()
@@ -230,7 +244,7 @@ def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
     bridge = FakeBridge(True)
     monitor = HealthMonitor(
         lambda: EngineHealth(frames_in=9), bridge, lambda: StreamState.LIVE, lambda *_: None,
-        tmp_path, Besides(unreadable_nodes=lambda: 3),
+        tmp_path, HealthInputs(unreadable_nodes=lambda: 3),
     )  # fmt: skip
     tracking = SimpleNamespace(state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None)
     monitor.add_estimate(tracking)
@@ -325,8 +339,8 @@ def test_its_first_turn_is_its_start_not_its_making():
     monitor = HealthMonitor(
         EngineHealth, FakeBridge(connected), lambda: state, lambda *_: None, None
     )
-    made_ns = monitor.turn_ns = monitor.turn_ns - 36_000_000_000
+    made_ns = monitor.last_tick_ns = monitor.last_tick_ns - 36_000_000_000
     monitor.start()
-    begun_ns = monitor.turn_ns
+    begun_ns = monitor.last_tick_ns
     monitor.stop()
     assert begun_ns - made_ns >= 36_000_000_000

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.flight.injection import FixInjection
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -16,7 +16,7 @@ LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
 DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
 BRIDGING = TrackingState.BRIDGING
 CAMERA = Camera.from_fov(640, 480, 60)
-INSTALLATION = Installation(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zeros(3))
+INSTALLATION = CameraExtrinsics(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zeros(3))
 
 
 class FakeBridge:

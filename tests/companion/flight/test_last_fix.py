@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from companion.config import PriorConfig
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.flight.last_fix import FixMemory, LastFix, read_last_fix
 from companion.flight.priors import local_about
 from localizer.geometry.camera import Camera
@@ -24,7 +24,7 @@ from mavlink_bridge.link.clock import boot_id
 from mavlink_bridge.messages import Origin, VehicleState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
-INSTALLATION = Installation(FRAME, 47.0, np.zeros(3))
+INSTALLATION = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
 DOWN = np.diag([1.0, -1.0, -1.0])
 AUTOPILOT: Any = SimpleNamespace(rotation=lambda _: DOWN, velocity=np.array([1.0, 0.0, 0.0]))
 SECOND = 10**9
@@ -135,7 +135,7 @@ def test_a_flight_that_does_not_end_in_order_leaves_its_place(tmp_path: Path) ->
     path = kept(tmp_path)
     failing = memory(path)
     failing.start()
-    failing.leave()
+    failing.hand_over()
     failing.stop()
     assert memory(path).prior(103 * SECOND) is not None
     ending = memory(path)

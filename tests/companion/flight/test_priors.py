@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.config import PriorConfig
-from companion.conversions import Installation
+from companion.conversions import CameraExtrinsics
 from companion.flight.priors import AutopilotPose, PositionBelief, drift_sigma_m
 from localizer.geometry.geo import Geodetic, LocalFrame
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
@@ -19,7 +19,7 @@ from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 SECOND = 10**9
 METRE = 1.0 / 111319.0  # of latitude, degrees
 FLYING = VehicleState(connected=True, ekf_flags=8 | 16)
-INSTALLATION = Installation(LocalFrame(Geodetic(47.0, 8.0, 500.0)), 48.0, np.zeros(3))
+INSTALLATION = CameraExtrinsics(LocalFrame(Geodetic(47.0, 8.0, 500.0)), 48.0, np.zeros(3))
 
 
 def with_gnss(at_s: float, accuracy_m: float = 1.0) -> VehicleState:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from companion.config import CameraModel, CompanionConfig, FeedConfig, RecordConfig
-from companion.convert.formats import READERS, WRITERS, Place
+from companion.convert.formats import READERS, WRITERS, MapReference
 from companion.errors import DiskFaultError, ReportError
 from companion.flight.recorder import (
     ESTIMATE_COLUMNS,
@@ -91,7 +91,7 @@ def test_the_accepted_estimates_are_a_trajectory_as_convert_makes_it(tmp_path):
     for estimate in estimates:
         recorder.estimate(estimate)
     recorder.close()
-    place = Place(FRAME)
+    place = MapReference(FRAME)
     converted = READERS["record"](tmp_path, place)
     assert len(converted) == 3  # the second was rejected
     for kind, name in (("poses", "poses.txt"), ("tum", "trajectory.tum")):

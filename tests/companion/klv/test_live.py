@@ -16,7 +16,7 @@ from companion.config import KlvConfig
 from companion.klv.relay import KlvRelay
 from companion.sources import SourceSettings, open_source
 from companion.sources.timing import system_minus_monotonic
-from companion.targets.population import Target
+from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import Array, matrix_from_euler
 from localizer.types import TargetFix
 from sitl.camera.stream import VideoSender
@@ -136,7 +136,7 @@ def _fly(url: str, relay: KlvRelay) -> dict[int, float]:
             told[now_ns] = east
             one = estimate(now_ns, east)
             fix = TargetFix("car", _target_of(east), np.eye(3), (1.0, 1.0), now_ns)
-            relay.add_target(Target(fix, one))
+            relay.add_target(TargetEstimate(fix, one))
             relay.add_estimate(one)
             if relay.described >= DESCRIBED or time.monotonic() > end:
                 break

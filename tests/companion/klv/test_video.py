@@ -21,12 +21,12 @@ from stanag4609.st0601 import decode_uas_local_set
 from companion.config import CompanionConfig, KlvConfig, RecordConfig
 from companion.errors import RecordError
 from companion.flight.recorder import RecordKeeper
-from companion.klv.metadata import Scene, picture_fields
+from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.relay import KlvRelay
 from companion.reporting.klv_recording import describe_recording
 from companion.sources import SourceSettings, VideoFileSource
 from companion.sources.misp import MispTime, sei_nal
-from companion.targets.population import Target
+from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, so3_exp
@@ -39,7 +39,7 @@ SECOND = 10**9
 RATE = 10
 DOWN = np.diag([1.0, -1.0, -1.0])
 PLACE = Geodetic(47.4, 8.5, 500.0)
-SCENE = Scene(LocalFrame(PLACE), flat.cast, 47.0, "survey 7")
+SCENE = KlvContext(LocalFrame(PLACE), flat.cast, 47.0, "survey 7")
 
 
 def write_video(path, count, stamps=None, b_frames=0):
@@ -152,7 +152,7 @@ def test_a_live_video_is_sent_on_byte_for_byte_with_its_metadata_in_step(tmp_pat
             one = estimate(times[-1], east, len(times) % 3 != 0)
             below = np.array([east, 0.0, 0.0])
             fix = TargetFix("car", below, np.eye(3), None, times[-1])
-            relay.add_target(Target(fix, one))
+            relay.add_target(TargetEstimate(fix, one))
             relay.add_estimate(one)
         relay.start()  # all targets are told by now, and each picture has its own
         end = time.monotonic() + 30.0

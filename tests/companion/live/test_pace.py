@@ -2,12 +2,12 @@
 
 import pytest
 
-from companion.live.pace import Pace
+from companion.live.pace import RateLimiter
 
 
 @pytest.mark.parametrize(("fed_hz", "asked_hz", "sent_hz"), [(10, 6, 6), (10, 15, 10), (30, 6, 6)])
 def test_the_mean_rate_is_what_was_asked_for(fed_hz, asked_hz, sent_hz):
-    pace, sent = Pace(1.0 / asked_hz), 0
+    pace, sent = RateLimiter(1.0 / asked_hz), 0
     for i in range(100 * fed_hz):
         if pace.is_due(1000.0 + i / fed_hz):
             pace.went(1000.0 + i / fed_hz)
@@ -16,7 +16,7 @@ def test_the_mean_rate_is_what_was_asked_for(fed_hz, asked_hz, sent_hz):
 
 
 def test_a_long_pause_is_not_made_up_for():
-    pace = Pace(0.2)
+    pace = RateLimiter(0.2)
     for now_s in (10.0, 10.2, 500.0):
         assert pace.is_due(now_s)
         pace.went(now_s)

@@ -16,7 +16,7 @@ import pytest
 from companion.console.flight_source import FlightSource
 from companion.errors import CompanionError
 from companion.live.orders import Helm, OrderError, Orders
-from companion.live.protocol import Decoder, LinkError, encode, runtime_folder, socket_path
+from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
 from companion.live.publisher import Publisher
 from companion.live.shared import Arrivals
 from companion.live.shown import Instruments, Shown
@@ -66,7 +66,7 @@ class Console:
         self.socket.settimeout(30.0)
         self.socket.connect(str(path))
         self.arrivals = Arrivals(self.socket)
-        self._decoder = Decoder()
+        self._decoder = MessageDecoder()
         self._messages = []
 
     def send(self, head):

@@ -30,10 +30,10 @@ from localizer.geometry.pose import quaternion_from_matrix
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.engine import DualThreadEngine
-from mavlink_bridge.errors import RecordError as TlogError
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.kinematic import record_scenario
-from sitl.demo.scenario import CameraSpec, Leg, Scenario
+from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 
 FRAMES_AT_LEAST = 6
 
@@ -104,7 +104,7 @@ def at_the_engines_pace(submit):
         at, deadline_s = time.monotonic_ns(), time.monotonic() + 30.0
         submit(engine, frame)
         for thread in ("extract", "localize", "render"):
-            while (begun_ns := engine.turns().get(thread, 0)) <= at:
+            while (begun_ns := engine.last_ticks_ns().get(thread, 0)) <= at:
                 if time.monotonic() > deadline_s:
                     return
                 time.sleep(1e-3)
@@ -117,7 +117,7 @@ def at_the_engines_pace(submit):
 def record(small_assets, tmp_path_factory):
     """The folder that a flight of some seconds leaves."""
     folder = tmp_path_factory.mktemp("flight")
-    leg = Leg(east_m=0, north_m=16, height_m=80, gimbal_pitch_deg=-85)
+    leg = ScenarioLeg(east_m=0, north_m=16, height_m=80, gimbal_pitch_deg=-85)
     camera = CameraSpec(width=480, height=360, rate_hz=5)
     scenario = Scenario(takeoff_height_m=80, legs=(leg,), cars=1, people=0, camera=camera).ideal()
     sequence = folder / "sequence"

@@ -12,13 +12,20 @@ from companion.cli.commands import app
 from companion.errors import MissionFileError
 from companion.geometry import Mount
 from companion.planning.instead import changes
-from companion.planning.judge import Judged, LegVerdict, Limits, Reason, judge, stretches
+from companion.planning.judge import (
+    JudgedSample,
+    LegVerdict,
+    MissionLimits,
+    Reason,
+    judge,
+    stretches,
+)
 from companion.planning.mission import HeightAbove, read_mission
-from companion.planning.way import Aim, Ground, camera_pose, legs_of
+from companion.planning.way import Aim, MapHeights, camera_pose, legs_of
 from companion.preflight.map_pin import map_hash
 from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import Figures
-from localizer.forecast.rivals import Rival
+from localizer.forecast.rivals import AmbiguousPosition
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
@@ -70,7 +77,7 @@ def test_each_altitude_is_above_what_its_frame_says(tmp_path, cache):
     assert [w.above for w in mission.waypoints] == [
         HeightAbove.HOME, HeightAbove.SEA, HeightAbove.TERRAIN,
     ]  # fmt: skip
-    legs = legs_of(mission, cache, Ground(cache), GIMBAL, 1000.0)
+    legs = legs_of(mission, cache, MapHeights(cache), GIMBAL, 1000.0)
     ends = [leg.samples[0].position[2] for leg in legs]  # of each leg the middle
     home, sea = float(height(0, 0)) + 70, 500 + 47.5 - 430
     terrain = float(height(0, 60)) + 70
@@ -84,7 +91,7 @@ def test_samples_stand_for_equal_parts_of_the_whole_way(tmp_path, cache):
         tmp_path / "a.plan", cache, item(22, 0, 0, 0, None, 0, 0, 40),
         waypoint(cache, 0, 0, 40), waypoint(cache, 100, 0, 40), item(20, 0, 0, 0, 0, 0, 0, 0),
     )  # fmt: skip
-    legs = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 20.0)
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 20.0)
     assert [leg.name for leg in legs] == ["1 to 2", "2 to home"]  # the climb is no leg
     ways = [s.way_m for leg in legs for s in leg.samples]
     assert ways == pytest.approx(np.arange(10, 200, 20), abs=0.2)
@@ -94,7 +101,7 @@ def test_a_landing_elsewhere_is_flown_to_and_no_return_is_made_up(tmp_path, cach
     land = item(21, 0, 0, 0, 0, *place(cache, 100, 50), 0)
     path = plan_file(tmp_path / "a.plan", cache, waypoint(cache, 100, 0, 40), land)
     mission = read_mission(path)
-    legs = legs_of(mission, cache, Ground(cache), GIMBAL, 1000.0)
+    legs = legs_of(mission, cache, MapHeights(cache), GIMBAL, 1000.0)
     assert [leg.name for leg in legs] == ["home to 1", "1 to 2"]
     assert legs[1].samples[0].position == pytest.approx(
         [100, 25, float(height(0, 0)) + 40], abs=0.5
@@ -108,7 +115,7 @@ def test_zero_zero_is_where_the_vehicle_is_and_no_place_off_africa(tmp_path, cac
         tmp_path / "a.plan", cache, item(17, 0, 0, 0, 0, 0, 0, 40), waypoint(cache, 100, 0, 40),
         item(19, 5, 0, 0, 0, 0, 0, altitude), waypoint(cache, 100, 50, 0),
     )  # fmt: skip
-    legs = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 1000.0)
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 1000.0)
     assert [leg.name for leg in legs] == ["1 to 2", "3 to 4"]
     assert legs[1].length_m == pytest.approx(50, abs=0.5)
     above = legs[1].samples[0].position[2] - float(height(0, 0))
@@ -117,7 +124,7 @@ def test_zero_zero_is_where_the_vehicle_is_and_no_place_off_africa(tmp_path, cac
 
 def test_altitudes_above_home_follow_the_earths_curve(tmp_path, cache):
     path = plan_file(tmp_path / "a.plan", cache, waypoint(cache, 0, 30_000, 100))
-    leg = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 100.0)[0]
+    leg = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 100.0)[0]
     ways = [leg.samples[k].position for k in (150, -1)]
     above = [cache.frame.position(p).height_m - cache.frame.origin.height_m for p in ways]
     assert above == pytest.approx([float(height(0, 0)) + 100] * 2, abs=1.0)
@@ -126,7 +133,7 @@ def test_altitudes_above_home_follow_the_earths_curve(tmp_path, cache):
 def test_gimbal_and_fixed_cameras_look_where_they_are_aimed(tmp_path, cache):
     path = plan_file(tmp_path / "a.plan", cache, item(205, -40, 0, 0, 0, 0, 0, 0),
                      waypoint(cache, 100, 0, 40))  # fmt: skip
-    sample = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 500.0)[0].samples[0]
+    sample = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 500.0)[0].samples[0]
     forward = camera_pose(sample, cache, GIMBAL).rotation[:, 2]
     down = math.radians(40)
     assert forward == pytest.approx([math.cos(down), 0, -math.sin(down)], abs=1e-3)
@@ -142,7 +149,7 @@ def test_the_camera_keeps_its_region_of_interest_in_view(tmp_path, cache):
     path = plan_file(tmp_path / "a.plan", cache, region, waypoint(cache, 100, 0, 40))
     fixed = Aim(Mount.from_degrees(pitch_deg=-30.0), -75.0, True)
     for aim in (GIMBAL, fixed):
-        legs = legs_of(read_mission(path), cache, Ground(cache), aim, 10.0)
+        legs = legs_of(read_mission(path), cache, MapHeights(cache), aim, 10.0)
         for sample in legs[0].samples:
             forward = camera_pose(sample, cache, aim).rotation[:, 2]
             there = np.array([50, 150, float(height(0, 0))]) - sample.position
@@ -155,7 +162,7 @@ def test_a_yaw_is_from_the_heading_or_from_north(tmp_path, cache):
     def turn(flags):
         turned = item(1000, -60, 30, None, None, flags, 0, 0)
         path = plan_file(tmp_path / "a.plan", cache, turned, waypoint(cache, 100, 0, 40))
-        sample = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 500.0)[0].samples[0]
+        sample = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 500.0)[0].samples[0]
         assert sample.pitch_deg == -60
         return sample.turn_deg
 
@@ -169,7 +176,7 @@ def test_a_spline_is_flown_as_a_curve_through_its_places(tmp_path, cache):
         item(82, 0, 0, 0, None, *place(cache, 80, 80), 40), waypoint(cache, 80, 160, 40),
         home=(-150, 0),
     )  # fmt: skip
-    legs = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 4.0)
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 4.0)
     curve = next(leg for leg in legs if leg.name == "2 to 3")
     headings = [s.heading_deg for s in curve.samples]
     assert headings[0] == pytest.approx(90, abs=6)
@@ -185,7 +192,7 @@ def test_rounds_are_flown_often_and_judged_once(tmp_path, cache):
     jump = item(177, 1, 3, 0, 0, 0, 0, 0)
     places = [waypoint(cache, *p, 40) for p in ((60, 0), (60, 60))]
     path = plan_file(tmp_path / "a.plan", cache, *places, jump, item(20, *[0] * 7))
-    legs = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 30.0)
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 30.0)
     assert [leg.name for leg in legs[:4]] == ["home to 1", "1 to 2", "2 to 1", "1 to 2"]
     assert len(legs) == 1 + 4 + 3 + 1
     assert [leg.first for leg in legs] == [0, 1, 2, 1, 2, 1, 2, 1, 8]
@@ -195,7 +202,7 @@ def test_rounds_are_flown_often_and_judged_once(tmp_path, cache):
 
 
 def test_missions_that_cannot_be_placed_are_named(tmp_path, cache):
-    ground = Ground(cache)
+    ground = MapHeights(cache)
     far = plan_file(tmp_path / "far.plan", cache, waypoint(cache, 0, 0, 50), home=(0, 9e5))
     with pytest.raises(MissionFileError, match="km from the map's origin"):
         legs_of(read_mission(far), cache, ground, GIMBAL, 25.0)
@@ -230,13 +237,15 @@ def test_a_mission_that_no_autopilot_counts_is_refused(tmp_path, cache, suffix):
 
 def forecast(risk=0.01, sigma=0.2, share=1.0, rival=0.1, ground=80.0, condition="day"):
     figures = Figures(sigma, 0.9, 0.6, share, 0.0, 0.2)
-    return ViewForecast(condition, figures, sigma, risk, ground, 20.0, Rival(rival, 12.0))
+    return ViewForecast(
+        condition, figures, sigma, risk, ground, 20.0, AmbiguousPosition(rival, 12.0)
+    )
 
 
 @pytest.fixture
 def leg(tmp_path, cache):
     path = plan_file(tmp_path / "a.plan", cache, waypoint(cache, 100, 0, 40))
-    return legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 20.0)[0]
+    return legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 20.0)[0]
 
 
 @pytest.mark.parametrize(
@@ -251,18 +260,18 @@ def leg(tmp_path, cache):
     ],
 )
 def test_each_verdict_has_its_reason(leg, given, reason):
-    assert judge(leg.samples[0], [given], Limits()).reason is reason
+    assert judge(leg.samples[0], [given], MissionLimits()).reason is reason
 
 
 def test_the_worst_condition_counts(leg):
     both = [forecast(condition="day"), forecast(risk=0.5, condition="night")]
-    judged = judge(leg.samples[0], both, Limits())
+    judged = judge(leg.samples[0], both, MissionLimits())
     assert (judged.forecast.condition, judged.holds) == ("night", False)
 
 
 def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
     def verdict(bad):
-        judged = [judge(s, [forecast(risk=0.9 if k in bad else 0.0)], Limits())
+        judged = [judge(s, [forecast(risk=0.9 if k in bad else 0.0)], MissionLimits())
                   for k, s in enumerate(leg.samples)]  # fmt: skip
         return [LegVerdict(leg, tuple(judged))]
 
@@ -280,7 +289,7 @@ def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
 def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg, tmp_path):
     def drift_m(share, odometry):
         off = forecast(risk=0.9, share=share, ground=0.0 if share == 0.0 else 0.3)
-        judged = tuple(judge(s, [off], Limits()) for s in leg.samples)
+        judged = tuple(judge(s, [off], MissionLimits()) for s in leg.samples)
         return stretches([LegVerdict(leg, judged)], 5.0, odometry)[0].drift_m
 
     level, terrain = OdometryConfig(), OdometryConfig(terrain=tmp_path / "terrain.tif")
@@ -291,7 +300,7 @@ def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg, tmp_
 
 
 def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
-    worst = Judged(leg.samples[0], forecast(risk=0.9), Reason.WEAK)
+    worst = JudgedSample(leg.samples[0], forecast(risk=0.9), Reason.WEAK)
     assert any("gimbal" in c.words for c in changes(worst, fixed=False))
     assert not any("gimbal" in c.words for c in changes(worst, fixed=True))
     assert any("higher" in c.words for c in changes(worst, fixed=True))

@@ -8,7 +8,7 @@ from companion.config import parse_config
 from companion.preflight.coverage import check_mission, covered
 from companion.preflight.doctor import examine_deployment
 from localizer.map.cache.cache import TileCache
-from mavlink_bridge.vehicle.mission import Waypoint
+from mavlink_bridge.vehicle.mission import MissionWaypoint
 from sitl.geodesy import Location
 from sitl.ground.mission_steps import takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot
@@ -24,7 +24,7 @@ def _at(cache, east, north, number=1):
     """A waypoint at metres from the middle of the map."""
     middle = (cache.index.box_min[0] + cache.index.box_max[0]) / 2.0
     latitude, longitude, _ = cache.frame.geodetic_from_enu(middle + np.array([east, north, 0.0]))
-    return Waypoint(number, float(latitude), float(longitude))
+    return MissionWaypoint(number, float(latitude), float(longitude))
 
 
 def test_points_in_and_beside_the_map(cache):

@@ -14,7 +14,7 @@ from companion.preflight.doctor import examine_deployment
 from companion.sources import StreamState
 from companion.terminal.steps import shown_steps
 from localizer.types import Frame
-from mavlink_bridge.preflight.doctor import Diagnosis, Finding
+from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 SIZE = (160, 120)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
@@ -149,8 +149,8 @@ def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
     why = "no position by vision on 40 % of the way: build a larger map or move it"
     diagnosis = Diagnosis(
         (
-            Finding("localizer", "tiny (onnxruntime, CPU); numba", "a net", "", True, True),
-            Finding("GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False,
+            DoctorFinding("localizer", "tiny (onnxruntime, CPU); numba", "a net", "", True, True),
+            DoctorFinding("GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False,
                     True),
         )
     )  # fmt: skip
@@ -164,7 +164,7 @@ def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
 
 
 def test_what_was_not_examined_is_said_beside_fit_to_fly(capsys):
-    good = Diagnosis((Finding("map", "42 tiles", "a tile cache", "", True, True),))
+    good = Diagnosis((DoctorFinding("map", "42 tiles", "a tile cache", "", True, True),))
     print_diagnosis(Console(width=80, force_terminal=False), good, ["vehicle"])
     lines = capsys.readouterr().out.splitlines()
     assert "fit to fly as far as examined" in lines[0]

@@ -13,13 +13,13 @@ import yaml
 from companion.config import CompanionConfig, load_config
 from companion.errors import ReportError
 from companion.preflight.map_pin import map_hash
-from companion.preflight.sheet import Sheet, as_html, as_text, make_sheet, write_sheet
+from companion.preflight.sheet import PreflightSheet, as_html, as_text, make_sheet, write_sheet
 from localizer.map.cache.cache import MANIFEST_NAME
-from mavlink_bridge.preflight.doctor import Diagnosis, Finding
+from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=timezone.utc)
-GOOD = Finding("EK3_SRC2_POSXY", "6", "6", "", True, True)
-WRONG = Finding("VISO_TYPE", "0 <b>", "1", "no vision", False, True)
+GOOD = DoctorFinding("EK3_SRC2_POSXY", "6", "6", "", True, True)
+WRONG = DoctorFinding("VISO_TYPE", "0 <b>", "1", "no vision", False, True)
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def deployment(tmp_path: Path) -> tuple[Path, CompanionConfig]:
     return path, load_config(path)
 
 
-def rows(sheet: Sheet) -> dict[str, tuple[str, bool | None]]:
+def rows(sheet: PreflightSheet) -> dict[str, tuple[str, bool | None]]:
     return {r.name: (r.text, r.good) for r in sheet.rows}
 
 

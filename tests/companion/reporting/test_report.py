@@ -17,12 +17,12 @@ from companion.reporting.content import (
     INNER,
     MIDDLE,
     OUTER,
-    Event,
+    MapMark,
     MapSheet,
-    Mark,
+    MapTrack,
     Report,
+    ReportEvent,
     Stanford,
-    Track,
 )
 from companion.reporting.figures import first_fault, target_table
 from companion.reporting.layout import render
@@ -110,10 +110,10 @@ def test_what_came_before_gnss_was_denied_is_no_headline_of_the_denial() -> None
     """It stood in amber above a flight without a fault."""
     time_s = np.arange(-5.0, 5.0)
     estimates = {"state": np.full(10, "tracking"), "time": time_s}
-    early = (Event(-3.0, "warning", "PiLoT: video feed stalled"),)
+    early = (ReportEvent(-3.0, "warning", "PiLoT: video feed stalled"),)
     told = first_fault(estimates, time_s, early, "", 0.0)
     assert told == "nothing while GNSS was denied; before, at -3.0 s: PiLoT: video feed stalled"
-    late = (*early, Event(2.0, "warning", "PiLoT: withheld"))
+    late = (*early, ReportEvent(2.0, "warning", "PiLoT: withheld"))
     assert first_fault(estimates, time_s, late, "", 0.0) == "at 2.0 s: PiLoT: withheld"
     assert first_fault(estimates, time_s, (), "", 0.0).startswith("nothing: ")
     assert '<p class="first fine">' in render(Report("a flight", "", told))
@@ -188,7 +188,7 @@ def test_each_target_has_its_own_line_and_its_place_on_the_map(record):
 def test_tracks_that_coincide_are_seen_one_inside_the_other():
     """A rim as wide as the track below hid the truth and the autopilot's way."""
     points = np.array([[0.0, 0.0], [50.0, 50.0]])
-    tracks = [Track(str(w), "#fff", w, points) for w in (OUTER, MIDDLE, INNER)]
+    tracks = [MapTrack(str(w), "#fff", w, points) for w in (OUTER, MIDDLE, INNER)]
     page = render(Report("", "", "", sheet=MapSheet(None, 0.0, 100.0, 0.0, 100.0, tuple(tracks))))
     rims = [float(w) for w in re.findall(r'class=rim stroke-width="([\d.]+)"', page)]
     for below, rim in zip(tracks[:-1], rims[1:], strict=True):
@@ -201,7 +201,7 @@ def test_tracks_that_coincide_are_seen_one_inside_the_other():
 )
 def test_a_name_at_the_maps_edge_is_not_cut(at, anchor, above):
     """at: metres from the west and the south of a map of 100 m."""
-    marks = (Mark("point A", *at, "target"),)
+    marks = (MapMark("point A", *at, "target"),)
     page = render(Report("", "", "", sheet=MapSheet(None, 0.0, 100.0, 0.0, 100.0, marks=marks)))
     x, y, font, side = re.search(
         r'<text x="([\d.]+)" y="([\d.]+)" font-size="([\d.]+)" text-anchor="(\w+)">point A', page

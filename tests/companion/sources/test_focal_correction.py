@@ -16,7 +16,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import open_localizer
 from localizer.types import (
     FocalFit,
@@ -54,7 +54,7 @@ def test_on_rendered_pictures_it_finds_the_lens(small_assets: FlightAssets) -> N
     table = ZoomTable(points=BELIEVED, refine=0.015)
     zoomed = ZoomedFrames(table, lambda _time_ns, _hold_s: 0.0, pytest.fail)
     config = LocalizerConfig(renderer="numba", device="cpu", focal_fit_s=0.01)
-    sensors = OtherSensors(lambda time_ns: _pose(time_ns, height_m).rotation)
+    sensors = AuxiliarySensors(lambda time_ns: _pose(time_ns, height_m).rotation)
     off: list[float] = []
     try:
         camera = WorldCamera(NumbaRenderer(streamer), true, Appearance(), options)

@@ -137,7 +137,7 @@ def test_closing_waits_for_a_reader_that_is_just_being_started(
     def decoder(*_: Any) -> None:
         raise ValueError("nothing comes")
 
-    monkeypatch.setattr("companion.sources.av_source.Decoder", decoder)
+    monkeypatch.setattr("companion.sources.av_source.VideoDecoder", decoder)
     source = open_source(url, CAMERA)
     begun, go_on = threading.Event(), threading.Event()
     start = threading.Thread.start
@@ -209,7 +209,7 @@ def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
     def decoder(*_: Any) -> None:
         raise ValueError("no such enumeration value")
 
-    monkeypatch.setattr("companion.sources.av_source.Decoder", decoder)
+    monkeypatch.setattr("companion.sources.av_source.VideoDecoder", decoder)
     with Watch(url, retry_max_s=0.3) as watch:
         watch.wait_until(lambda: StreamState.STALLED in watch.states)
         assert "unexpected ValueError" in watch.text(StreamState.STALLED)
@@ -242,7 +242,7 @@ def test_pixels_that_cannot_be_converted_do_not_end_the_feed_in_flight(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """FFmpeg's error left `frames` and ended the flight; one kind ends even the process."""
-    monkeypatch.setattr("companion.sources.av_source.Decoder", _Decoder)
+    monkeypatch.setattr("companion.sources.av_source.VideoDecoder", _Decoder)
     _Decoder.kinds = ["yuv420p", "y210be", "y210be", "yaf32le", "yuv420p"]
     _Decoder.taken = [threading.Event() for _ in _Decoder.kinds]
     source = open_source(url, CAMERA)
@@ -266,7 +266,7 @@ def test_pixels_that_cannot_be_converted_do_not_end_the_feed_in_flight(
 def test_pixels_that_cannot_be_converted_are_named_at_the_start(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.sources.av_source.Decoder", _Decoder)
+    monkeypatch.setattr("companion.sources.av_source.VideoDecoder", _Decoder)
     for kind in ("y210be", "yaf32le"):
         _Decoder.kinds, _Decoder.taken = [kind], [threading.Event()]
         source = open_source(url, CAMERA)

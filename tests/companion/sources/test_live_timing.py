@@ -61,7 +61,7 @@ def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(
     delay = 0.03
     with real_time():
         with (
-            Watch(url, timing="pts", latency_ms=1000 * delay + 20, stamps_late_ms=-20) as watch,
+            Watch(url, timing="pts", latency_ms=1000 * delay + 20, time_offset_ms=-20) as watch,
             PacedSender(url, misp=False, delay_s=delay) as sender,
         ):
             watch.wait_for(40)

@@ -8,8 +8,8 @@ import pytest
 from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
 from companion.sources.timing import (
     ExposureClock,
+    FrameTimestamps,
     MinimumLag,
-    Stamps,
     Timing,
     system_minus_monotonic,
 )
@@ -99,7 +99,7 @@ def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not(
     now = clocks.now_ns
     clock = ExposureClock(latency_ns=90 * MS)
     misp = MispTime((now - 60 * MS + clocks.offset_ns) // 1000, locked=True)
-    exposed = clock.exposure_time(Stamps(pts_ns=7, misp=misp), now)
+    exposed = clock.exposure_time(FrameTimestamps(pts_ns=7, misp=misp), now)
     assert exposed == pytest.approx(now - 60 * MS, abs=0.1 * MS)
 
 
@@ -114,7 +114,7 @@ def test_a_misp_clock_that_is_not_ours_gives_differences_only(
     for i, lag in enumerate([30, 55, 48]):
         true = now + i * 100 * MS
         misp = MispTime((true + offset_ns + clocks.offset_ns) // 1000, locked)
-        stamps = Stamps(None, misp)
+        stamps = FrameTimestamps(None, misp)
         result = clock.exposure_time(stamps, true + lag * MS)
         assert result == pytest.approx(true, abs=0.2 * MS)
     assert caplog.text.count("MISP clock") == 1
@@ -123,14 +123,14 @@ def test_a_misp_clock_that_is_not_ours_gives_differences_only(
 def test_device_stamps_on_the_monotonic_clock_are_exposure_times(clocks: Clocks) -> None:
     now = clocks.now_ns
     clock = ExposureClock(latency_ns=30 * MS, device=True)
-    assert clock.exposure_time(Stamps(now - 25 * MS, None), now) == now - 25 * MS
-    wall_clock = Stamps(clocks.time_ns(), None)
+    assert clock.exposure_time(FrameTimestamps(now - 25 * MS, None), now) == now - 25 * MS
+    wall_clock = FrameTimestamps(clocks.time_ns(), None)
     assert clock.exposure_time(wall_clock, now) == now - 30 * MS
 
 
 def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
     clock = ExposureClock(latency_ns=30 * MS)
-    assert clock.exposure_time(Stamps(None, None), 10**12) == 10**12 - 30 * MS
+    assert clock.exposure_time(FrameTimestamps(None, None), 10**12) == 10**12 - 30 * MS
 
 
 @pytest.mark.parametrize("step_s", [0.0, 0.3, -0.1])
@@ -144,7 +144,7 @@ def test_a_step_of_the_wall_clock_is_told_and_enters_no_exposure_time(
         clocks.now_ns += 100 * MS
         now = clocks.now_ns
         stamp = MispTime((now - 120 * MS + camera_offset_ns) // 1000, locked=True)
-        return now - clock.exposure_time(Stamps(None, stamp), now)
+        return now - clock.exposure_time(FrameTimestamps(None, stamp), now)
 
     assert seen() == pytest.approx(120e6, abs=0.1e6)
     clocks.offset_ns += round(step_s * 1e9)
@@ -168,7 +168,7 @@ def test_a_camera_that_loses_its_reference_keeps_its_times(clocks: Clocks) -> No
         now = clocks.now_ns
         lag = (120 + 7 * (k % 3)) * MS
         misp = MispTime((now - lag + clocks.offset_ns) // 1000, locked=k < 20)
-        exposed = clock.exposure_time(Stamps(None, misp), now)
+        exposed = clock.exposure_time(FrameTimestamps(None, misp), now)
         if k > 5:
             assert exposed == pytest.approx(now - lag, abs=0.2 * MS)
 
@@ -205,7 +205,7 @@ def test_no_stamp_whatever_it_says_makes_a_frame_of_the_future_or_of_long_ago(
             misp += int(rng.choice(leaps))
             wall_ns[0] += int(rng.choice(leaps)) if rng.random() < 0.05 else 0
         stamp = MispTime(max(misp + 10**18, 0) // 1000, locked=bool(rng.random() < 0.8))
-        stamps = Stamps(
+        stamps = FrameTimestamps(
             None if restless and rng.random() < 0.1 else pts,
             None if restless and rng.random() < 0.2 else stamp,
         )

@@ -17,7 +17,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import open_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, TrackingState
@@ -76,7 +76,7 @@ def flight(small_assets: FlightAssets) -> Iterator[Flight]:
 
 @contextmanager
 def localizer_of(flight: Flight, assets: FlightAssets) -> Iterator[Localizer]:
-    sensors = OtherSensors(lambda time_ns: flight.pose(time_ns).rotation)
+    sensors = AuxiliarySensors(lambda time_ns: flight.pose(time_ns).rotation)
     with open_localizer(assets.map_cache, LENS, CONFIG, sensors) as localizer:
         localizer.set_prior(flight.prior())
         yield localizer

@@ -153,7 +153,7 @@ def test_restarts_are_given_it_and_the_first_start_is_not(
             pass
 
     monkeypatch.setattr("companion.supervision.processes.FlightProcess", Dies)
-    monkeypatch.setattr("mavlink_bridge.vehicle.last_words.say_without_bridge", lambda *_: None)
+    monkeypatch.setattr("mavlink_bridge.vehicle.crash_notifier.say_without_bridge", lambda *_: None)
     before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         done = CliRunner().invoke(app, ["run", str(deployment), "--supervised"])
@@ -163,4 +163,4 @@ def test_restarts_are_given_it_and_the_first_start_is_not(
     assert done.exit_code == 0, done.output
     assert begun[0] == ([], ())
     (kept,) = begun[1][1]
-    assert begun[1:] == [([f"--kept={kept}", "--again"], (kept,))] * 2
+    assert begun[1:] == [([f"--kept={kept}", "--restart"], (kept,))] * 2

@@ -16,8 +16,12 @@ from companion.supervision.pulse import Pulse, line
 
 def test_the_oldest_turn_is_told() -> None:
     now_ns = 100_000_000_000
-    turns = {"render": now_ns - 5_000_000, "link fc": now_ns - 7_100_000_000, "feed": now_ns + 9}
-    assert line(turns, now_ns) == b"link-fc 7100\n"
+    last_ticks_ns = {
+        "render": now_ns - 5_000_000,
+        "link fc": now_ns - 7_100_000_000,
+        "feed": now_ns + 9,
+    }
+    assert line(last_ticks_ns, now_ns) == b"link-fc 7100\n"
     assert line({}, now_ns) == b"all 0\n"
 
 
@@ -25,7 +29,7 @@ def test_a_pulse_is_read_and_a_supervisor_that_does_not_read_is_not_waited_for()
     reading, writing = os.pipe()
     beating = threading.Event()
 
-    def turns() -> dict[str, int]:
+    def last_ticks_ns() -> dict[str, int]:
         beating.set()
         return {}
 
@@ -35,22 +39,22 @@ def test_a_pulse_is_read_and_a_supervisor_that_does_not_read_is_not_waited_for()
             os.write(writing, b"x" * 4096)
         except BlockingIOError:
             break
-    pulse = Pulse(turns, writing)
+    pulse = Pulse(last_ticks_ns, writing)
     pulse.start()
     assert beating.wait(20.0)
-    pulse.stop(in_order=True)
+    pulse.stop(clean_shutdown=True)
     os.close(reading)
 
 
-@pytest.mark.parametrize("in_order", [True, False])
-def test_the_last_word_says_whether_the_end_is_in_order(in_order: bool) -> None:
+@pytest.mark.parametrize("clean_shutdown", [True, False])
+def test_the_last_word_says_whether_the_end_is_in_order(clean_shutdown: bool) -> None:
     reading, writing = os.pipe()
     pulse = Pulse(lambda: {}, writing)
     pulse.start()
-    pulse.stop(in_order=in_order)
+    pulse.stop(clean_shutdown=clean_shutdown)
     last = os.read(reading, 4096).splitlines()[-1]
     os.close(reading)
-    assert last == (f"{ENDING} 0" if in_order else "failing 0").encode()
+    assert last == (f"{ENDING} 0" if clean_shutdown else "failing 0").encode()
 
 
 def test_a_frame_that_a_part_keeps_is_seen() -> None:
@@ -71,10 +75,10 @@ def test_a_frame_that_a_part_keeps_is_seen() -> None:
     feed = Feed(Source(), keeps)  # type: ignore[arg-type]
     feed.start()
     assert taken.wait(20.0)
-    assert feed.turn_ns == feed.turn_ns
+    assert feed.last_tick_ns == feed.last_tick_ns
     go.set()
     feed.stop()
-    assert feed.turn_ns < feed.turn_ns
+    assert feed.last_tick_ns < feed.last_tick_ns
 
 
 def test_what_is_no_beat_is_no_sign_of_life() -> None:
@@ -99,7 +103,7 @@ def test_a_part_that_was_made_long_before_the_start_is_no_hang() -> None:
     pulse = Pulse(lambda: {"health": made_ns, "feed": time.monotonic_ns()}, writing)
     pulse.start()
     first = os.read(reading, 100).split(b"\n")[0]
-    pulse.stop(in_order=True)
+    pulse.stop(clean_shutdown=True)
     os.close(reading)
     name, age_ms = first.split()
     assert name == b"health"

@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 from companion.config import DetectorConfig
 from companion.errors import DetectorError
 from companion.targets.detector.boxes import decode, layout_of
-from companion.targets.detector.names import Sight, ThingNames
+from companion.targets.detector.names import LocatedBox, ThingNames
 from companion.targets.detector.network import DetectorNetwork
 from companion.targets.detector.worker import BoxDetector
 from localizer.types import Frame
@@ -122,16 +122,16 @@ def _broken(folder):
 def test_a_thing_keeps_its_name_while_it_drives_and_a_single_sight_has_none():
     names, told = ThingNames(), []
     for k in range(8):  # two cars that pass each other, half a second apart
-        a = Sight("car", np.array([8.0 * 0.5 * k, 0.0, 0.0]))
-        b = Sight("car", np.array([30.0 - 8.0 * 0.5 * k, 4.0, 0.0]))
+        a = LocatedBox("car", np.array([8.0 * 0.5 * k, 0.0, 0.0]))
+        b = LocatedBox("car", np.array([30.0 - 8.0 * 0.5 * k, 4.0, 0.0]))
         shown = [a, b] if k % 2 else [b, a]
         found = names.name(shown, k * SECOND // 2)
         told.append(found if k % 2 else found[::-1])
     assert told[0] == [None, None]
     assert told[1:] == [["car 2", "car 1"]] * 7
-    again = names.name([Sight("boat", np.zeros(3))], 4 * SECOND)
+    again = names.name([LocatedBox("boat", np.zeros(3))], 4 * SECOND)
     assert again == [None]
-    assert names.name([Sight("car", np.array([500.0, 0.0, 0.0]))], 5 * SECOND) == [None]
+    assert names.name([LocatedBox("car", np.array([500.0, 0.0, 0.0]))], 5 * SECOND) == [None]
 
 
 class Fake(DetectorNetwork):

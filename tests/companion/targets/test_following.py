@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.targets import population
+from companion.targets import target_manager
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.targets.follow import Found
+from localizer.targets.follow import FollowedPosition
 from localizer.targets.track import TargetTrack, projected
 from localizer.types import Visibility
 from tests.companion.targets import scene
@@ -251,7 +251,7 @@ class _Slides:
         at = self._place + np.array([0.0, self.speed * since_s, 0.0])
         pixel = projected(estimate, at)
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
-        return Found(at, pixel, 0.9) if near else None
+        return FollowedPosition(at, pixel, 0.9) if near else None
 
     def find_before(self, *_picture, **_how):
         return False, None  # it looks as the ground does
@@ -293,7 +293,7 @@ class _Edge(_Returns):
         at = self._place + np.array([0.0, self.speed * self.until_s + 2.0, 0.0])
         pixel = projected(estimate, at)
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
-        return Found(at, pixel, 0.9) if near else None
+        return FollowedPosition(at, pixel, 0.9) if near else None
 
 
 class _Glimpse(_Slides):
@@ -305,7 +305,9 @@ class _Glimpse(_Slides):
     def find_before(self, _gray, estimate, *_picture, **_how):
         since_s = round((estimate.exposure_time_ns - self._begun_ns) * 1e-9, 1)
         at = self._place + np.array([0.0, 3.0, 0.0])
-        found = Found(at, projected(estimate, at), 0.9) if since_s in self.times_s else None
+        found = (
+            FollowedPosition(at, projected(estimate, at), 0.9) if since_s in self.times_s else None
+        )
         return True, found
 
 
@@ -316,7 +318,7 @@ class _Beside(_Glimpse):
 
 
 def _flown(follower, monkeypatch, frames, at=(0.5, 0.3)):
-    monkeypatch.setattr(population, "ImageFollower", follower)
+    monkeypatch.setattr(target_manager, "ImageFollower", follower)
     watcher = Operator(rate_hz=10.0)
     gray = np.zeros((480, 640), np.uint8)
 

@@ -9,7 +9,7 @@ import pytest
 
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
-from companion.targets.population import Click, Population, Target
+from companion.targets.target_manager import Click, TargetEstimate, TargetManager
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits
@@ -58,8 +58,10 @@ class Ground:
 
 def errors(holed, velocity, say=lambda *_: None):
     """(frame, error, own sigma, m) of every report of a target that a detector sees."""
-    ground, told, found = Ground(), list[Target](), []
-    population = Population(TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, say)
+    ground, told, found = Ground(), list[TargetEstimate](), []
+    population = TargetManager(
+        TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, say
+    )
     noise = np.random.default_rng(0)
     for k in range(FRAMES):
         estimate, ground.is_holed = estimate_at(k), k in holed
@@ -126,8 +128,8 @@ class Holed(Ground):
 
 def clicked(cast, place):
     """(fixes, texts) of a click at a place (3,)."""
-    told, texts, estimate = list[Target](), list[str](), estimate_at(0)
-    population = Population(
+    told, texts, estimate = list[TargetEstimate](), list[str](), estimate_at(0)
+    population = TargetManager(
         TargetConfig(), cast, told.append, lambda _: None, lambda _, text: texts.append(text)
     )
     population.begin(Click(1, estimate, projected(estimate, np.array(place))))

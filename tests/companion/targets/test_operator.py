@@ -8,7 +8,7 @@ import pytest
 from companion.config import TargetConfig
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import Detection, clicked_name
-from companion.targets.population import Population
+from companion.targets.target_manager import TargetManager
 from localizer.targets.track import projected
 from localizer.types import TrackingState, Visibility
 from mavlink_bridge.messages import TrackRequest
@@ -27,7 +27,7 @@ class Operator:
         self.told: list[Any] = []
         self.gone: list[Any] = []
         self.texts: list[Any] = []
-        self.population = Population(
+        self.population = TargetManager(
             self.config, cast, self.told.append, self._end, lambda _, text: self.texts.append(text)
         )
         self.begin = self.population.begin

@@ -5,8 +5,8 @@ import numpy as np
 
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
-from companion.targets.population import Click
 from companion.targets.reporter import TargetReporter
+from companion.targets.target_manager import Click
 from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose

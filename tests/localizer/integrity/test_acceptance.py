@@ -10,7 +10,7 @@ import pytest
 
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
-from localizer.registration.agreement import Agreement
+from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
 
@@ -42,13 +42,13 @@ def test_the_gate_rejects() -> None:
 
 def test_equal_roofs_are_refused_where_the_prior_cannot_tell_them_apart() -> None:
     """All parts agree, the quality is good: with a prior of 20 m it may be the next roof."""
-    alike = _registration(agreement=Agreement(parts=60, votes=58, peak=3.2))
+    alike = _registration(agreement=PatchAgreement(patches=60, votes=58, peak=3.2))
     assert not is_acceptable(CONFIG, alike, 1.0, prior_sigma_m=20.0)
     assert is_acceptable(CONFIG, alike, 1.0, prior_sigma_m=3.0)
 
 
 def test_a_place_like_no_other_needs_no_narrow_prior() -> None:
-    seen = _registration(agreement=Agreement(parts=60, votes=58, peak=6.2))
+    seen = _registration(agreement=PatchAgreement(patches=60, votes=58, peak=6.2))
     assert is_acceptable(CONFIG, seen, 1.0, prior_sigma_m=200.0)
     assert is_acceptable(CONFIG, _registration(), 1.0, prior_sigma_m=200.0)  # a GPU has no votes
 

@@ -11,10 +11,10 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry import (
     DepthSource,
     FlatGround,
-    Ground,
     ImageFault,
     OdometryConfig,
     OdometryStatus,
+    TerrainModel,
     Usability,
     VisualOdometry,
     odometry_optimizer,
@@ -27,7 +27,7 @@ from tests.localizer.registration.conftest import SyntheticPlace
 COVERED = Usability(ImageFault.FLAT, 0.0, 0.0, 0.0, 0.0)
 
 
-def odometry(ground: Ground | None = None, **changes: object) -> VisualOdometry:
+def odometry(ground: TerrainModel | None = None, **changes: object) -> VisualOdometry:
     optimizer = odometry_optimizer(JNGO(threads=1))
     return VisualOdometry(CAMERA, optimizer, OdometryConfig(**{"anchors": 600, **changes}), ground)
 

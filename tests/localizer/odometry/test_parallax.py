@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from localizer.geometry.pose import Array, Pose, hat, so3_exp, so3_log
-from localizer.odometry.parallax import Alignment, View, align
+from localizer.odometry.parallax import ParallaxAlignment, ParallaxView, align
 from localizer.registration.cpu.kernel import NumbaBackend
 from tests.localizer.odometry.conftest import CAMERA, Flight
 from tests.localizer.registration.conftest import SyntheticPlace
@@ -29,15 +29,15 @@ def prior(flight: Flight, tilt_deg: float, shift_m: float) -> tuple[Array, Array
     return root @ root.T, root
 
 
-def aligned(flight: Flight, step: Array, covariance: Array) -> Alignment | None:
+def aligned(flight: Flight, step: Array, covariance: Array) -> ParallaxAlignment | None:
     first, second = flight.pose(FIRST), flight.pose(SECOND)
     turn = so3_exp(step[3:])
     moved = Pose(turn @ first.rotation, first.translation + step[:3])
     arm = turn @ (second.translation - first.translation)
     after = Pose(turn @ second.rotation, moved.translation + arm)
     views = (
-        View(flight.frame(FIRST).features, moved, CAMERA),
-        View(flight.frame(SECOND).features, after, CAMERA),
+        ParallaxView(flight.frame(FIRST).features, moved, CAMERA),
+        ParallaxView(flight.frame(SECOND).features, after, CAMERA),
     )
     return align(NumbaBackend(1), *views, flight.surface(FIRST), covariance, NOISE)
 
@@ -83,5 +83,5 @@ def test_a_keyframe_that_is_right_stays_there(mountains: Flight) -> None:
 def test_nothing_is_told_where_nothing_is_seen(mountains: Flight) -> None:
     covariance, _ = prior(mountains, 0.2, 0.1)
     elsewhere = mountains.surface(FIRST) + np.array([5000.0, 0.0, 0.0])
-    view = View(mountains.frame(FIRST).features, mountains.pose(FIRST), CAMERA)
+    view = ParallaxView(mountains.frame(FIRST).features, mountains.pose(FIRST), CAMERA)
     assert align(NumbaBackend(1), view, view, elsewhere, covariance, NOISE) is None

@@ -9,7 +9,7 @@ import pytest
 
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable, parts_agree
 from localizer.registration import JNGO
-from localizer.registration.agreement import Agreement, agreement
+from localizer.registration.agreement import PatchAgreement, agreement
 from localizer.registration.backend import camera_from_local, level_problems, local_origin
 from localizer.types import FeatureLevel, RegistrationStatus
 
@@ -31,7 +31,7 @@ def test_parts_agree_on_the_truth_and_not_on_a_place_elsewhere(scene_factory):
     for seed in range(3):
         scene, other = scene_factory(seed, 2.0, 2.0), scene_factory(seed + 50, 2.0, 2.0)
         right, wrong = votes_at(scene, scene.true), votes_at(scene, scene.true, other.query)
-        assert right.parts >= 8
+        assert right.patches >= 8
         assert right.share > 0.9
         assert wrong.share < 0.35
         assert right.peak > wrong.peak
@@ -47,7 +47,7 @@ def test_a_shifted_pose_loses_the_votes(scene_factory):
 def test_a_registration_to_another_place_is_refused_by_its_parts_alone(jngo, scene_factory, prior):
     """Quality alone let it in: its threshold is turned off to see what the parts do."""
     config = IntegrityConfig(min_quality=0.0, min_overlap=0.0, max_sigma_m=100.0)
-    without = config.model_copy(update={"min_agreement": 0.0, "min_parts": 0})
+    without = config.model_copy(update={"min_patch_inlier_ratio": 0.0, "min_patches": 0})
     let_in, refused = 0, 0
     for seed in range(4):
         scene, other = scene_factory(seed, 2.0, 2.0), scene_factory(seed + 50, 2.0, 2.0)
@@ -81,7 +81,9 @@ def test_too_few_parts_say_nothing_and_a_gpu_has_no_votes(jngo, scene_factory, p
         scene.query, scene.camera, scene.anchors, prior(scene.reference, 4.0, 5.0)
     )
     assert parts_agree(config, right)
-    few = replace(right, agreement=Agreement(config.min_parts - 1, config.min_parts - 1, 9.0))
+    few = replace(
+        right, agreement=PatchAgreement(config.min_patches - 1, config.min_patches - 1, 9.0)
+    )
     assert not parts_agree(config, few)
     assert parts_agree(config, replace(right, agreement=None))
 
@@ -90,4 +92,4 @@ def test_without_anchors_in_view_nobody_votes(scene_factory):
     scene = scene_factory(0, 2.0, 2.0)
     turned = replace(scene.true, rotation=scene.true.rotation @ np.diag([1.0, -1.0, -1.0]))
     votes = votes_at(scene, turned)
-    assert (votes.parts, votes.votes, votes.share) == (0, 0, 0.0)
+    assert (votes.patches, votes.votes, votes.share) == (0, 0, 0.0)

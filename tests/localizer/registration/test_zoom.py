@@ -127,7 +127,7 @@ def test_what_a_longer_lens_does_not_show_has_no_vote(jngo, scene_factory, prior
     raw = jngo.register(black, scene.camera, scene.anchors, begun)
     found = jngo.register(only_seen(black, seen), scene.camera, scene.anchors, begun)
     assert (raw.quality < 0.3, found.quality > 0.9) == (True, True)
-    assert found.agreement.parts < raw.agreement.parts
+    assert found.agreement.patches < raw.agreement.patches
     assert found.agreement.share > 0.9
     off = [r.world_from_camera.distance_to(scene.true)[0] for r in (raw, found)]
     assert off[1] < 0.6 * off[0]

@@ -9,7 +9,7 @@ import scipy.fft
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.registration.agreement import Agreement
+from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.relocalization.align import FrameShift, moved
 from localizer.relocalization.config import RelocalizationConfig
@@ -232,7 +232,7 @@ def test_the_shift_of_an_image_is_found_and_moves_the_camera():
 
 @pytest.mark.parametrize(
     ("votes", "credible"),
-    [(Agreement(60, 54, 6.0), True), (Agreement(60, 20, 4.0), False), (None, True)],
+    [(PatchAgreement(60, 54, 6.0), True), (PatchAgreement(60, 20, 4.0), False), (None, True)],
 )
 def test_an_answer_needs_the_parts_of_the_image(votes, credible):
     """Without votes (a GPU) the other tests decide, as before."""

@@ -107,7 +107,7 @@ def test_a_place_that_stands_out_needs_no_decisive_votes(opened, query, truth, m
     """
     relocalizer = opened.relocalizer
     best, *_ = relocalizer.verify(query, relocalizer.search(query)[:1])
-    votes = replace(best.result.agreement, votes=round(0.7 * best.result.agreement.parts))
+    votes = replace(best.result.agreement, votes=round(0.7 * best.result.agreement.patches))
     best = replace(best, result=replace(best.result, agreement=votes))
     away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
     candidates = [best.candidate, PlaceCandidate(away, best.candidate.score)]
@@ -163,7 +163,7 @@ def test_a_doubt_that_the_last_pass_leaves_is_settled(opened, query, truth, monk
         votes = result.agreement
         if len(calls) == 1 or votes is None or votes.share < 0.7:
             return result
-        return replace(result, agreement=replace(votes, votes=round(0.7 * votes.parts)))
+        return replace(result, agreement=replace(votes, votes=round(0.7 * votes.patches)))
 
     monkeypatch.setattr(JNGO, "register", doubtful_later)
     answer = opened.relocalizer.confirm(query, [best, *alike])

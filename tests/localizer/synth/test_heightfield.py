@@ -4,11 +4,11 @@ import pytest
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.synth.heightfield.render import render
-from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene
+from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene
 
 N, CELL = 128, 0.5
 NADIR = np.diag([1.0, -1.0, -1.0])
-NOON = Light((0.0, 0.0, 1.0), 0.7, 0.3)
+NOON = SkyLight((0.0, 0.0, 1.0), 0.7, 0.3)
 
 
 def land(height: np.ndarray | None = None) -> Land:
@@ -16,7 +16,7 @@ def land(height: np.ndarray | None = None) -> Land:
     return Land(z, np.full((N, N, 3), 0.5, np.float32), CELL)
 
 
-def lit(prisms: list[Prism], light: Light = NOON) -> LitScene:
+def lit(prisms: list[Prism], light: SkyLight = NOON) -> LitScene:
     return light_scene(compose(land(), prisms), light, (0.5, 0.6, 0.7))
 
 
@@ -68,7 +68,7 @@ def test_a_ridge_is_higher_than_the_eaves() -> None:
 
 
 def test_shadows_fall_away_from_the_sun() -> None:
-    sun = Light((np.cos(np.radians(30)), 0.0, np.sin(np.radians(30))), 1.0, 0.3)
+    sun = SkyLight((np.cos(np.radians(30)), 0.0, np.sin(np.radians(30))), 1.0, 0.3)
     camera = Camera.from_fov(128, 128, 60)
     # Columns grow with x: the sun stands in the east, so the shadow is west of the house.
     pose = Pose(NADIR, np.array([30.0, 27.5, 60.0]))

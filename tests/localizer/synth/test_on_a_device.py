@@ -21,7 +21,7 @@ from localizer.synth.appearance.model import (  # noqa: E402
 )
 from localizer.synth.heightfield import render_torch as heightfield_torch  # noqa: E402
 from localizer.synth.heightfield.render import render  # noqa: E402
-from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene  # noqa: E402
+from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene  # noqa: E402
 
 N = 128
 
@@ -35,7 +35,7 @@ def scene(seed: int) -> LitScene:
     corners = np.array([[50, 50], [80, 50], [80, 75], [50, 75]], np.float32)
     prism = Prism(corners, 25.0, 0.0, (0.7, 0.2, 0.2), (0.8, 0.8, 0.7), 3.0)
     land = Land(height, albedo, 0.5 + 0.1 * seed)
-    light = Light((0.6, 0.3, 0.74), 0.9, 0.4)
+    light = SkyLight((0.6, 0.3, 0.74), 0.9, 0.4)
     return light_scene(compose(land, [prism]), light, (0.5, 0.6, 0.7))
 
 

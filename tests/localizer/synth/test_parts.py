@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from localizer.synth.config import SURVEY, Look, WorldConfig
+from localizer.synth.config import SURVEY, VisitLook, WorldConfig
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light, raise_surface
 from localizer.synth.plan.terrain import River, Terrain, make_terrain
 from localizer.synth.tiles.charts import ChartedMesh, pack
@@ -10,7 +10,7 @@ from localizer.synth.tiles.props import CAR_HEIGHT_M, CAR_LENGTH_M, car_mesh, pe
 from localizer.synth.tiles.terrain_mesh import terrain_mesh
 
 
-def flat_light(look: Look):
+def flat_light(look: VisitLook):
     """Light about a block of 4 x 4 m and 10 m height in the middle of 60 x 60 m."""
     ground = np.zeros((120, 120), np.float32)
     dsm = ground.copy()
@@ -31,7 +31,7 @@ def test_a_block_raises_the_surface_model_where_it_stands():
 
 
 def test_shadow_falls_away_from_the_sun_and_is_as_long_as_its_height_says():
-    look = Look(sun_azimuth_deg=90.0, sun_elevation_deg=45.0)  # sun in the east
+    look = VisitLook(sun_azimuth_deg=90.0, sun_elevation_deg=45.0)  # sun in the east
     _, light = flat_light(look)
     assert sample(light.ceiling, -6, 0) > 0  # to the west: shadow
     assert sample(light.ceiling, 6, 0) <= 0

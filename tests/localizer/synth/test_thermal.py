@@ -8,7 +8,7 @@ import pytest
 from localizer.synth.appearance.thermal import (
     SPAN_K,
     THERMAL_CONDITIONS,
-    Cover,
+    ThermalCover,
     ThermalDay,
     crossover_hour,
     draw_microbolometer,
@@ -20,22 +20,42 @@ from localizer.synth.heightfield.scene import Land, Prism, compose
 from localizer.synth.heightfield.thermal import covers, thermal_scene
 
 DAY = ThermalDay("thermal day", 13.0, 0.1, 1.0, np.radians(50), 0.0, 0.3)
-GROUND = [Cover.SOIL, Cover.GRASS, Cover.CROWN, Cover.ASPHALT]
+GROUND = [ThermalCover.SOIL, ThermalCover.GRASS, ThermalCover.CROWN, ThermalCover.ASPHALT]
 N, CELL = 128, 0.5
 
 
-def at(hour: float) -> dict[Cover, float]:
-    return dict(zip(Cover, level_surfaces(replace(DAY, hour=hour)), strict=True))
+def at(hour: float) -> dict[ThermalCover, float]:
+    return dict(zip(ThermalCover, level_surfaces(replace(DAY, hour=hour)), strict=True))
 
 
 def test_surfaces_are_warm_in_the_order_that_is_known() -> None:
     noon, night = at(13.0), at(3.0)
-    assert noon[Cover.BITUMEN] > noon[Cover.ASPHALT] > noon[Cover.SOIL] > noon[Cover.GRASS]
-    assert noon[Cover.GRASS] > noon[Cover.CROWN] > noon[Cover.WATER] > noon[Cover.METAL]
-    assert night[Cover.WATER] > night[Cover.ASPHALT] > night[Cover.CROWN] > night[Cover.GRASS]
-    assert night[Cover.METAL] < min(v for k, v in night.items() if k is not Cover.METAL) - 10
-    assert 8 < noon[Cover.ASPHALT] - noon[Cover.CROWN] < 25
-    assert at(19.0)[Cover.ASPHALT] > at(7.0)[Cover.ASPHALT] + 4  # it holds the day's heat
+    assert (
+        noon[ThermalCover.BITUMEN]
+        > noon[ThermalCover.ASPHALT]
+        > noon[ThermalCover.SOIL]
+        > noon[ThermalCover.GRASS]
+    )
+    assert (
+        noon[ThermalCover.GRASS]
+        > noon[ThermalCover.CROWN]
+        > noon[ThermalCover.WATER]
+        > noon[ThermalCover.METAL]
+    )
+    assert (
+        night[ThermalCover.WATER]
+        > night[ThermalCover.ASPHALT]
+        > night[ThermalCover.CROWN]
+        > night[ThermalCover.GRASS]
+    )
+    assert (
+        night[ThermalCover.METAL]
+        < min(v for k, v in night.items() if k is not ThermalCover.METAL) - 10
+    )
+    assert 8 < noon[ThermalCover.ASPHALT] - noon[ThermalCover.CROWN] < 25
+    assert (
+        at(19.0)[ThermalCover.ASPHALT] > at(7.0)[ThermalCover.ASPHALT] + 4
+    )  # it holds the day's heat
 
 
 def test_clouds_and_the_crossover_take_the_contrast() -> None:
@@ -68,8 +88,8 @@ def made(day: ThermalDay):  # type: ignore[no-untyped-def]
 
 def test_a_place_has_slow_shadows_and_a_warm_street() -> None:
     kelvin, cover = made(DAY)
-    assert (cover[:, 103:107] == Cover.ASPHALT).all()
-    assert cover[60, 60] == Cover.BITUMEN
+    assert (cover[:, 103:107] == ThermalCover.ASPHALT).all()
+    assert cover[60, 60] == ThermalCover.BITUMEN
     assert kelvin[:, 103:107].mean() > kelvin[:, 10:40].mean() + 3
     north = kelvin[72:80, 55:65].mean(), kelvin[40:48, 55:65].mean()
     open_grass = float(np.median(kelvin[:, 5:30]))

@@ -14,7 +14,7 @@ from localizer.config import LocalizerConfig
 from localizer.errors import CameraError, MapCacheError, OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
-from localizer.registration.agreement import Agreement
+from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.render.base import SKY
 from localizer.tracking.engine import DualThreadEngine
@@ -82,7 +82,7 @@ class FakeOptimizer:
         self.error: Exception | None = None
         self.status = RegistrationStatus.OK
         self.offset = np.zeros(3)
-        self.agreement: Agreement | None = None
+        self.agreement: PatchAgreement | None = None
         self.focal_gain = -np.inf
 
     def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
@@ -150,7 +150,7 @@ class Flight:
 
     def _turn_after(self, thread: str, time_ns: int, deadline: float) -> int:
         """Wait until a thread begins a new turn, and so has ended what it took; when it began."""
-        while (begun_ns := self.engine.turns().get(thread, 0)) <= time_ns:
+        while (begun_ns := self.engine.last_ticks_ns().get(thread, 0)) <= time_ns:
             assert time.monotonic() < deadline, f"{thread} stands: {self.engine.health}"
             time.sleep(1e-3)
         return begun_ns
@@ -273,7 +273,7 @@ def test_a_jump_against_the_prediction_is_not_accepted():
 @pytest.mark.parametrize(("sigma_m", "accepted"), [(3.0, True), (20.0, False)])
 def test_of_equal_roofs_only_a_narrow_prior_says_which(sigma_m, accepted):
     optimizer = FakeOptimizer()
-    optimizer.agreement = Agreement(parts=60, votes=58, peak=3.2)
+    optimizer.agreement = PatchAgreement(parts=60, votes=58, peak=3.2)
     localizer = _localizer(optimizer=optimizer)
     localizer.set_prior(PosePrior(NADIR, np.diag([sigma_m**2] * 3 + [1.0] * 3), 10**9))
     assert localizer.track(_frame(0)).accepted is accepted
@@ -286,7 +286,7 @@ def test_a_found_place_is_refused_where_another_focal_length_fits_better(gain, t
     localizer = _localizer(optimizer=optimizer)
     localizer.offer(replace(_prior(10**9), independent=False))
     localizer.track(_frame(0))
-    assert localizer.tracker.standing.accepted_in_row == tried
+    assert localizer.tracker.track_status.accepted_in_row == tried
 
 
 def test_localizing_before_a_prior_is_an_error():
@@ -318,7 +318,7 @@ def test_a_frame_is_tracked_in_one_call_as_in_its_two_halves():
     again.set_prior(_prior(10**9))
     assert again.track(_frame(0), passes=3, query=lambda: whole.extract_query(_frame(0))).accepted
     assert len(renderer.poses) == 3
-    assert again.tracker.standing.accepted_in_row == 1
+    assert again.tracker.track_status.accepted_in_row == 1
 
 
 def test_a_frame_of_another_size_is_named():
@@ -465,7 +465,7 @@ def test_while_lost_a_search_finds_the_place_and_the_way_flown_confirms_it(fligh
     optimizer.offset = elsewhere  # the vehicle is 300 m off at once: every frame is refused
     f.feed_until(lambda: f.estimates[-1].state is TrackingState.LOST)
     f.feed_until(lambda: f.engine.health.found > 0)
-    f.feed_until(lambda: f.localizer.tracker.standing.probation is not None)
+    f.feed_until(lambda: f.localizer.tracker.track_status.tentative_track is not None)
     last = f.estimates[-1]
     assert last.state is TrackingState.LOST
     assert not last.accepted

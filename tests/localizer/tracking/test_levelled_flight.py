@@ -20,8 +20,8 @@ from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration, failure
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
-from localizer.tracking.horizon import Horizon, horizontal_axes
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.attitude_bias import AttitudeBias, horizontal_axes
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import open_localizer
 from localizer.types import Frame, PosePrior, RegistrationStatus
 from sitl.camera.true_motion import PoseTrack
@@ -69,7 +69,7 @@ def fly(
     assets: FlightAssets,
     filmed: list[tuple[Frame, Pose]],
     pitch_off_deg: Callable[[int], float],
-) -> tuple[list[float], Horizon]:
+) -> tuple[list[float], AttitudeBias]:
     """Position errors (m) of the flight with a gimbal that is off by so much, and what was learned
     of it.
     """
@@ -85,7 +85,7 @@ def fly(
 
     config = LocalizerConfig(renderer="numba", device="cpu")
     errors = []
-    with open_localizer(assets.map_cache, CAMERA, config, OtherSensors(reported)) as localizer:
+    with open_localizer(assets.map_cache, CAMERA, config, AuxiliarySensors(reported)) as localizer:
         first, truth = filmed[0]
         prior = PosePrior(truth, np.eye(6) * 0.01, first.exposure_time_ns)
         localizer.set_prior(replace(prior, velocity=np.array([0.0, 12.0, 0.0])))
@@ -93,17 +93,17 @@ def fly(
             estimate = localizer.track(frame)
             if estimate.accepted:  # a turn that the gimbal made up is refused at first
                 errors.append(estimate.world_from_camera.distance_to(true)[0])
-        horizon = localizer.levelling.horizon
-    assert horizon is not None
+        bias = localizer.attitude_bias.bias
+    assert bias is not None
     assert len(errors) > len(filmed) - 4
-    return errors, horizon
+    return errors, bias
 
 
 def test_the_gimbals_constant_is_learned_and_takes_nothing_from_the_place(small_assets, filmed):
-    errors, horizon = fly(small_assets, filmed, lambda _: 1.2)
+    errors, bias = fly(small_assets, filmed, lambda _: 1.2)
     level, _ = fly(small_assets, filmed, lambda _: 0.0)
-    assert abs(horizon.off_deg[0] - 1.2) < 0.4
-    assert abs(horizon.off_deg[1]) < 0.4
+    assert abs(bias.off_deg[0] - 1.2) < 0.4
+    assert abs(bias.off_deg[1]) < 0.4
     assert np.median(errors) < np.median(level) + 0.1
     assert max(errors) < 0.6
 

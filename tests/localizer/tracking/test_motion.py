@@ -133,7 +133,10 @@ def test_a_turn_that_is_known_better_mends_the_position(rate_deg_s, share):
 
 def test_a_turn_that_begins_passes_the_gate_only_where_it_is_told():
     """45 degrees a second from one frame to the next; told, the gate is the narrower one, too."""
-    gate, covariance = IntegrityConfig().gate, np.diag([0.05**2] * 3 + [0.002**2] * 3)
+    chi2_threshold, covariance = (
+        IntegrityConfig().chi2_threshold,
+        np.diag([0.05**2] * 3 + [0.002**2] * 3),
+    )
     turn = so3_exp([0.0, 0.0, np.radians(4.5)])
     state = motion.start(_prior(0.1), CONFIG)
     for k in range(1, 21):
@@ -142,12 +145,12 @@ def test_a_turn_that_begins_passes_the_gate_only_where_it_is_told():
     time_ns = 21 * SECOND // 10
     blind = motion.predict(state, time_ns, CONFIG).prior
     told = motion.predict(state, time_ns, CONFIG, turn).prior
-    assert motion.mahalanobis_squared(blind, Pose(turn, np.zeros(3)), covariance) > gate
-    assert motion.mahalanobis_squared(told, Pose(turn, np.zeros(3)), covariance) < gate
+    assert motion.mahalanobis_squared(blind, Pose(turn, np.zeros(3)), covariance) > chi2_threshold
+    assert motion.mahalanobis_squared(told, Pose(turn, np.zeros(3)), covariance) < chi2_threshold
     beside = Pose(so3_exp([0.0, 0.0, np.radians(1.5)]), np.zeros(3))
     steady = motion.predict(state, time_ns, CONFIG, np.eye(3)).prior
-    assert motion.mahalanobis_squared(blind, beside, covariance) < gate
-    assert motion.mahalanobis_squared(steady, beside, covariance) > gate
+    assert motion.mahalanobis_squared(blind, beside, covariance) < chi2_threshold
+    assert motion.mahalanobis_squared(steady, beside, covariance) > chi2_threshold
 
 
 def test_a_turns_error_grows_with_its_rate_and_with_time():

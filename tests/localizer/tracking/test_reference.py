@@ -150,7 +150,7 @@ class _Flight:
 def test_a_slow_flight_takes_fewer_references_than_frames_and_a_fast_one_as_many():
     slow = _Flight(step_m=2.0 * METRES_PER_PX)
     slow.fly(range(5))
-    assert slow.localizer.tracker.standing.state is TrackingState.TRACKING
+    assert slow.localizer.tracker.track_status.state is TrackingState.TRACKING
     # 2 px a frame; a reference serves from 6 px before its place to 8 px behind it
     assert slow.fly(range(5, 25)) in (2, 3)
     fast = _Flight(step_m=10.0 * METRES_PER_PX)

@@ -14,7 +14,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
-from localizer.tracking.motion import OtherSensors
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import open_localizer
 from localizer.types import Frame, PosePrior
 from sitl.camera.realism import CameraRealism
@@ -64,7 +64,7 @@ def _errors_m(
     frames, truth = filmed
     camera = replace(CAMERA, readout_ms=readout_ms)
     height_m = float(truth[0].translation[2])
-    sensors = OtherSensors(lambda time_ns: _pose(time_ns, height_m).rotation)
+    sensors = AuxiliarySensors(lambda time_ns: _pose(time_ns, height_m).rotation)
     errors = []
     config = LocalizerConfig(renderer="numba", device="cpu")
     with open_localizer(assets.map_cache, camera, config, sensors) as localizer:
@@ -80,7 +80,7 @@ def _errors_m(
 
 
 def test_a_slew_is_localized_once_the_camera_states_its_readout(small_assets, filmed):
-    untold = _errors_m(small_assets, filmed, readout_ms=0.0)
+    unreported = _errors_m(small_assets, filmed, readout_ms=0.0)
     told = _errors_m(small_assets, filmed, readout_ms=CAMERA.readout_ms)
-    assert np.median(untold) > 1.0  # what is mended
+    assert np.median(unreported) > 1.0  # what is mended
     assert max(told) < 0.4

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene
+from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, regrown, wetted
 from localizer.training.places.changes import coarse_mesh, plain_walls
 
@@ -58,7 +58,7 @@ def scene() -> LitScene:
     prism = Prism(np.float32([[100, 100], [150, 100], [150, 140], [100, 140]]), 9.0, 0.0,
                   (0.5, 0.4, 0.4), (0.6, 0.6, 0.6), 3.0)  # fmt: skip
     land = Land(np.zeros((N, N), np.float32), np.full((N, N, 3), 0.4, np.float32), CELL)
-    return light_scene(compose(land, [prism]), Light((0.3, 0.2, 0.9), 0.7, 0.5), (1, 1, 1))
+    return light_scene(compose(land, [prism]), SkyLight((0.3, 0.2, 0.9), 0.7, 0.5), (1, 1, 1))
 
 
 def test_a_coarse_mesh_is_rounded_and_bounded_from_above() -> None:

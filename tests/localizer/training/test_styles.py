@@ -74,9 +74,9 @@ def test_the_light_is_of_its_style() -> None:
 
 
 def _noon():  # type: ignore[no-untyped-def]
-    from localizer.synth.heightfield.scene import Light
+    from localizer.synth.heightfield.scene import SkyLight
 
-    return Light((0.0, 0.6, 0.8), 0.8, 0.5)
+    return SkyLight((0.0, 0.6, 0.8), 0.8, 0.5)
 
 
 def test_styles_are_drawn_where_they_are_asked_for() -> None:

@@ -14,7 +14,7 @@ import pytest
 from mavlink_bridge.config import InjectionConfig, YawGuardConfig
 from mavlink_bridge.injection.encode import DIAGONAL
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import Injection, InjectionContext
+from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.quaternion import from_euler
@@ -78,7 +78,7 @@ def fly(
     where: InjectionContext | None = None,
     start: int = SECOND,
     change: Any = None,
-) -> list[tuple[int, Injection]]:
+) -> list[tuple[int, EncodedMessage]]:
     """Feed fixes of a vehicle that flies north, in 1 ms steps; (send time, injection) of each."""
     sent = []
     arriving: list[tuple[int, VisionFix]] = []

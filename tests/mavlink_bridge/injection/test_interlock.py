@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
-from mavlink_bridge.injection.gate_memory import NoGoMemory
+from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.interlock import ShadowInterlock
-from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from tests.mavlink_bridge.simulated import SECOND, Flight
 
 SWITCH = SourceSwitchConfig(enabled=True)
@@ -65,14 +65,14 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
     """The process that had seen it was killed, the next one had nothing to compare with: after two
     seconds it injected.
     """
-    gate, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
-    killed = on_gnss(monkeypatch, state_file=gate)
+    enable, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
+    killed = on_gnss(monkeypatch, state_file=enable)
     killed.north_m = 20.0
     killed.run(15.0)
     assert killed.vision() == []
     while not file.exists():  # written by its own thread
         pass
-    again = on_gnss(monkeypatch, state_file=gate)
+    again = on_gnss(monkeypatch, state_file=enable)
     again.north_m, again.gnss_north_m = 20.0, None
     again.end.recall()
     again.run(30.0)
@@ -94,15 +94,15 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
 def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    gate, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
-    killed = on_gnss(monkeypatch, state_file=gate)
-    killed.end.flies_over("map a")
+    enable, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
+    killed = on_gnss(monkeypatch, state_file=enable)
+    killed.end.set_map_id("map a")
     killed.north_m = 20.0
     killed.run(15.0)
     while not file.exists():
         pass
-    again = on_gnss(monkeypatch, state_file=gate)
-    again.end.flies_over("map b")
+    again = on_gnss(monkeypatch, state_file=enable)
+    again.end.set_map_id("map b")
     again.gnss_north_m = None
     again.end.recall()
     again.run(10.0)
@@ -126,7 +126,11 @@ def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
     )  # fmt: skip
     scores = [ShadowScore(begins, 100, () if begins else ("3.0 Hz, needs 4",))]
     interlock = ShadowInterlock(
-        False, lambda _: scores[-1], lambda: SECOND, Teller(lambda *_: None), NoGoMemory(file)
+        False,
+        lambda _: scores[-1],
+        lambda: SECOND,
+        StatusNotifier(lambda *_: None),
+        ShadowFailureMemory(file),
     )
     interlock.recall()
     for second, against in ((1, ()), (2, ("20 m off",)), (4, ("20 m off",))):
@@ -172,7 +176,7 @@ def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
     flight.run(3.0)
     assert not flight.end.sender.is_good(flight.now_ns)
     assert told(flight, "not sent") == ["not sent: the link takes no more"]
-    assert flight.end.trouble == "not sent: the link takes no more"
+    assert flight.end.injection_fault == "not sent: the link takes no more"
     assert not flight.end.sender.reaches_ekf(flight.now_ns)
     flight.gnss_north_m = None
     flight.run(6.0)
@@ -180,7 +184,7 @@ def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
     flight.link.full = False
     flight.run(4.0)
     assert told(flight, "source set") == ["EKF source set 2: GNSS lost"]
-    assert flight.end.trouble == ""
+    assert flight.end.injection_fault == ""
 
 
 def test_a_port_that_is_full_for_half_a_second_is_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -376,7 +380,7 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
 ) -> None:
     """A calibration that was found wrong: no injection, no switch, until it is over."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
-    flight.end.forbid("focal length looks 5.0 % long")
+    flight.end.inhibit("focal length looks 5.0 % long")
     flight.run(18.0)
     assert flight.vision() == []
     assert told(flight, "not sent") == ["not sent: focal length looks 5.0 % long"]
@@ -385,22 +389,22 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
     assert flight.vision() == []
     assert orders(flight) == []
     flight.gnss_north_m = 0.0
-    flight.end.forbid("")
+    flight.end.inhibit("")
     flight.run(3.0)
     assert flight.vision()
     begun_ns = flight.now_ns
-    flight.end.forbid("focal length looks 5.0 % long")
+    flight.end.inhibit("focal length looks 5.0 % long")
     flight.run(2.0)
     assert flight.vision(begun_ns)  # taking it back would leave the vehicle without a position
 
 
 def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    gate = InjectionGate(RcGateConfig(), lambda _: None)
-    flight = Flight(monkeypatch, gate, mode="rc")
+    enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
+    flight = Flight(monkeypatch, enable, mode="rc")
     flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
     flight.run(15.0)
     assert flight.vision() == []
-    assert gate.command(31010, 1.0) == 0
+    assert enable.command(31010, 1.0) == 0
     flight.run(5.0)
     assert flight.vision()
     assert told(flight, "go from") == ["injecting without a go from shadow"]
@@ -412,21 +416,21 @@ def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
     """The pilot had injected a map 20 m off: receiver and EKF repeated it, which was a go, and his
     next injection and a switch to vision began without a word.
     """
-    gate = InjectionGate(RcGateConfig(), lambda _: None)
+    enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
     injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input")
-    flight = Flight(monkeypatch, gate, mode="rc", injection=injection, switch=SWITCH)
+    flight = Flight(monkeypatch, enable, mode="rc", injection=injection, switch=SWITCH)
     flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
     flight.run(10.0)
-    gate.command(31010, 1.0)
+    enable.command(31010, 1.0)
     flight.run(1.0)
     flight.gnss_north_m = flight.ekf_north_m = 20.0
     flight.run(150.0)
     score = flight.end.shadow_score(flight.now_ns)
     assert not score.go, score.line()
     assert flight.end.on_gnss(flight.now_ns) is False
-    gate.command(31010, 0.0)
+    enable.command(31010, 0.0)
     flight.run(1.0)
-    gate.command(31010, 1.0)
+    enable.command(31010, 1.0)
     flight.run(1.0)
     assert told(flight, "go from") == 2 * ["injecting without a go from shadow"]
 
@@ -450,7 +454,7 @@ class Compared:
             False,
             lambda _: ShadowScore(self._go, 100, () if self._go else ("3.0 Hz, needs 4",)),
             lambda: self._compared_ns,
-            Teller(lambda _severity, _text: None),
+            StatusNotifier(lambda _severity, _text: None),
         )
 
     def may_switch(self, second: int, *, go: bool, gnss: bool = True) -> bool:

@@ -505,7 +505,7 @@ def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() ->
 
 def test_evidence_that_an_autopilot_did_not_hear_of_is_asked_for_again() -> None:
     """IMU and barometer were asked for twice in the first seconds, while it still booted, and the
-    guardian flew without either, untold. One that does not know them is asked once a minute.
+    monitor flew without either, untold. One that does not know them is asked once a minute.
     """
     keeper, config = StreamKeeper(), BridgeConfig()
     asked = ["RAW_IMU" in names(keeper, config, 10.0 + 2.5 * i) for i in range(90)]

@@ -17,7 +17,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig
-from mavlink_bridge.errors import RecordError
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.link.tlog import TlogRecorder, read_tlog
 
@@ -35,9 +35,9 @@ def test_a_file_that_cannot_be_opened_is_a_named_error(tmp_path: Path) -> None:
     occupied = tmp_path / "file"
     occupied.write_text("")
     for path in (occupied / "flight.tlog", tmp_path):
-        with pytest.raises(RecordError, match=r"bridge\.tlog"):
+        with pytest.raises(TlogError, match=r"bridge\.tlog"):
             TlogRecorder(path)
-        with pytest.raises(RecordError):
+        with pytest.raises(TlogError):
             Bridge(BridgeConfig(tlog=path), 0.0)
 
 
@@ -65,7 +65,7 @@ def test_a_start_on_a_failing_disk_goes_on_without_a_tlog(
         return mkdir
 
     monkeypatch.setattr(Path, "mkdir", refuse(errno.EACCES))
-    with pytest.raises(RecordError):
+    with pytest.raises(TlogError):
         TlogRecorder(tmp_path / "x" / "a.tlog")
     monkeypatch.setattr(Path, "mkdir", refuse(errno.EROFS))
     told: list[str] = []
@@ -169,5 +169,5 @@ def test_a_tlog_that_a_record_names_keeps_no_reader_waiting(tmp_path: Path, kind
     if kind == "endless":
         with path.open("wb") as file:
             file.truncate(1 << 40)  # sparse
-    with pytest.raises(RecordError, match=r"not a plain file|larger than the 2 GiB"):
+    with pytest.raises(TlogError, match=r"not a plain file|larger than the 2 GiB"):
         list(read_tlog(path))

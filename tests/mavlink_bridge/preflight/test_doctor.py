@@ -15,7 +15,7 @@ from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.preflight.doctor import (
-    Finding,
+    DoctorFinding,
     check_failsafes,
     check_parameters,
     examine,
@@ -357,7 +357,7 @@ def test_what_px4_does_when_vision_ends_is_told_likewise(
 def test_px4_is_asked_for_its_own_failsafes(
     autopilot: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link = Finding("connection", "px4", "a heartbeat", "", True, True)
+    link = DoctorFinding("connection", "px4", "a heartbeat", "", True, True)
     known = ([link], VehicleState(autopilot="px4"))
     monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
     autopilot.autopilot = mavlink.MAV_AUTOPILOT_PX4

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError, MissionError
 from mavlink_bridge.preflight.mission import download_mission
-from mavlink_bridge.vehicle.mission import Waypoint
+from mavlink_bridge.vehicle.mission import MissionWaypoint
 from sitl.geodesy import Location
 from sitl.ground.mission_steps import MissionStep, takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot
@@ -74,13 +74,13 @@ def with_mission(autopilot: Any) -> Callable[..., Any]:
 
 
 PLACES = [
-    Waypoint(0, 47.397742, 8.545594),
-    Waypoint(2, 47.4, 8.545594),
-    Waypoint(5, 47.4, 8.55),
+    MissionWaypoint(0, 47.397742, 8.545594),
+    MissionWaypoint(2, 47.4, 8.545594),
+    MissionWaypoint(5, 47.4, 8.55),
 ]
 
 
-def same(found: list[Waypoint], expected: list[Waypoint]) -> None:
+def same(found: list[MissionWaypoint], expected: list[MissionWaypoint]) -> None:
     assert [w.number for w in found] == [w.number for w in expected]
     for a, b in zip(found, expected, strict=True):
         assert (a.latitude_deg, a.longitude_deg) == pytest.approx(
@@ -170,7 +170,10 @@ def upload_and_download(vehicle: Any) -> None:
     found = download_mission(config(vehicle.companion_endpoint))
     pilot.link.close()
     flown = [w for w in found if w.number > 0]
-    same(flown, [Waypoint(2 + i, p.latitude_deg, p.longitude_deg) for i, p in enumerate(places)])
+    same(
+        flown,
+        [MissionWaypoint(2 + i, p.latitude_deg, p.longitude_deg) for i, p in enumerate(places)],
+    )
 
 
 def test_embedded_vehicle() -> None:

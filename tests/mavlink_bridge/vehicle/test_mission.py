@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, VehicleState
-from mavlink_bridge.vehicle.mission import MissionWatch, Waypoint
+from mavlink_bridge.vehicle.mission import MissionWatch, MissionWaypoint
 
 S = 1_000_000_000
 US = (1, 191)
@@ -79,7 +79,9 @@ def test_it_is_read_once_and_its_number_asked_for_now_and_then() -> None:
     assert asked.count("MISSION_REQUEST_INT") == len(ITEMS)
     assert asked[-1] == "MISSION_ACK"
     assert talk.numbers == PLACES
-    assert talk.watch.waypoints[1] == Waypoint(2, pytest.approx(47.4), pytest.approx(8.545594))
+    assert talk.watch.waypoints[1] == MissionWaypoint(
+        2, pytest.approx(47.4), pytest.approx(8.545594)
+    )
     assert talk.run(60.0) == ["MISSION_REQUEST_LIST"] * 6
 
 

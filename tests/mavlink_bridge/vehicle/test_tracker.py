@@ -14,12 +14,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.messages import Origin
-from mavlink_bridge.texts import Teller
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin import OriginKeeper, ned_from_origin, north_east, offset
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
 from mavlink_bridge.vehicle.readings import gimbal_in_earth_frame
-from mavlink_bridge.vehicle.strangers import StrangerWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -497,8 +497,8 @@ def test_the_angles_of_two_gimbals_are_not_mixed(other: tuple[int, int]) -> None
     assert looks(it, 2075) == pytest.approx(10.0, abs=0.01)
     assert it.other_gimbals == (other,)
     told: list[str] = []
-    teller = Teller(lambda _, text: told.append(text))
-    watch = StrangerWatch(BridgeConfig(), it, teller, Counter())
+    teller = StatusNotifier(lambda _, text: told.append(text))
+    watch = UnexpectedSenderMonitor(BridgeConfig(), it, teller, Counter())
     link: Any = SimpleNamespace(stranger="", system_id=1)
     for _ in range(3):
         watch.check(link, 20 * SECOND)

@@ -9,9 +9,9 @@ import pytest
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp, so3_log
 from localizer.synth.appearance.model import Appearance
-from sitl.camera.distortion import Lens, row_motion
+from sitl.camera.distortion import RenderedLens, row_motion
 from sitl.camera.imaging import Sensor
-from sitl.camera.realism import CameraRealism, Stamps, Vibration
+from sitl.camera.realism import CameraClock, CameraRealism, Vibration
 from sitl.camera.stream import LossyLink
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0, (-0.08, 0.02, 0.0, 0.0, 0.0))
@@ -37,10 +37,10 @@ def test_every_row_shows_the_world_as_it_was_at_its_own_time(supersample: float)
         turn = so3_exp([0.0, np.radians(0.8) * share, np.radians(0.5) * share])
         return Pose(middle.rotation @ turn, middle.translation + np.array([0.4 * share, 0.0, 0.1]))
 
-    lens = Lens.of(CAMERA, supersample, is_rolling=True)
+    lens = RenderedLens.of(CAMERA, supersample, is_rolling=True)
     rgb, depth = _picture(lens.pinhole, middle)
     rolled, still = lens.roll(rgb, depth, row_motion(middle, pose_of_row, CAMERA.height))
-    flat = Lens.of(CAMERA, supersample)
+    flat = RenderedLens.of(CAMERA, supersample)
     for row in (20, 120, 220):
         wanted = flat.distort(_picture(flat.pinhole, pose_of_row(row))[0])[row].astype(int)
         inside = np.s_[12:-12]
@@ -61,15 +61,15 @@ def test_vibration_is_as_strong_as_said_and_a_function_of_time() -> None:
 
 
 def test_stamps_are_off_by_what_was_drawn_and_never_run_backwards() -> None:
-    stamps = Stamps(CameraRealism(stamp_offset_ms=4.0, stamp_jitter_ms=2.0), seed=1)
+    stamps = CameraClock(CameraRealism(stamp_offset_ms=4.0, stamp_jitter_ms=2.0), seed=1)
     true = np.arange(0, 60_000_000_000, 100_000_000)
     late_ms = (np.array([stamps.of(int(t)) for t in true]) - true) * 1e-6
     assert late_ms.mean() == pytest.approx(4.0, abs=0.3)
     assert late_ms.std() == pytest.approx(2.0, rel=0.1)
-    rough = Stamps(CameraRealism(stamp_jitter_ms=50.0), seed=1)
+    rough = CameraClock(CameraRealism(stamp_jitter_ms=50.0), seed=1)
     fast = [rough.of(t) for t in range(0, 10_000_000, 10_000)]
     assert all(b > a for a, b in itertools.pairwise(fast))
-    assert Stamps(CameraRealism(), seed=1).of(123) == 123
+    assert CameraClock(CameraRealism(), seed=1).of(123) == 123
 
 
 def test_exposure_follows_the_scene_and_the_noise_the_gain() -> None:
@@ -107,7 +107,7 @@ def test_a_lossy_link_loses_its_share_and_sends_the_rest_in_whole_datagrams() ->
 
 def test_a_supersampled_picture_is_the_average_of_what_its_pixels_cover() -> None:
     """Of a pattern too fine for the picture: point samples alias, a finer rendering does less."""
-    lens = Lens.of(Camera.from_fov(320, 240, 60), 2.0)
+    lens = RenderedLens.of(Camera.from_fov(320, 240, 60), 2.0)
     size = (lens.pinhole.height, lens.pinhole.width)
     fine = np.indices(size).sum(axis=0) % 2 * 255
     image = np.repeat(fine[..., None], 3, 2).astype(np.uint8)

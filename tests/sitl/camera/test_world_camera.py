@@ -20,7 +20,7 @@ from localizer.geometry.trajectory import read_tum
 from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
-from sitl.camera.distortion import Lens
+from sitl.camera.distortion import RenderedLens
 from sitl.camera.movers import Mover
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera, centre_flow
@@ -113,12 +113,12 @@ def test_spots_appear_where_opencv_projects_them(renderer: NumbaRenderer) -> Non
 def test_the_rendered_pinhole_covers_the_distorted_picture() -> None:
     for k1 in (-0.2, 0.2):
         camera = Camera(320, 240, 230, 230, 150, 130, (k1, 0, 0, 0, 0))
-        lens = Lens.of(camera)
+        lens = RenderedLens.of(camera)
         white = np.full((lens.pinhole.height, lens.pinhole.width, 3), 255, np.uint8)
         assert lens.distort(white).min() == 255
         depth = np.full(white.shape[:2], 7.0, np.float32)
         assert lens.distort_depth(depth).min() == 7.0
-    assert Lens.of(Camera.from_fov(64, 48, 60)).pinhole.width == 66
+    assert RenderedLens.of(Camera.from_fov(64, 48, 60)).pinhole.width == 66
 
 
 def test_a_mover_is_drawn_at_its_true_place(renderer: NumbaRenderer) -> None:

@@ -47,6 +47,6 @@ def test_the_scenarios_table_is_near_the_lens_and_not_the_same() -> None:
     off = [abs((table.factor(level_of(f)) or 0.0) / f - 1.0) for f in np.linspace(1.0, 2.0, 41)]
     assert 0.003 < max(off) < 0.007
     assert case.is_normal
-    (untold,) = load_loop_cases(["zooms-untold"])
-    assert not untold.is_normal
-    assert untold.earns
+    (unreported,) = load_loop_cases(["zooms-untold"])
+    assert not unreported.is_normal
+    assert unreported.earns

@@ -3,14 +3,14 @@ import pytest
 from companion.reporting.verdicts import advice, compared
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
-from sitl.demo.criteria import Judged, Pace, headline, judge, latency_warning
+from sitl.demo.criteria import ComputingRates, FlightFigures, headline, judge, latency_warning
 
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
 
 def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0):
     metrics = LocalizationMetrics(**(GOOD.to_dict() | (localizer or {})))
-    return Judged(metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside)
+    return FlightFigures(metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside)
 
 
 def _missed(**changes):
@@ -88,7 +88,7 @@ GOOD_PACE = {"sent_hz": 10.0, "wanted_hz": 10, "taken": 1.0, "latency_ms": 150.0
     ],
 )
 def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(changes, said):
-    text = Pace(**(GOOD_PACE | changes)).complaint()
+    text = ComputingRates(**(GOOD_PACE | changes)).complaint()
     assert text is not None
     assert said in text
     assert "did not keep up" in text
@@ -96,7 +96,7 @@ def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(c
 
 @pytest.mark.parametrize("changes", [{}, {"latency_ms": None}, {"sent_hz": 9.6, "taken": 0.97}])
 def test_a_computer_that_keeps_up_is_not_blamed(changes):
-    assert Pace(**(GOOD_PACE | changes)).complaint() is None
+    assert ComputingRates(**(GOOD_PACE | changes)).complaint() is None
 
 
 def test_every_target_says_what_a_miss_means_and_where_to_look():

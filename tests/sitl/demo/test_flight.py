@@ -13,7 +13,7 @@ from sitl.demo import flight
 from sitl.demo.companion_process import Ports, write_deployment
 from sitl.demo.flight import fly
 from sitl.demo.report import make_report, print_report
-from sitl.demo.scenario import CameraSpec, Injection, Leg, Scenario
+from sitl.demo.scenario import CameraSpec, Injection, Scenario, ScenarioLeg
 from sitl.demo.script import FlightError, FlightScript
 
 # Light, because it flies in real time on what may be two cores.
@@ -22,9 +22,9 @@ SCENARIO = Scenario(
     deny_after_s=3,
     speed_m_s=6,
     legs=(
-        Leg(east_m=0, north_m=60, height_m=80, gimbal_pitch_deg=-80),
-        Leg(east_m=50, north_m=30, height_m=85, gimbal_pitch_deg=-80),
-        Leg(east_m=0, north_m=0, height_m=80, gimbal_pitch_deg=-85),
+        ScenarioLeg(east_m=0, north_m=60, height_m=80, gimbal_pitch_deg=-80),
+        ScenarioLeg(east_m=50, north_m=30, height_m=85, gimbal_pitch_deg=-80),
+        ScenarioLeg(east_m=0, north_m=0, height_m=80, gimbal_pitch_deg=-85),
     ),
     cars=3,
     people=3,

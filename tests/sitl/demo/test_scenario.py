@@ -5,7 +5,14 @@ import pytest
 
 from localizer.geometry.pose import so3_log
 from sitl.demo.kinematic import camera_path
-from sitl.demo.scenario import CameraSpec, Leg, Scenario, ScenarioError, check_inside, load_scenario
+from sitl.demo.scenario import (
+    CameraSpec,
+    Scenario,
+    ScenarioError,
+    ScenarioLeg,
+    check_inside,
+    load_scenario,
+)
 from sitl.demo.script import mission
 from sitl.geodesy import Location
 from tests.bounds import unbounded
@@ -73,9 +80,9 @@ def test_the_kinematic_path_is_smooth_and_visits_every_corner():
 @pytest.mark.parametrize("east", [801.0, -9e3])
 def test_a_leg_outside_the_world_is_named(east):
     check_inside(Scenario(), 1600.0)
-    home = Leg(east_m=0, north_m=0)
+    home = ScenarioLeg(east_m=0, north_m=0)
     with pytest.raises(ScenarioError, match=r"legs\.1: .* reaches 800 m"):
-        check_inside(Scenario(legs=(home, Leg(east_m=east, north_m=0))), 1600.0)
+        check_inside(Scenario(legs=(home, ScenarioLeg(east_m=east, north_m=0))), 1600.0)
 
 
 def test_every_number_has_its_bounds():

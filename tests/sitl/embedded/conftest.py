@@ -16,7 +16,7 @@ from sitl.embedded.ekf.timesync import JitterCorrection
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import euler
-from sitl.embedded.vehicle import Vehicle
+from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 
 HOME = Location(47.397742, 8.545594, 488.0)
@@ -81,7 +81,7 @@ class Bench:
         for name, value in parameters.items():
             assert table.set(name, value), name
         self.texts: list[tuple[float, str]] = []
-        self.whole = Vehicle(HOME, 30.0, table, Listened(self._note), seed)
+        self.whole = EmbeddedVehicle(HOME, 30.0, table, Listened(self._note), seed)
         self.vehicle = self.whole.aircraft
         self.each_tick: list[Callable[[], None]] = []
 

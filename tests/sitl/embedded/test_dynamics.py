@@ -7,7 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from sitl.embedded.control.controller import Carrot, Limits, PositionController, attitude_control
+from sitl.embedded.control.controller import (
+    Carrot,
+    ControlLimits,
+    PositionController,
+    attitude_control,
+)
 from sitl.embedded.physics import dynamics
 from sitl.embedded.physics.dynamics import GRAVITY, MASS, MOTOR_MAX
 from sitl.embedded.physics.rotation import euler, quaternion
@@ -98,7 +103,7 @@ def test_attitude_control_reaches_a_lean():
 
 
 def test_carrot_keeps_speed_and_acceleration_limits_and_stops_at_the_end():
-    limits = Limits(10.0, 2.5, 1.5, 2.5, 1.0)
+    limits = ControlLimits(10.0, 2.5, 1.5, 2.5, 1.0)
     carrot = Carrot((0.0, 0.0, 0.0), (200.0, 0.0, 0.0))
     speeds = [0.0]
     for _ in range(6000):
@@ -113,7 +118,7 @@ def test_carrot_keeps_speed_and_acceleration_limits_and_stops_at_the_end():
 
 
 def test_carrot_waits_for_a_vehicle_that_lags():
-    limits = Limits(10.0, 2.5, 1.5, 2.5, 1.0)
+    limits = ControlLimits(10.0, 2.5, 1.5, 2.5, 1.0)
     carrot = Carrot((0.0, 0.0, 0.0), (200.0, 0.0, 0.0))
     for _ in range(6000):
         carrot.move((0.0, 0.0, 0.0), limits, 0.01)

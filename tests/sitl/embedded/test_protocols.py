@@ -21,7 +21,7 @@ from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters, read_parameter_file
 from sitl.embedded.physics.gimbal import Gimbal
 from sitl.embedded.physics.rotation import euler
-from sitl.embedded.vehicle import Vehicle
+from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 
 HERE = Location(47.0, 8.0, 500.0)
@@ -235,7 +235,7 @@ def delivered(socket_):
 def linked():
     server = MavlinkServer((0, 0), 1)  # any ports that are free
     ports = [link.listener.getsockname()[1] for link in server.links]
-    vehicle = Vehicle(HERE, 0.0, Parameters({"MNT1_TYPE": 7}), server)
+    vehicle = EmbeddedVehicle(HERE, 0.0, Parameters({"MNT1_TYPE": 7}), server)
     gcs, companion = Client(ports[0], 255, 190), Client(ports[1], 1, 191)
 
     def run(ticks=30):

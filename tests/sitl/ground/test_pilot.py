@@ -28,7 +28,7 @@ from sitl.ground.mission_steps import (
     waypoint_step,
 )
 from sitl.ground.pilot import Pilot
-from sitl.ground.tracks import LeastLatencyClock, Track
+from sitl.ground.tracks import LeastLatencyClock, SampleTrack
 from sitl.suite.simulated_localizer import FixModel, TruthFeed
 from sitl.vehicles import ardupilot, process
 from sitl.vehicles.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
@@ -54,7 +54,7 @@ def test_boot_clock_takes_the_least_latency():
 
 
 def test_track_brackets_a_time_and_forgets_the_oldest():
-    track: Track[Any] = Track(limit=10)
+    track: SampleTrack[Any] = SampleTrack(limit=10)
     for t in range(100):
         track.add(SimpleNamespace(time_ns=10 * t))
     both = track.around(985)

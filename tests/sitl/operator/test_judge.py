@@ -21,7 +21,7 @@ from sitl.operator.followed import FollowedFix, follow_verdict
 from sitl.operator.judge import judge
 from sitl.operator.operator import Asked, Frames
 from sitl.operator.station import GeoReport, Heard
-from sitl.operator.truth import Pointed, Witness, all_pointed
+from sitl.operator.truth import GroundTruth, Pointed, all_pointed
 from sitl.operator.wishes import Wish, draw_wishes
 from tests.companion.targets.scene import CAMERA, DOWN
 
@@ -41,14 +41,14 @@ def test_wishes_are_drawn_by_the_seed_alone_and_have_stops_between() -> None:
 
 
 @pytest.fixture
-def witness(small_assets: FlightAssets, tmp_path: Path) -> Witness:
+def witness(small_assets: FlightAssets, tmp_path: Path) -> GroundTruth:
     """A camera that hovers over the small world for half a minute."""
     height = float(small_assets.world.ground_height(0.0, 0.0)) + 100.0
     with FrameLog(tmp_path / "frames.csv") as log:
         for k in range(320):
             pose = Pose(so3_exp([0.1, 0.05, 0.0]) @ DOWN, np.array([0.01 * k, 0.0, height]))
             log.add(k, k * PERIOD_NS, pose)
-    return Witness(small_assets, CAMERA, tmp_path / "frames.csv")
+    return GroundTruth(small_assets, CAMERA, tmp_path / "frames.csv")
 
 
 def clicked(number: int, u: float, v: float, frame: int, ended: tuple[int, ...] = ()) -> Asked:
@@ -86,7 +86,7 @@ def asked() -> list[Asked]:
     return [clicked(1, 0.3, 0.4, 10), clicked(2, 0.7, 0.6, 40), stopped(1, frame=200)]
 
 
-def heard(witness: Witness, points: dict[int, Pointed], **other: Any) -> Heard:
+def heard(witness: GroundTruth, points: dict[int, Pointed], **other: Any) -> Heard:
     """One report over the link, of target 2."""
     place = points[2].place
     assert place is not None
@@ -96,7 +96,9 @@ def heard(witness: Witness, points: dict[int, Pointed], **other: Any) -> Heard:
     return Heard(geo=[replace(geo, **other)])
 
 
-def test_right_reports_are_no_problem(witness: Witness, asked: list[Asked], tmp_path: Path) -> None:
+def test_right_reports_are_no_problem(
+    witness: GroundTruth, asked: list[Asked], tmp_path: Path
+) -> None:
     points = all_pointed(witness, asked)
     rows = [row(p, s, (0.2, 0.0, 0.1)) for p in points.values() for s in np.arange(0.0, 12.0, 0.2)]
     verdict = judge(witness, asked, heard(witness, points), reports(tmp_path / "t.csv", rows))
@@ -118,7 +120,7 @@ def test_right_reports_are_no_problem(witness: Witness, asked: list[Asked], tmp_
     ],
 )
 def test_each_fault_of_a_report_is_a_problem(
-    fault: Any, problem: str, witness: Witness, asked: list[Asked], tmp_path: Path
+    fault: Any, problem: str, witness: GroundTruth, asked: list[Asked], tmp_path: Path
 ) -> None:
     points = all_pointed(witness, asked)
     rows = [*fault(points[1], points[2]), row(points[2], 1.0)]
@@ -127,7 +129,7 @@ def test_each_fault_of_a_report_is_a_problem(
 
 
 def test_what_comes_over_the_link_is_judged_too(
-    witness: Witness, asked: list[Asked], tmp_path: Path
+    witness: GroundTruth, asked: list[Asked], tmp_path: Path
 ) -> None:
     points = all_pointed(witness, asked)
     path = reports(tmp_path / "t.csv", [row(p, 1.0) for p in points.values()])

@@ -22,7 +22,7 @@ import pytest
 from mavlink_bridge.link.link import sleep_until
 from sitl.suite import runner
 from sitl.suite.case import load_cases
-from sitl.suite.runner import Row, run_case, run_suite
+from sitl.suite.runner import ReportRow, run_case, run_suite
 from sitl.vehicles.ardupilot import find_arducopter
 from sitl.vehicles.process import VehicleKind
 
@@ -42,7 +42,9 @@ KINDS = [
 
 
 @cache
-def flown(kind: VehicleKind, few: bool, watched_processors: Any) -> tuple[dict[str, Row], bool]:
+def flown(
+    kind: VehicleKind, few: bool, watched_processors: Any
+) -> tuple[dict[str, ReportRow], bool]:
     """All of them side by side, once: a flight in real time takes 0.15 of a processor.
 
     And whether other work took their processors.
@@ -61,7 +63,9 @@ def check(real_time: Any, watched_processors: Any) -> Callable[[VehicleKind, str
     return checked
 
 
-def _check(row: Row, shared: bool, real_time: Callable[[], AbstractContextManager[None]]) -> None:
+def _check(
+    row: ReportRow, shared: bool, real_time: Callable[[], AbstractContextManager[None]]
+) -> None:
     """What a flight did that fell behind real time says nothing: it flies once more, alone."""
     if row.ok or not (shared or row.slow or row.error):
         assert row.ok, [f.what for f in row.findings if not f.ok]

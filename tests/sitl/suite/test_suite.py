@@ -17,9 +17,9 @@ from sitl.demo.scenario import ScenarioError
 from sitl.suite.case import SCENARIOS, Case, load_case, load_cases
 from sitl.suite.checks import Check
 from sitl.suite.flight import bridge_config, longest_stall, slowest_pace
-from sitl.suite.record import Doctor, Record, Sample, Text
+from sitl.suite.record import CaseRecord, Doctor, Text, VehicleSample
 from sitl.suite.report import markdown, summary, write_report
-from sitl.suite.runner import Row, judge
+from sitl.suite.runner import ReportRow, judge
 
 SHIPPED = load_cases()
 
@@ -28,14 +28,15 @@ def expectation(**fields: Any) -> Any:
     return TypeAdapter(Check).validate_python(fields)
 
 
-def record(error: float = 0.2, seconds: float = 20.0) -> Record:
+def record(error: float = 0.2, seconds: float = 20.0) -> CaseRecord:
     """Errors to the north at 25 Hz, hovering in GUIDED on source set 1."""
     times = [i / 25 for i in range(int(25 * seconds))]
     samples = [
-        Sample(i / 10, 0.0, 0.0, "GUIDED", True, i, 1, i / 10) for i in range(int(10 * seconds))
+        VehicleSample(i / 10, 0.0, 0.0, "GUIDED", True, i, 1, i / 10)
+        for i in range(int(10 * seconds))
     ]
     errors = [(t, error, 0.0) for t in times]
-    return Record(errors=errors, unpaired=errors, samples=samples)
+    return CaseRecord(errors=errors, unpaired=errors, samples=samples)
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -154,7 +155,7 @@ def test_limits_of_error_and_motion_within_a_span() -> None:
         assert not expectation(check=check, from_s=99, **limits).judge(flown).ok
 
 
-def jumping(taken_s: float, peak: float) -> Record:
+def jumping(taken_s: float, peak: float) -> CaseRecord:
     flown = record()
     flown.errors = [(t, 0.0 if t < taken_s else 10.0, 0.0) for t, _, _ in flown.errors]
     i = next(i for i, (t, _, _) in enumerate(flown.errors) if t >= taken_s)
@@ -174,10 +175,10 @@ def test_a_told_jump_must_be_taken_at_once_and_without_overshoot(
 
 
 def test_an_untold_jump_must_be_refused_for_a_while_and_then_taken() -> None:
-    untold = expectation(check="jump_refused", at_s=4, north_m=10, after_s=5, before_s=9)
-    assert untold.judge(jumping(11.0, 13.0)).ok
-    assert not untold.judge(jumping(4.3, 10.0)).ok
-    assert not untold.judge(record()).ok
+    unreported = expectation(check="jump_refused", at_s=4, north_m=10, after_s=5, before_s=9)
+    assert unreported.judge(jumping(11.0, 13.0)).ok
+    assert not unreported.judge(jumping(4.3, 10.0)).ok
+    assert not unreported.judge(record()).ok
 
 
 def test_texts_are_looked_for_by_sender_and_time() -> None:
@@ -250,9 +251,9 @@ def test_arming_and_doctor() -> None:
 # --- report ---------------------------------------------------------------------------------------
 
 
-def row(name: str, flown: Record | None, error: str = "") -> Row:
+def row(name: str, flown: CaseRecord | None, error: str = "") -> ReportRow:
     case = next(c for c in SHIPPED if c.name == name)
-    return Row(case, "embedded", flown, judge(case, flown) if flown else (), error)
+    return ReportRow(case, "embedded", flown, judge(case, flown) if flown else (), error)
 
 
 def test_the_report_holds_every_flight(tmp_path: Path) -> None:
@@ -290,8 +291,10 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
 def test_the_commands_exit_code_is_for_scripts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float, code: int
 ) -> None:
-    def flown(cases: Any, kinds: Any, *_: Any) -> list[Row]:
-        return [Row(c, k, record(error), judge(c, record(error))) for k in kinds for c in cases]
+    def flown(cases: Any, kinds: Any, *_: Any) -> list[ReportRow]:
+        return [
+            ReportRow(c, k, record(error), judge(c, record(error))) for k in kinds for c in cases
+        ]
 
     monkeypatch.setattr(cli, "run_suite", flown)
     out = str(tmp_path / "out")

@@ -12,9 +12,9 @@ from pyproj import CRS
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, around, utm_zone
-from localizer.map.fetch.catalogue import Source, choose, load_sources
+from localizer.map.fetch.catalogue import CatalogueSource, choose, load_sources
 from localizer.map.fetch.cloud import degree_files
-from localizer.map.fetch.raster import Grid
+from localizer.map.fetch.raster import FetchGrid
 from localizer.map.fetch.web_map import wms_url
 
 BERN = around(np.array([[46.948, 7.447]]), 300.0)
@@ -112,8 +112,10 @@ def test_areas():
 @pytest.mark.parametrize("version", ["1.1.1", "1.3.0"])
 def test_a_wms_in_degrees_is_asked_to_a_millimetre_east_of_100_degrees_too(version):
     """Nine digits were 6 cm off there, and its picture says no place of its own."""
-    source = Source(**{**MINE, "crs": "EPSG:4326", "version": version})
-    window = Grid(CRS.from_epsg(4326), 151.2093123456, -33.8688197531, (2e-6, 2e-6), 1000, 1000)
+    source = CatalogueSource(**{**MINE, "crs": "EPSG:4326", "version": version})
+    window = FetchGrid(
+        CRS.from_epsg(4326), 151.2093123456, -33.8688197531, (2e-6, 2e-6), 1000, 1000
+    )
     asked = parse_qs(urlsplit(wms_url(source, window)).query)["BBOX"][0]
     numbers = [float(v) for v in asked.split(",")]
     left, bottom, right, top = window.bounds

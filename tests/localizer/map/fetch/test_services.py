@@ -15,7 +15,7 @@ pytest.importorskip("owslib")
 pytest.importorskip("pystac")
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
-from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile, plan_files
 from localizer.map.fetch.fetch import estimate, fetch, make_plan
 from localizer.map.fetch.mosaic import check_piece
@@ -51,7 +51,7 @@ def server(tmp_path_factory):
         yield served
 
 
-def source(kind: str, url: str, **more: object) -> Source:
+def source(kind: str, url: str, **more: object) -> CatalogueSource:
     role = more.pop("role", "imagery")
     given = {
         "name": "here", "title": "the world", "kind": kind, "role": role, "url": url,
@@ -59,10 +59,10 @@ def source(kind: str, url: str, **more: object) -> Source:
         "bounds": rectangle(0.0), "resolution_m": 0.5 if role == "imagery" else 1.0,
         "rate_per_s": 50.0, "vertical_datum": None if role == "imagery" else "amsl",
     }  # fmt: skip
-    return Source.model_validate(given | more)
+    return CatalogueSource.model_validate(given | more)
 
 
-def fetched(wanted: Source, tmp_path: Path, client: PoliteClient | None = None) -> Path:
+def fetched(wanted: CatalogueSource, tmp_path: Path, client: PoliteClient | None = None) -> Path:
     client = client or PoliteClient(Manners(50.0))
     plan = make_plan(wanted, AREA, wanted.resolution_m, client)
     fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
@@ -252,7 +252,7 @@ def test_a_server_that_fails_in_the_middle_of_a_file_is_told_and_not_taken_for_a
     assert not (tmp_path / "out.tif").exists()
 
 
-def _with_sea_beside(server, wanted: Source, lacks: int) -> list[CloudFile]:
+def _with_sea_beside(server, wanted: CatalogueSource, lacks: int) -> list[CloudFile]:
     """The world's file, and one that is not there: GLO-30 has none of a degree that is all sea."""
     files = [CloudFile(f"{server.url}/{name}", wanted.bounds, may_lack=True)
              for name in ("surface.tif", "surface.tif")]  # fmt: skip

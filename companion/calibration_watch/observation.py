@@ -1,0 +1,59 @@
+"""One registered picture, as evidence of how the camera is made and mounted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CalibrationObservation:
+    """What the map says of one picture.
+
+    place: latitude, longitude (degrees) and height above the ellipsoid (m) of the vehicle;
+    sigma_m: horizontal, 1 sigma. ned_from_camera: (3, 3), OpenCV axes. depth_m: of the ground along
+    the optical axis, as the map is seen from there. horizontal_fov_deg: of this picture's zoom.
+    """
+
+    time_ns: int
+    place: tuple[float, float, float]
+    sigma_m: float
+    ned_from_camera: Array
+    depth_m: float
+    horizontal_fov_deg: float
+
+
+@dataclass(frozen=True)
+class AutopilotObservation:
+    """What the autopilot says of the same moment; None where it does not know.
+
+    ned_from_camera: (3, 3) by gimbal and attitude; turn: its rotation vector (3,) over a second,
+    NED, rad. north_east_m: of the EKF on GNSS, from the sighting's place. gnss_height_m,
+    pressure_height_m: only their changes count.
+    """
+
+    ned_from_camera: Array | None
+    turn: Array | None
+    north_east_m: tuple[float, float] | None
+    gnss_height_m: float | None
+    pressure_height_m: float | None
+
+
+@dataclass(frozen=True)
+class CalibrationEstimate:
+    """An estimate and its standard deviation."""
+
+    value: float
+    sigma: float
+
+    def exceeds(self, limit: float) -> bool:
+        """Beyond the limit, and sure to be wrong at all."""
+        return abs(self.value) > limit and abs(self.value) > 4.0 * self.sigma
+
+    def is_within(self, limit: float) -> bool:
+        """Surely below the limit."""
+        return abs(self.value) + 2.0 * self.sigma < limit

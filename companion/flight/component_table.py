@@ -1,0 +1,619 @@
+"""The table of what runs: every part of the flight process, how it is made, started and stopped.
+
+A new part is a line in `COMPONENTS` and a function that makes it. It takes what it needs from the parts
+above it and subscribes to the channels that it reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.calibration_watch.map_offset import MapOffsetEstimator
+from companion.config import CompanionConfig
+from companion.conversions import CameraExtrinsics, target_report
+from companion.errors import ConfigError
+from companion.flight.calibration_observer import CalibrationObserver
+from companion.flight.components import BuildContext, Component
+from companion.flight.feed import Feed
+from companion.flight.health import HealthInputs, HealthMonitor
+from companion.flight.injection import FixInjection, is_for_injection
+from companion.flight.last_fix import FixMemory
+from companion.flight.priors import AutopilotPose, PriorSources, local_about
+from companion.flight.reachable_region import ReachableRegion
+from companion.flight.recorder import RecordKeeper, remove_empty
+from companion.flight.search import PlaceSearch, place_on_map
+from companion.flight.view_reporter import ViewReporter
+from companion.ground.vital_signs import VitalSigns
+from companion.integrity_monitor.alert_rules import InhibitMemory
+from companion.integrity_monitor.checks import IntegrityLimits
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
+from companion.klv.metadata import KlvContext
+from companion.klv.relay import KlvRelay
+from companion.live.orders import Helm, OrderError, Orders
+from companion.live.protocol import socket_path
+from companion.live.publisher import Publisher
+from companion.live.shown import Instruments, Shown
+from companion.preflight.coverage import check_origin
+from companion.preflight.map_pin import readable_map_hash, require_pinned
+from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
+from companion.sources.timing import system_minus_monotonic
+from companion.sources.zoom import ZoomedFrames
+from companion.targets.clicks import ClickPolicy
+from companion.targets.detections import DetectionListener
+from companion.targets.detector.worker import BoxDetector
+from companion.targets.frame_times import FrameTimes
+from companion.targets.numbers import TargetNumbers
+from companion.targets.reporter import TargetReporter
+from companion.targets.target_manager import TargetEstimate
+from localizer.geometry.pose import matrix_from_quaternion
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.tracking.engine import DualThreadEngine
+from localizer.tracking.motion import AuxiliarySensors
+from localizer.tracking.opening import MapStack, build_localizer
+from localizer.tracking.pipeline import Localizer
+from localizer.types import Frame, PoseEstimate, ReferenceBundle
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.injection.restart_memory import RestartMemory
+from mavlink_bridge.messages import TrackRequest
+
+_log = logging.getLogger(__name__)
+_FOCAL_FIT_S = 0.5  # where the table may be corrected: 5 ms of processor each
+_ZOOM_RATE_HZ = 5.0  # at which CAMERA_SETTINGS is asked for where a table waits for it
+_WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
+_BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT)
+
+
+def _map(making: BuildContext) -> MapStack:
+    config = making.config
+    require_pinned(config.map, config.map_sha256)
+    stack = MapStack(config.map, config.localizer)
+    try:
+        _require_origin_at_map(config, stack.cache)
+    except BaseException:
+        stack.close()
+        raise
+    return stack
+
+
+def _extrinsics(making: BuildContext) -> CameraExtrinsics:
+    cache = making[MapStack].cache
+    arm = np.array(making.config.camera.lever_arm_m)
+    return CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
+
+
+def _bridge(making: BuildContext) -> Bridge:
+    search = making.later(PlaceSearch)
+    bridge = Bridge(
+        _bridge_config(making.config),
+        making[MapStack].cache.manifest.geoid_separation_m,
+        on_track=making.channels.clicks.send,
+        on_hint=lambda hint: search().hint_at(hint),
+        on_text=making.channels.texts.send,
+        on_vehicle_text=making.channels.vehicle_texts.send,
+    )
+    bridge.set_map_id(readable_map_hash(making.config.map) or "")
+    return bridge
+
+
+def _record(making: BuildContext) -> RecordKeeper:
+    bridge, channels, config = making[Bridge], making.channels, making.config
+    keeper = RecordKeeper(
+        making[MapStack].cache.frame,
+        lambda why: bridge.say(_WARNING, f"PiLoT: record is incomplete: {why}"),
+    )
+    if config.record is None:
+        return keeper
+
+    def claim(folder: Path) -> None:
+        making.if_abandoned(lambda: remove_empty(folder))
+
+    keeper.open(config, config.record, claim)
+    recorder = keeper.recorder
+    if recorder is not None:
+        channels.frames.subscribe(recorder.snapshot)
+        integrity_monitor = making.get(IntegrityMonitor)
+
+        def record(estimate: PoseEstimate, _: ReferenceBundle) -> None:
+            recorder.estimate(estimate, _levels(integrity_monitor, estimate))
+
+        channels.estimates.subscribe(record)
+        channels.targets.subscribe(lambda target: recorder.target(target.fix))
+        channels.events.subscribe(recorder.event)
+        # What the operator was told belongs in the record; the bridge has logged it.
+        channels.texts.subscribe(lambda severity, text: recorder.event(_level(severity), text))
+        channels.texts.subscribe(lambda severity, text: recorder.text(severity, text, "companion"))
+        channels.vehicle_texts.subscribe(recorder.text)
+    return keeper
+
+
+def _source(making: BuildContext) -> FrameSource:
+    camera, events, bridge = making.config.camera, making.channels.events, making[Bridge]
+
+    def on_state(state: StreamState, text: str) -> None:
+        events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
+
+    def on_stranger(text: str) -> None:
+        bridge.say(_WARNING, f"PiLoT: {text}")
+
+    model = camera.model.camera()
+    wanted: tuple[PacketTap | None, ...] = (making.get(KlvRelay), making.get(FrameTimes))
+    taps = [tap for tap in wanted if tap is not None]
+    tap = PacketTaps(taps) if taps else None
+    return open_source(camera.source, model, camera.settings, on_state, on_stranger, tap)
+
+
+def _frame_times(making: BuildContext) -> FrameTimes:
+    targets = making.later(TargetReporter)
+    times = FrameTimes(lambda detection: targets().add_detection(detection))
+    making.channels.frames.subscribe(times.add_frame)
+    return times
+
+
+def _klv(making: BuildContext) -> KlvRelay:
+    config, bridge, cache = making.config, making[Bridge], making[MapStack].cache
+    assert config.klv is not None  # or the part is not wanted
+    if not config.camera.is_video:
+        raise ConfigError(f"klv: {config.camera.source} is no video that could be sent on")
+    geoid_m = cache.manifest.geoid_separation_m
+    scene = KlvContext(cache.frame, MapSurface(cache).cast, geoid_m, config.klv.mission)
+
+    def attitude(time_ns: int) -> np.ndarray | None:
+        known = bridge.attitude_at(time_ns)
+        return None if known is None else matrix_from_quaternion(known.quaternion)
+
+    relay = KlvRelay(config.klv, scene, attitude, system_minus_monotonic())
+    making.channels.estimates.subscribe(lambda estimate, _: relay.add_estimate(estimate))
+    making.channels.targets.subscribe(relay.add_target)
+    return relay
+
+
+def _health(making: BuildContext) -> HealthMonitor:
+    engine, keeper = making.later(DualThreadEngine), making[RecordKeeper]
+    streamer = making[MapStack].streamer
+    autopilot, search = making.later(AutopilotPose), making.later(PlaceSearch)
+    source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+    inputs = HealthInputs(
+        lambda: keeper.is_complete,
+        lambda: autopilot().sigma_m,
+        making.get(IntegrityMonitor),
+        lambda: streamer.counters().unreadable,
+        making[MapOffsetEstimator].report,
+        _target_counts(making),
+        lambda: search().lacks,
+    )
+    health = HealthMonitor(
+        lambda: engine().health,
+        making[Bridge],
+        lambda: source.state,
+        making.channels.events.send,
+        keeper.folder,
+        inputs,
+    )
+    making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
+    return health
+
+
+def _targets(making: BuildContext) -> TargetReporter:
+    channels, bridge = making.channels, making[Bridge]
+    cache, numbers = making[MapStack].cache, TargetNumbers()
+    reporter = TargetReporter(
+        making.config.targets,
+        MapSurface(cache).cast,
+        channels.targets.send,
+        channels.gone.send,
+        bridge.say,
+    )
+
+    def report(target: TargetEstimate) -> None:
+        camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
+        bridge.report(target_report(target.fix, camera, cache.frame, number))
+
+    channels.frames.subscribe(reporter.add_frame)
+    channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
+    channels.targets.subscribe(report)
+    channels.gone.subscribe(lambda name: bridge.forget(numbers.of(name)))
+    return reporter
+
+
+def _clicks(making: BuildContext) -> ClickPolicy:
+    clicks = ClickPolicy(making[TargetReporter], making[Bridge].say, making.config.targets)
+    making.channels.estimates.subscribe(clicks.add_estimate)
+    making.channels.clicks.subscribe(clicks.on_request)
+    making.channels.gone.subscribe(clicks.on_gone)
+    return clicks
+
+
+def _detections(making: BuildContext) -> DetectionListener:
+    address = making.config.targets.detections
+    assert address is not None  # or the part is not wanted
+    return DetectionListener(address, making[FrameTimes].add_detection)
+
+
+def _detector(making: BuildContext) -> BoxDetector:
+    channels, reporter = making.channels, making[TargetReporter]
+    config = making.config.targets.detector
+    assert config is not None  # or the part is not wanted
+    cast = MapSurface(making[MapStack].cache).cast
+    detector = BoxDetector(config, cast, reporter.add_detection, making[Bridge].say)
+    channels.frames.subscribe(detector.add_frame)
+    channels.estimates.subscribe(lambda estimate, _: detector.add_estimate(estimate))
+    return detector
+
+
+def _target_counts(making: BuildContext) -> Callable[[], dict[str, int]]:
+    """What was asked of the targets and could not be told, for the health and the report."""
+    targets, times = making.later(TargetReporter), making.get(FrameTimes)
+    has_detector = making.config.targets.detector is not None
+    detector = making.later(BoxDetector) if has_detector else None
+
+    def counts() -> dict[str, int]:
+        reporter = targets()
+        return {
+            "missed": reporter.missed,
+            "doubted": reporter.doubted,
+            "refused": reporter.refused,
+            "failed": reporter.failed + (0 if detector is None else detector().failed),
+            "unmatched": reporter.unmatched + (0 if times is None else times.unmatched),
+        }
+
+    return counts
+
+
+def _view(making: BuildContext) -> ViewReporter:
+    cache, bridge = making[MapStack].cache, making[Bridge]
+    rate_hz = making.config.bridge.targets.rate_hz
+    view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.look)
+    making.channels.estimates.subscribe(lambda estimate, _: view.add_estimate(estimate))
+    return view
+
+
+def _vital_signs(making: BuildContext) -> VitalSigns:
+    signs = VitalSigns(making[Bridge].tell_figures)
+    making.channels.estimates.subscribe(lambda estimate, _: signs.add_estimate(estimate))
+    return signs
+
+
+def _autopilot(making: BuildContext) -> AutopilotPose:
+    bridge = making[Bridge]
+    autopilot = AutopilotPose(
+        bridge, making[CameraExtrinsics], making.config.prior, lambda: bridge.on_gnss
+    )
+    making.channels.estimates.subscribe(
+        lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
+    )
+    return autopilot
+
+
+def _last_fix(making: BuildContext) -> FixMemory:
+    config, integrity_monitor, bridge = making.config, making.get(IntegrityMonitor), making[Bridge]
+    path = config.prior.state_file
+    if path is None and config.record is not None:
+        path = config.record.folder.parent / "last-fix.json"
+    memory = FixMemory(
+        path,
+        config.prior,
+        making[AutopilotPose],
+        making[CameraExtrinsics],
+        lambda time_ns: local_about(bridge, time_ns),
+        lambda: integrity_monitor is None or not integrity_monitor.reason,
+        bridge.state,
+    )
+    making.channels.estimates.subscribe(memory.add_estimate)
+    return memory
+
+
+def _localizer(making: BuildContext) -> Localizer:
+    _log.info("making the localizer ready; the first start on a machine compiles its kernels")
+    config, autopilot = making.config, making.later(AutopilotPose)
+    camera = config.camera.model.camera()
+    sensors = AuxiliarySensors(
+        lambda time_ns: autopilot().rotation(time_ns),
+        lambda begin_ns, end_ns: autopilot().displacement(begin_ns, end_ns),
+        lambda _time_ns: autopilot().height_m,
+        lambda time_ns: autopilot().clearance_m(time_ns),
+    )
+    settings, zoom = config.localizer, config.camera.zoom
+    if zoom is not None and zoom.refine and not settings.focal_fit_s:
+        settings = settings.model_copy(update={"focal_fit_s": _FOCAL_FIT_S})
+    return build_localizer(making[MapStack], camera, settings, sensors)
+
+
+def _injection(making: BuildContext) -> FixInjection:
+    injection = FixInjection(making[Bridge], making[CameraExtrinsics])
+    making.channels.estimates.subscribe(injection.add_estimate)
+    return injection
+
+
+def _map_shift(making: BuildContext) -> MapOffsetEstimator:
+    injection = making.config.bridge.injection
+    shift = MapOffsetEstimator(
+        making[Bridge],
+        injection.map_shift,
+        making.channels.events.send,
+        gnss_is_ours=injection.message == "gps_input",
+    )
+    making[FixInjection].add_judge(shift.judge)
+    return shift
+
+
+def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
+    config, injection = making.config, making.config.bridge.injection
+    limits = IntegrityLimits(
+        injection.alert_limit_m,
+        injection.time_to_alert_s,
+        gnss_is_ours=injection.message == "gps_input",
+        horizontal_fov_deg=config.camera.model.camera().horizontal_fov_deg,
+    )
+    calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
+    protection = config.integrity_monitor.protection.of_camera(calibrated=calibrated)
+    watched = config.integrity_monitor.model_copy(update={"protection": protection})
+    integrity_monitor = IntegrityMonitor(watched, limits, making[Bridge], _forbid_memory(config))
+    making[FixInjection].add_judge(lambda _, fix: integrity_monitor.judge(fix))
+    making.channels.frames.subscribe(lambda f: integrity_monitor.see(f.exposure_time_ns, f.image))
+    sightings = CalibrationObserver(
+        making[Bridge], making[CameraExtrinsics], integrity_monitor.add_observation
+    )
+    making.channels.estimates.subscribe(sightings.add_estimate)
+    return integrity_monitor
+
+
+def _feed(making: BuildContext) -> Feed:
+    source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+    return Feed(source, making.channels.frames.send)
+
+
+def _console(making: BuildContext) -> Publisher:
+    """Everything it asks of the flight is a look at what is there; it subscribes last, and what it
+    keeps of a picture is a reference.
+    """
+    config, bridge, channels = making.config, making[Bridge], making.channels
+    assert config.console is not None  # or the part is not wanted
+    cache, search, health = making[MapStack].cache, making[PlaceSearch], making[HealthMonitor]
+    geoid_m = cache.manifest.geoid_separation_m
+    instruments = Instruments(
+        lambda: health.newest, bridge.state, bridge.shadow_score, bridge.loop_verdict,
+        lambda: bridge.injecting and bridge.reaches_ekf, bridge.mission,
+    )  # fmt: skip
+    folder = making[RecordKeeper].folder
+    about = {
+        "map": str(config.map),
+        "record": None if folder is None else str(folder),
+        "control": config.console.control,
+        "mode": config.bridge.mode,
+        "delay_ms": config.bridge.injection.delay_ms,
+        "alert_limit_m": config.bridge.injection.alert_limit_m,
+    }
+    shown = Shown(cache.frame, geoid_m, instruments, about)
+
+    def hint(latitude_deg: float, longitude_deg: float, radius_m: float) -> None:
+        place = place_on_map(cache, latitude_deg, longitude_deg, radius_m)
+        if place is None:
+            raise OrderError("the hint lies off the map")
+        search.hint(*place, radius_m)
+
+    # A click of the page names its frame; a ground station's is taken to be late.
+    late_ns = round(config.targets.operator_delay_ms * 1e6)
+
+    def track(request: TrackRequest) -> None:
+        bridge.track(replace(request, time_ns=request.time_ns + late_ns))
+
+    helm = Helm(bridge.say, track, hint)
+    orders = Orders(config.console.control, helm)
+    record = None if config.record is None else config.record.folder
+    path = socket_path(config.map, record, config.console.listen)
+    publisher = Publisher(path, shown, orders, config.console.frames_hz)
+
+    def see(frame: Frame) -> None:
+        if publisher.is_watched:
+            shown.add_frame(frame)
+
+    def estimated(estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
+        shown.add_estimate(estimate, bundle)
+        if publisher.is_watched:
+            publisher.wake()
+
+    channels.frames.subscribe(see)
+    channels.estimates.subscribe(estimated)
+    channels.targets.subscribe(shown.add_target)
+    channels.gone.subscribe(shown.forget_target)
+    channels.events.subscribe(shown.add_event)
+    channels.texts.subscribe(lambda severity, text: shown.add_event(_level(severity), text))
+    return publisher
+
+
+def _search(making: BuildContext) -> PlaceSearch:
+    cache, channels, reach = (
+        making[MapStack].cache,
+        making.channels,
+        ReachableRegion(making[Bridge]),
+    )
+    channels.estimates.subscribe(reach.add_estimate)
+    channels.frames.subscribe(lambda _frame: reach.follow())
+    return PlaceSearch(
+        cache, making.config.localizer, making[AutopilotPose], channels.events.send, reach.region
+    )
+
+
+def _engine(making: BuildContext) -> DualThreadEngine:
+    channels = making.channels
+    engine = DualThreadEngine(
+        making[Localizer],
+        (channels.estimates.send,),
+        making[PriorSources].at,
+        making[PlaceSearch].search,
+    )
+    table, bridge = making.config.camera.zoom, making[Bridge]
+    if table is None:
+        channels.frames.subscribe(engine.submit)
+        return engine
+    zoomed = ZoomedFrames(
+        table, bridge.zoom_at, lambda text: bridge.say(_WARNING, f"PiLoT: {text}")
+    )
+    channels.frames.subscribe(zoomed.before(engine.submit))
+    channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))
+    return engine
+
+
+# In this order the parts are made and then started, and in the reverse order stopped and then
+# closed. What gives an estimate's age its last milliseconds, injection, is served first. A wrong
+# source and a port in use are found before the localizer, whose compilation takes its time; the
+# record is closed after all that could tell it something.
+COMPONENTS: tuple[Component[Any], ...] = (
+    Component("map", MapStack, _map, close=MapStack.close, ahead=True),
+    Component("installation", CameraExtrinsics, _extrinsics, depends=(MapStack,)),
+    Component(
+        "bridge", Bridge, _bridge, depends=(MapStack,), later=(PlaceSearch,),
+        start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
+        hand_over=Bridge.hand_over,
+    ),
+    Component("injection", FixInjection, _injection, depends=(Bridge, CameraExtrinsics)),
+    Component("map shift", MapOffsetEstimator, _map_shift, depends=(Bridge, FixInjection)),
+    Component(
+        "guardian", IntegrityMonitor, _integrity_monitor, depends=(Bridge, CameraExtrinsics, FixInjection),
+        start=IntegrityMonitor.start, stop=IntegrityMonitor.stop, close=IntegrityMonitor.close, hand_over=IntegrityMonitor.hand_over,
+        wanted=lambda config: config.integrity_monitor.enabled,
+    ),
+    Component(
+        "record", RecordKeeper, _record, depends=(MapStack, Bridge, IntegrityMonitor),
+        start=RecordKeeper.link,
+        close=RecordKeeper.close,
+    ),
+    Component(
+        "klv", KlvRelay, _klv, depends=(MapStack, Bridge), start=KlvRelay.start, stop=KlvRelay.stop,
+        wanted=lambda config: config.klv is not None,
+    ),
+    Component(
+        "frame times", FrameTimes, _frame_times, later=(TargetReporter,),
+        wanted=lambda config: config.targets.detections is not None,
+    ),
+    Component("source", FrameSource, _source, depends=(Bridge, KlvRelay, FrameTimes)),
+    Component(
+        "health", HealthMonitor, _health,
+        depends=(MapStack, Bridge, MapOffsetEstimator, RecordKeeper, FrameSource, IntegrityMonitor, FrameTimes),
+        later=(DualThreadEngine, AutopilotPose, TargetReporter, BoxDetector, PlaceSearch),
+        start=HealthMonitor.start, stop=HealthMonitor.stop,
+    ),
+    Component(
+        "targets", TargetReporter, _targets, depends=(MapStack, Bridge),
+        start=TargetReporter.start, stop=TargetReporter.stop,
+    ),
+    Component("clicks", ClickPolicy, _clicks, depends=(TargetReporter, Bridge)),
+    Component(
+        "detections", DetectionListener, _detections, depends=(FrameTimes,),
+        close=DetectionListener.close, wanted=lambda config: config.targets.detections is not None,
+    ),
+    Component(
+        "detector", BoxDetector, _detector, depends=(MapStack, TargetReporter, Bridge),
+        start=BoxDetector.start, stop=BoxDetector.stop,
+        wanted=lambda config: config.targets.detector is not None,
+    ),
+    Component("autopilot", AutopilotPose, _autopilot, depends=(Bridge, CameraExtrinsics)),
+    Component(
+        "last fix", FixMemory, _last_fix,
+        depends=(Bridge, CameraExtrinsics, IntegrityMonitor, AutopilotPose),
+        start=FixMemory.start, stop=FixMemory.stop, hand_over=FixMemory.hand_over,
+    ),
+    Component(
+        "priors", PriorSources,
+        lambda making: PriorSources(making[FixMemory].prior, making[AutopilotPose].prior),
+        depends=(FixMemory, AutopilotPose),
+    ),
+    Component(
+        "localizer", Localizer, _localizer, depends=(MapStack,), later=(AutopilotPose,), ahead=True
+    ),
+    Component(
+        "view", ViewReporter, _view, depends=(MapStack, Bridge),
+        start=ViewReporter.start, stop=ViewReporter.stop,
+        wanted=lambda config: config.bridge.camera.announce or config.bridge.targets.cot_aircraft,
+    ),
+    Component(
+        "vital signs", VitalSigns, _vital_signs, depends=(Bridge,),
+        start=VitalSigns.start, stop=VitalSigns.stop,
+        wanted=lambda config: config.bridge.named_values,
+    ),
+    Component(
+        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose, Bridge),
+        start=PlaceSearch.start, stop=PlaceSearch.stop, close=PlaceSearch.close,
+    ),
+    Component(
+        "console", Publisher, _console,
+        depends=(MapStack, Bridge, HealthMonitor, RecordKeeper, PlaceSearch),
+        start=Publisher.start, stop=Publisher.stop, close=Publisher.close,
+        wanted=lambda config: config.console is not None,
+    ),
+    Component(
+        "engine", DualThreadEngine, _engine,
+        depends=(Localizer, PriorSources, PlaceSearch, Bridge),
+        start=DualThreadEngine.start, stop=DualThreadEngine.stop,
+    ),
+    Component(
+        "feed", Feed, _feed, depends=(FrameSource,), start=Feed.start, stop=Feed.stop
+    ),
+)  # fmt: skip
+
+
+def _levels(
+    integrity_monitor: IntegrityMonitor | None, estimate: PoseEstimate
+) -> tuple[float, float] | None:
+    """The estimate's protection levels: injection, which is served before, had the monitor judge
+    it in this same call. What is not for injection was not judged.
+    """
+    level = None if integrity_monitor is None else integrity_monitor.level
+    if level is None or not is_for_injection(estimate):
+        return None
+    return level.horizontal_m, level.vertical_m
+
+
+def _level(severity: int) -> str:
+    return "warning" if severity <= _WARNING else "info"
+
+
+def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
+    """The vehicle keeps an origin until it is switched off: a wrong one must never be sent."""
+    if config.bridge.origin is not None:
+        finding = check_origin(config.bridge.origin, cache)
+        if not finding.ok:
+            raise ConfigError(f"bridge.origin: {finding.found} (needed {finding.needed})")
+
+
+def _bridge_config(config: CompanionConfig) -> BridgeConfig:
+    """The bridge announces the feed's real camera, and keeps its state beside the record."""
+    camera = config.camera.model.camera()
+    asked = config.bridge.camera.zoom_rate_hz or _ZOOM_RATE_HZ
+    announced = config.bridge.camera.model_copy(
+        update={
+            "width_px": camera.width,
+            "height_px": camera.height,
+            "horizontal_fov_deg": camera.horizontal_fov_deg,
+        }
+        | ({"zoom_rate_hz": asked} if config.camera.zoom is not None else {})
+    )
+    return config.bridge.model_copy(update={"camera": announced, "state_file": _state_file(config)})
+
+
+def _state_file(config: CompanionConfig) -> Path | None:
+    if config.bridge.state_file is not None or config.record is None:
+        return config.bridge.state_file
+    return config.record.folder.parent / "injection-gate.json"
+
+
+def _forbid_memory(config: CompanionConfig) -> InhibitMemory | None:
+    """Of this map and this camera: what was found of another says nothing."""
+    file = _state_file(config)
+    if file is None:
+        return None
+    cameras = [one.model_dump(mode="json") for one in (config.camera, config.bridge.camera)]
+    about = json.dumps([readable_map_hash(config.map), *cameras])  # escaped: paths may be no UTF-8
+    digest = hashlib.sha256(about.encode()).hexdigest()
+    return InhibitMemory(RestartMemory(file.with_name("guardian-forbids.json"), about=digest))

@@ -1,0 +1,151 @@
+"""The machinery of the table of parts: made and started in its order, undone in the reverse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from companion.config import CompanionConfig
+from companion.flight.channels import Channels
+
+T = TypeVar("T")
+
+
+def _always(_: CompanionConfig) -> bool:
+    return True
+
+
+@dataclass(frozen=True)
+class Component(Generic[T]):
+    """One line of the table. All parts are made before the first is started.
+
+    close and stop are called only for what was made and started. What a part needs is looked up by
+    its class in `BuildContext`, and nothing else is found there.
+    """
+
+    name: str
+    kind: type[T]
+    """What `make` gives, and what other parts name in their `depends`."""
+    make: Callable[[BuildContext], T]
+    depends: tuple[type, ...] = ()
+    """Parts above this one in the table that `make` uses."""
+    later: tuple[type, ...] = ()
+    """Other parts that it asks only once all are made, see `BuildContext.later`."""
+    start: Callable[[T], None] | None = None
+    stop: Callable[[T], None] | None = None
+    """Undoes `start`; waits for the part's threads."""
+    close: Callable[[T], None] | None = None
+    """Undoes `make`, where that opened something."""
+    hand_over: Callable[[T], None] | None = None
+    """Called before an end that is none in order: another process takes over what it remembers."""
+    wanted: Callable[[CompanionConfig], bool] = _always
+    """Whether this deployment has the part at all."""
+    ahead: bool = False
+    """Whether a standby makes it before it may fly; it needs only parts that are made so, too."""
+
+
+class BuildContext:
+    """What a part is made from: the settings, the channels, and the parts that it depends on."""
+
+    def __init__(self, part: Component[Any], assembly: Assembly) -> None:
+        self._part = part
+        self._assembly = assembly
+        self.config = assembly.config
+        self.channels = assembly.channels
+
+    def __getitem__(self, kind: type[T]) -> T:
+        """The part of that class."""
+        self._require_named(kind, self._part.depends)
+        return self._assembly[kind]
+
+    def get(self, kind: type[T]) -> T | None:
+        """The part of that class; None in a deployment without it."""
+        self._require_named(kind, self._part.depends)
+        return self._assembly.get(kind)
+
+    def later(self, kind: type[T]) -> Callable[[], T]:
+        """How to get a part that is not made yet, to be called after the start."""
+        self._require_named(kind, self._part.later)
+        return lambda: self._assembly[kind]
+
+    def if_abandoned(self, undo: Callable[[], None]) -> None:
+        """Have `undo` called if this start comes to nothing. It may be called at any moment from
+        now on, by a signal's handler too.
+        """
+        self._assembly.abandonments.append(undo)
+
+    def _require_named(self, kind: type, named: tuple[type, ...]) -> None:
+        if kind not in named:
+            raise LookupError(
+                f"part {self._part.name!r} uses {kind.__name__}, which its line in the table of "
+                "parts does not name"
+            )
+
+
+class Assembly:
+    """The parts of one process, by their class."""
+
+    def __init__(self, config: CompanionConfig, parts: Sequence[Component[Any]]) -> None:
+        _check_order(parts)
+        self.config = config
+        self.channels = Channels()
+        self.abandonments: list[Callable[[], None]] = []
+        self._parts = tuple(part for part in parts if part.wanted(config))
+        self._made: dict[type, Any] = {}
+
+    def __getitem__(self, kind: type[T]) -> T:
+        """A part that is made."""
+        found: T = self._made[kind]
+        return found
+
+    def get(self, kind: type[T]) -> T | None:
+        """A part, or None if it is not made."""
+        found: T | None = self._made.get(kind)
+        return found
+
+    def make(self, up: ExitStack, *, ahead: bool = False) -> None:
+        """Make every part that is not made yet; `up` closes them in the reverse order.
+
+        ahead: only what a standby makes.
+        """
+        for part in self._parts:
+            if part.kind in self._made or (ahead and not part.ahead):
+                continue
+            made = part.make(BuildContext(part, self))
+            self._made[part.kind] = made
+            if part.close is not None:
+                up.callback(part.close, made)
+
+    def hand_over(self) -> None:
+        """What follows is no end in order."""
+        for part in self._parts:
+            if part.hand_over is not None and part.kind in self._made:
+                part.hand_over(self._made[part.kind])
+
+    def forget(self) -> None:
+        """What was made is closed: it is made anew."""
+        self._made.clear()
+
+    def start(self, up: ExitStack) -> None:
+        """Start every part; `up` stops them in the reverse order."""
+        for part in self._parts:
+            made = self._made[part.kind]
+            if part.start is not None:
+                part.start(made)
+            if part.stop is not None:
+                up.callback(part.stop, made)
+
+
+def _check_order(parts: Sequence[Component[Any]]) -> None:
+    known: set[type] = set()
+    every = {part.kind for part in parts}
+    for part in parts:
+        missing = (set(part.depends) - known) | (set(part.later) - every)
+        if missing or part.kind in known:
+            names = ", ".join(sorted(kind.__name__ for kind in missing)) or part.kind.__name__
+            raise LookupError(
+                f"table of parts: {part.name!r} depends on {names}, in the wrong place or twice"
+            )
+        known.add(part.kind)

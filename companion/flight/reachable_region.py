@@ -1,0 +1,121 @@
+"""Where the camera can be since the map last said where it was.
+
+An EKF that has lost its position says nothing of the place, but the aircraft has not left the
+neighbourhood: it was seen seconds ago, moved as its IMU says, and no faster than it can. So a
+search need not begin with the whole map, where other ground looks like the frame's.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from companion.integrity_monitor.inertial import InertialDisplacement, InertialTrack
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import Array
+from localizer.relocalization.types import SearchRegion
+from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
+from mavlink_bridge.messages import Attitude, InertialSample, VehicleState
+
+# What the free integral of an IMU is off: the velocity at its beginning, and a bias of the
+# accelerometers with the attitude's error under it (0.4 degrees), growing with the tilt's drift.
+_SPEED_SIGMA_M_S = 0.5
+_ACCELERATION_SIGMA_M_S2 = 0.07
+_SIGMAS = 3.0
+_LEAST_M = 15.0  # candidates of the search are metres off themselves
+_GUST_M_S = 8.0  # by which a wind carries an aircraft that holds nothing, beyond its own speed
+
+
+class ReachTelemetry(Protocol):
+    """What is asked of the autopilot: the bridge."""
+
+    def state(self) -> VehicleState:
+        """What the vehicle says about itself."""
+        ...
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """Its attitude at a time."""
+        ...
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """What its IMU read after a time, oldest first."""
+        ...
+
+
+@dataclass(frozen=True)
+class _ConfirmedPosition:
+    """A confirmed place (2,), east and north, m, and the velocity (2,), m/s, there. begun: the
+    IMU's integral then, of its run number `run`; None until its record has reached it.
+    """
+
+    time_ns: int
+    place: Array
+    velocity: Array
+    begun: InertialDisplacement | None = None
+    run: int = 0
+
+
+class ReachableRegion:
+    """Estimates come on the localization thread and `follow` is called by the feed's, some times a
+    second; `region` is asked by the search's thread.
+    """
+
+    def __init__(self, vehicle: ReachTelemetry) -> None:
+        self._vehicle = vehicle
+        self._lock = threading.Lock()
+        self._track = InertialTrack()
+        self._seen: _ConfirmedPosition | None = None
+
+    def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
+        """Note a place that the map confirmed."""
+        if not estimate.accepted or estimate.state is not TrackingState.TRACKING:
+            return
+        velocity = self._vehicle.state().local_velocity_ned or (0.0, 0.0, 0.0)
+        place = estimate.world_from_camera.translation[:2].copy()
+        moving = (NED_FROM_ENU.T @ np.array(velocity))[:2]
+        with self._lock:
+            self._seen = _ConfirmedPosition(estimate.exposure_time_ns, place, moving)
+
+    def follow(self) -> None:
+        """Take in what the IMU read meanwhile; some ten samples."""
+        with self._lock:
+            self._follow()
+
+    def region(self, time_ns: int) -> SearchRegion | None:
+        """Where the camera is at a CLOCK_MONOTONIC time; None before it was ever seen."""
+        with self._lock:
+            self._follow()
+            seen, end, run = self._seen, self._track.at(self._track.newest_ns), self._track.restarts
+        if seen is None or time_ns < seen.time_ns:
+            return None
+        t = (time_ns - seen.time_ns) * 1e-9
+        speed = float(np.linalg.norm(seen.velocity))
+        farthest_m = _LEAST_M + (speed + _GUST_M_S) * t
+        way = _way(seen, end) if run == seen.run else None
+        sigma_m = _SPEED_SIGMA_M_S * t + 0.5 * _ACCELERATION_SIGMA_M_S2 * t * t
+        radius_m = _LEAST_M + _SIGMAS * sigma_m
+        # An integral that lies beyond what can be flown is a wrong one.
+        if way is None or radius_m > farthest_m or float(np.linalg.norm(way)) > farthest_m:
+            return SearchRegion.circle(seen.place, farthest_m)
+        return SearchRegion.circle(seen.place + way, radius_m)
+
+    def _follow(self) -> None:
+        for sample in self._vehicle.inertial_since(self._track.newest_ns):
+            self._track.add(sample, self._vehicle.attitude_at)
+        seen = self._seen
+        if seen is not None and seen.begun is None:
+            begun = self._track.at(seen.time_ns)
+            self._seen = replace(seen, begun=begun, run=self._track.restarts)
+
+
+def _way(seen: _ConfirmedPosition, end: InertialDisplacement | None) -> Array | None:
+    """East and north since then by the IMU, m; None where its record does not reach back."""
+    if seen.begun is None or end is None:
+        return None
+    t = (end.time_ns - seen.begun.time_ns) * 1e-9
+    moved = end.position - seen.begun.position - seen.begun.velocity * t
+    way: Array = moved[::-1] + seen.velocity * t
+    return way if np.isfinite(way).all() else None

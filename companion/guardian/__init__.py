@@ -1,1 +1,0 @@
-"""The guardian: an independent monitor with its own evidence and the last word before injection."""

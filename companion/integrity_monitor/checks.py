@@ -1,0 +1,415 @@
+"""All checks together: evidence in, findings out. No threads and no clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.calibration_watch.ground import GroundView
+from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
+from companion.calibration_watch.watch import CalibrationWatch
+from companion.integrity_monitor import alert_rules as f
+from companion.integrity_monitor.alert_rules import (
+    ActiveAlerts,
+    AlertDebouncer,
+    CheckResult,
+    OutputAction,
+)
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.ekf import EkfWatch
+from companion.integrity_monitor.inertial import InertialTrack
+from companion.integrity_monitor.jump import JumpCheck
+from companion.integrity_monitor.motion import MotionCheck, MotionVerdict
+from companion.integrity_monitor.position_checks import GnssCheck, HeightCheck
+from companion.integrity_monitor.protection import ProtectionLevel, protection_level
+from companion.integrity_monitor.step import StepUncertainty
+from companion.integrity_monitor.telemetry import (
+    ValidatedTelemetry,
+    VehicleTelemetry,
+    known_attitude,
+    known_state,
+    moving_now,
+)
+from companion.integrity_monitor.tilt import TiltCheck
+from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
+from localizer.types import Image
+from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
+
+_AIRBORNE_M = 3.0
+_IDENTICAL_S = 1.5
+_STILL_PER_M = 90.0  # s/m: how much longer where the limit is more metres on the ground
+_STILL_FIRST_S = 2.0
+_MOVED_M, _MOVED_SPEED_MPS, _MOVED_LEAST_S = 2.0, 1.5, 0.35
+_REPEATS_BEFORE_S = 1.5  # by which a loop may be older than its finding, beyond `repeat_s`
+_SHOWS_GRAY = 2.0  # contrast below which a picture shows nothing, gray levels of 255
+_WAITS_NS = 500_000_000  # for the IMU's record to reach a fix
+_FRESH_NS = 1_000_000_000
+_PICTURE_FRESH_NS = 2_000_000_000
+_CALM_SHARE = 0.5  # of a motion limit, below which vision agrees with the IMU
+_MOVES_S = 5.0  # a position that stood still for less moves
+_BACKWARDS = 5  # pictures or fixes in a row whose stamps do not advance
+_QUEUE = 256
+
+
+@dataclass(frozen=True)
+class IntegrityLimits:
+    """What stands in other parts of the configuration. gnss_is_ours: the receiver that the vehicle
+    reports is our own injection; horizontal_fov_deg: of the camera.
+    """
+
+    alert_limit_m: float = 10.0
+    time_to_alert_s: float = 3.0
+    gnss_is_ours: bool = False
+    horizontal_fov_deg: float = 60.0
+
+
+@dataclass(frozen=True)
+class OperatorLine:
+    """A line for the operator. bad: a finding began or lasts; else it is over."""
+
+    text: str
+    bad: bool
+    withholds: bool
+
+
+class IntegrityChecks:
+    """Every method is called under one lock, or from one thread.
+
+    Above 200 lines: each check has a few lines here that hand it its evidence and take its finding.
+    """
+
+    def __init__(self, config: IntegrityMonitorConfig, limits: IntegrityLimits) -> None:
+        self._config, self._limits = config, limits
+        self._pictures = FrozenVideoDetector(config.picture)
+        self._track = InertialTrack()
+        self._motion = MotionCheck(config.motion, self._track)
+        self._height = HeightCheck(config)
+        self._gnss = GnssCheck(config)
+        self._jumps = JumpCheck(config)
+        self._steps = StepUncertainty(config.unreported_jump_m)
+        self._tilt = TiltCheck(config)
+        self._ekf = EkfWatch()
+        self._calibration = CalibrationWatch(config.calibration)
+        self._ground = GroundView(limits.horizontal_fov_deg)
+        raise_s = min(f.LIMIT.raise_s, limits.time_to_alert_s)
+        changed = {
+            f.GNSS.name: replace(f.GNSS, repeat_s=config.gnss_repeat_s),
+            f.LIMIT.name: replace(f.LIMIT, raise_s=raise_s),
+        }
+        self._debouncers = {r.name: AlertDebouncer(changed.get(r.name, r)) for r in f.RULES}
+        self._picture: tuple[int, FrameVerdict] | None = None
+        self._verdict: MotionVerdict | None = None
+        self._height_reading = CheckResult(None)
+        self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self._newest: VisionFix | None = None
+        self._level: ProtectionLevel | None = None
+        self._jump_held = self._announced = False
+        self._reset_due = False
+        self._backwards = 0
+
+    # --- what there is ------------------------------------------------------------------------
+
+    @property
+    def action(self) -> OutputAction:
+        """The strongest action of all findings that stand."""
+        raised = (
+            debouncer.rule.action for debouncer in self._debouncers.values() if debouncer.raised
+        )
+        return max(raised, default=OutputAction.NONE)
+
+    @property
+    def reason(self) -> str:
+        """Why fixes are withheld, in words; empty while they are not."""
+        for debouncer in self._debouncers.values():
+            if debouncer.raised and debouncer.rule.action is self.action is not OutputAction.NONE:
+                return debouncer.line().removeprefix(f.PREFIX)
+        return ""
+
+    @property
+    def suppress_ekf_ok(self) -> str:
+        """Why the EKF's following must not be called good; empty where nothing speaks against."""
+        debouncer = self._debouncers[f.EKF_JUMPED.name]
+        return debouncer.line().removeprefix(f.PREFIX) if debouncer.raised else ""
+
+    @property
+    def inhibits(self) -> str:
+        """Why injection must not begin, in words; empty where nothing speaks against."""
+        for debouncer in self._debouncers.values():
+            if debouncer.raised and debouncer.rule.inhibits:
+                return debouncer.line().removeprefix(f.PREFIX)
+        return ""
+
+    def forbidding(self) -> ActiveAlerts:
+        """The findings that stand and forbid."""
+        standing = (debouncer for debouncer in self._debouncers.values() if debouncer.raised)
+        return {one.rule.name: (one.figure, one.word) for one in standing if one.rule.inhibits}
+
+    def restore(self, found: ActiveAlerts) -> None:
+        """What stood in a process before this one stands until evidence speaks against it."""
+        for name, (figure, word) in found.items():
+            self._debouncers[name].restore(figure, word)
+
+    @property
+    def level(self) -> ProtectionLevel | None:
+        """The newest fix's protection level."""
+        return self._level
+
+    def standing(self) -> dict[str, float]:
+        """The findings that stand, by name, with their figures."""
+        return {
+            name: debouncer.figure
+            for name, debouncer in self._debouncers.items()
+            if debouncer.raised
+        }
+
+    # --- evidence -----------------------------------------------------------------------------
+
+    def see(self, time_ns: int, image: Image) -> None:
+        """A picture (H, W, 3) uint8 at its exposure time."""
+        if self._picture is not None and time_ns <= self._picture[0]:
+            self._backwards += 1
+            return
+        self._backwards = 0
+        self._picture = (time_ns, self._pictures.add(time_ns, image))
+
+    def add_observation(self, sighting: CalibrationObservation) -> None:
+        """A registered picture, for what it says of the camera and of the ground."""
+        self._calibration.add(sighting)
+        self._ground.add(sighting)
+
+    def admit(
+        self,
+        fix: VisionFix,
+        state: VehicleState,
+        attitude: Attitude | None = None,
+        *,
+        held: bool = False,
+    ) -> VisionFix | None:
+        """The fix, if it may be injected; with a reset where the last ones were wrong.
+
+        attitude: the autopilot's at the fix's time, None where it is not known; withheld: another
+        has a reason against it, and a reset stays due.
+        """
+        state, attitude = known_state(state), known_attitude(attitude)
+        self._tilt.add(fix, attitude)
+        verdict = self._verdict
+        agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
+        admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
+        self._doubt_steps(fix, state, admitted=admitted)
+        height_m = self._ground.height_m(state, fix.time_ns)
+        known_m = self._known_m(state, height_m)
+        moving = moving_now(state, fix.time_ns)
+        self._level = level = protection_level(
+            fix, moving, self._config.protection, known_m, height_m
+        )
+        fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
+        self._jump_held = not admitted
+        # The jump has a line of its own; how the place moves after it is judged anew. An announced
+        # one is announced with each fix until one has passed: it began with the first.
+        leaps = self._jumps.leaps or (fix.reset and not self._announced)
+        self._announced = fix.reset
+        self._waiting.append(replace(fix, reset=leaps))
+        self._newest = fix
+        if self.action >= OutputAction.HOLD or not admitted:
+            self._reset_due = (
+                self._reset_due or self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
+            )
+            return None
+        if held:
+            return None
+        resets, self._reset_due = self._reset_due or fix.reset, False
+        # The EKF must not believe what is known to be off to what noise alone would leave. The
+        # checks above keep the noise: what they look for is what it does not explain.
+        covariance = fix.position_covariance_ned + known_m**2 * np.eye(3)
+        return replace(fix, reset=resets, position_covariance_ned=covariance)
+
+    def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[OperatorLine]:
+        """Look at everything, a few times a second; the lines to be told."""
+        vehicle = ValidatedTelemetry(vehicle)
+        state = vehicle.state()
+        for sample in vehicle.inertial_since(self._track.newest_ns):
+            self._track.add(sample, vehicle.attitude_at)
+        self._jumps.hear(state)
+        self._follow(now_ns, state)
+        self._leave_out_old_pictures()
+        self._calibration.step(now_ns, vehicle, self._track)
+        lines = []
+        readings = self._readings(now_ns, moving_now(state, now_ns))
+        for name, debouncer in self._debouncers.items():
+            text = debouncer.update(now_ns, readings[name])
+            if text is not None:
+                withholds = debouncer.rule.action is not OutputAction.NONE
+                lines.append(OperatorLine(text, debouncer.raised, withholds))
+        return lines
+
+    def _doubt_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
+        """What the newest fix, or the stamps since, leave in doubt of the positions."""
+        if not state.armed:
+            self._steps.begins_anew()
+        elif fix.reset and admitted:
+            self._steps.is_found_anew()
+        elif self._jumps.step is not None:
+            found = self._steps.add(self._jumps.step)
+            if found is not None:
+                self._calibration.doubt_stamps(found.time_ns)
+        no_delay_s = max(self._config.calibration.time_s, 0.5 * self._steps.delay_s)
+        if self._calibration.figures().late_s.is_within(no_delay_s):
+            self._steps.stamps_are_right()
+
+    def _leave_out_old_pictures(self) -> None:
+        """A picture that stands still or comes again shows no camera: its sightings agree with no
+        motion, which looks like late stamps (a frozen hover was blamed on them, ArduPilot).
+        """
+        if self._picture is None:
+            return
+        time_ns, verdict = self._picture
+        if verdict.repeat_lag_s > 0.0 or self._debouncers[f.VIDEO_REPEATS.name].raised:
+            found_s = self._config.picture.repeat_s + _REPEATS_BEFORE_S
+            self._calibration.distrust(time_ns - int(found_s * 1e9))
+        elif verdict.still_s >= _IDENTICAL_S or self._debouncers[f.VIDEO_FROZEN.name].raised:
+            self._calibration.distrust(time_ns - int(verdict.still_s * 1e9))
+
+    def _follow(self, now_ns: int, state: VehicleState) -> None:
+        """Fixes whose time the IMU's record has reached, in order."""
+        while self._waiting:
+            fix = self._waiting[0]
+            if not self._motion.ready(fix) and now_ns - fix.time_ns < _WAITS_NS:
+                return
+            self._waiting.popleft()
+            self._verdict = self._motion.add(fix)
+            self._height_reading = self._height.add(fix, state)
+
+    # --- judgement ----------------------------------------------------------------------------
+
+    def _readings(self, now_ns: int, state: VehicleState) -> dict[str, CheckResult]:
+        newest = self._newest
+        fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
+        height = state.altitude_relative_m
+        # Below take-off it flies, too: it began on a hill.
+        flies = state.armed and (height is None or abs(height) >= _AIRBORNE_M)
+        none = CheckResult(None)
+        checks: dict[str, Callable[[], CheckResult]] = {
+            f.VIDEO_FROZEN.name: lambda: (
+                self._frozen(now_ns, state) if flies else CheckResult(False)
+            ),
+            f.VIDEO_REPEATS.name: lambda: self._repeats(now_ns) if flies else CheckResult(False),
+            f.MOTION.name: lambda: self._moves_otherwise() if fresh else none,
+            f.HEIGHT.name: lambda: self._height_reading if fresh else none,
+            f.JUMP.name: lambda: CheckResult(self._jump_held, self._jumps.distance_m),
+            f.STEP.name: lambda: CheckResult(self._steps.metres > 0.0, self._steps.metres),
+            f.TILT.name: lambda: self._tilts() if fresh else none,
+            f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
+            f.EKF_REFUSES.name: lambda: self._ekf.refuses(state) if fresh else CheckResult(False),
+            f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
+            f.CLOCK.name: lambda: CheckResult(self._backwards >= _BACKWARDS),
+            f.LIMIT.name: lambda: self._beyond_limit() if fresh else none,
+            **self._calibration_checks(),
+        }
+        return {name: check() for name, check in checks.items()}
+
+    def _calibration_checks(self) -> dict[str, Callable[[], CheckResult]]:
+        limits, known = self._config.calibration, self._calibration.figures()
+        share, late = known.focal, known.late_s
+        long = "long" if share.value > 0.0 else "short"
+        when = "late" if late.value > 0.0 else "early"
+        return {
+            f.FOCAL.name: lambda: _beyond(share, limits.focal_share, 100.0, long),
+            f.BORESIGHT.name: lambda: _beyond(
+                known.boresight_deg, limits.boresight_deg, 1.0, known.axis
+            ),
+            f.TIME_OFFSET.name: lambda: _beyond(late, limits.time_s, 1e3, when),
+        }
+
+    def _known_m(self, state: VehicleState, height_m: float | None) -> float:
+        """By how much a fix is wrong for what was found of calibration and tilt, metres."""
+        speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
+        focal, late = (
+            self._debouncers[f.FOCAL.name].raised,
+            self._debouncers[f.TIME_OFFSET.name].raised,
+        )
+        focal_m = self._calibration.known_m(speed, focal=focal, time=False)
+        late_m = self._calibration.known_m(speed, focal=False, time=late)
+        # Late stamps are how a step is explained, and a tilt shifts as a step does.
+        return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(height_m))
+
+    def _frozen(self, now_ns: int, state: VehicleState) -> CheckResult:
+        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+            return CheckResult(None)  # a feed that ended is told as such
+        verdict = self._picture[1]
+        if verdict.contrast < _SHOWS_GRAY:
+            return CheckResult(
+                False
+            )  # fog, a covered lens: the localizer says that it sees nothing
+        identical = verdict.identical_s >= _IDENTICAL_S
+        still = verdict.still_s >= self._still_s(now_ns, state)
+        still = still or self._should_have_moved(state, verdict)
+        return CheckResult(identical or still, verdict.still_s)
+
+    @staticmethod
+    def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
+        """Whether the EKF flew metres while the picture stood still; a hover is too slow to tell.
+
+        The EKF still has its speed then: it takes a second or two to follow a frozen position.
+        """
+        if state.local_velocity_ned is None or verdict.still_s < _MOVED_LEAST_S:
+            return False
+        speed = math.hypot(*state.local_velocity_ned[:2])
+        return speed >= _MOVED_SPEED_MPS and speed * verdict.still_s >= _MOVED_M
+
+    def _still_s(self, now_ns: int, state: VehicleState) -> float:
+        """How long a hover may look still: the limit in the picture is metres on the ground."""
+        ground_m = self._config.picture.still_share * self._ground.width_m(state, now_ns)
+        return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)
+
+    def _repeats(self, now_ns: int) -> CheckResult:
+        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+            return CheckResult(None)
+        lag_s = self._picture[1].repeat_lag_s
+        return CheckResult(lag_s > 0.0, lag_s)
+
+    def _moves_otherwise(self) -> CheckResult:
+        verdict = self._verdict
+        if verdict is None or not verdict.settled:
+            return CheckResult(None)
+        if not self._debouncers[f.MOTION.name].raised:
+            return CheckResult(verdict.share > 1.0, verdict.deviation_m)
+        # A filter follows even a frozen position in the end: it must move before it is believed.
+        calm = verdict.share < _CALM_SHARE and verdict.still_s < _MOVES_S
+        return CheckResult(not calm, verdict.deviation_m)
+
+    def _against_gnss(self, state: VehicleState, now_ns: int) -> CheckResult:
+        if self._newest is None or self._level is None or self._limits.gnss_is_ours:
+            return CheckResult(None)
+        return self._gnss.read(self._newest, state, self._level.horizontal_m, now_ns)
+
+    def _tilts(self) -> CheckResult:
+        return CheckResult(self._tilt.tilts if self._tilt.is_known else None, self._tilt.off_deg)
+
+    def _ekf_jump(self, state: VehicleState, now_ns: int) -> CheckResult:
+        verdict = self._verdict
+        agrees = (
+            verdict is not None
+            and verdict.settled
+            and verdict.share < _CALM_SHARE
+            and verdict.still_s < _MOVES_S
+            and self.action is OutputAction.NONE
+        )
+        return self._ekf.jumped(state, now_ns, agrees=agrees)
+
+    def _beyond_limit(self) -> CheckResult:
+        if self._level is None:
+            return CheckResult(None)
+        level_m = self._level.horizontal_m
+        return CheckResult(level_m > self._limits.alert_limit_m, level_m)
+
+
+def _beyond(figure: CalibrationEstimate, limit: float, scale: float, word: str) -> CheckResult:
+    """Beyond its limit for sure, surely not, or not known."""
+    bad = figure.exceeds(limit)
+    if not bad and not figure.is_within(limit):
+        return CheckResult(None)
+    return CheckResult(bad, abs(figure.value) * scale, word)

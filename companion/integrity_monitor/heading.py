@@ -1,0 +1,96 @@
+"""Vision's heading against the gyros': a place whose frame turned is not where the aircraft is.
+
+A frame turned by 5 degrees about home puts a hover at 120 m 10 m aside. From then on it moves as
+the IMU does, so its motion never speaks against it; the turn does, against gyros and autopilot.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from dataclasses import dataclass
+
+from mavlink_bridge.messages import Attitude, VisionFix
+from mavlink_bridge.quaternion import wrap_pi
+
+_SPAN_NS = 1_000_000_000  # over which the heading is the median
+_LEAST = 3
+_SIGMAS = 4.0
+# What honest vision turned against the better of gyros and autopilot, medians of a second each: 0.6
+# degrees at most from one to the next, 1.5 over 5 s, 2.6 over 10 s (24 recorded flights).
+_OFF_RAD = math.radians(1.0)
+_DRIFT_RADPS = math.radians(0.25)
+_KEPT = 64
+
+
+@dataclass(frozen=True)
+class HeadingChange:
+    """Of one fix: vision's heading less the gyros' and less the autopilot's, rad."""
+
+    time_ns: int
+    against_gyros: float
+    against_autopilot: float
+    sigma: float
+
+
+def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
+    """None where one of the two headings is not known."""
+    if attitude is None or fix.yaw_rad is None:
+        return None
+    return HeadingChange(
+        fix.time_ns,
+        wrap_pi(fix.yaw_rad - attitude.gyro_heading_rad),
+        wrap_pi(fix.yaw_rad - attitude.yaw_rad),
+        fix.attitude_sigma_rad,
+    )
+
+
+class HeadingHistory:
+    """Of some fixes in the order of their times, the newest."""
+
+    def __init__(self) -> None:
+        self._turns: deque[HeadingChange] = deque(maxlen=_KEPT)
+
+    def add(self, turn: HeadingChange | None) -> None:
+        """Of another fix; one without a heading says nothing."""
+        if turn is not None:
+            self._turns.append(turn)
+
+    def apart(self, turn: HeadingChange) -> float:
+        """How far a fix is turned against the median of these, rad; 0 where too few have a heading.
+
+        The gyros' heading suffers where ATTITUDE was lost in a turn, and the autopilot's own may
+        step: only what both contradict is a turn.
+        """
+        newest = self._newest()
+        if len(newest) < _LEAST:
+            return 0.0
+        return min(
+            abs(_median([wrap_pi(turn.against_gyros - one.against_gyros) for one in newest])),
+            abs(
+                _median([wrap_pi(turn.against_autopilot - one.against_autopilot) for one in newest])
+            ),
+        )
+
+    def contradict(self, turn: HeadingChange) -> bool:
+        """Whether a fix is turned by more than noise and gyros explain."""
+        if not self._turns:
+            return False
+        newest = self._turns[-1]
+        # Errors of vision are alike within a second: a median has the sigma of one.
+        noise = _SIGMAS * math.hypot(newest.sigma, turn.sigma)
+        drift = _DRIFT_RADPS * (turn.time_ns - newest.time_ns) * 1e-9
+        return self.apart(turn) > _OFF_RAD + noise + drift
+
+    def _newest(self) -> list[HeadingChange]:
+        """Of the last second, and three at least where fixes are rarer."""
+        turns = list(self._turns)
+        since_ns = turns[-1].time_ns - _SPAN_NS if turns else 0
+        within = sum(turn.time_ns > since_ns for turn in turns)
+        return turns[-max(within, _LEAST) :]
+
+
+def _median(angles: list[float]) -> float:
+    """Of angles about the first one, for they wrap."""
+    return wrap_pi(angles[0] + statistics.median(wrap_pi(a - angles[0]) for a in angles))

@@ -1,0 +1,234 @@
+"""The monitor's thread, and its last word on every fix."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from companion.calibration_watch.observation import CalibrationObservation
+from companion.integrity_monitor.alert_rules import (
+    FAILED,
+    PREFIX,
+    STANDS,
+    AlertDebouncer,
+    CheckResult,
+    InhibitMemory,
+)
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.protection import ProtectionLevel
+from localizer.types import Image
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.link.clock import monotonic_ns
+from mavlink_bridge.messages import VisionFix
+
+_log = logging.getLogger(__name__)
+_PERIOD_S = 0.1
+_BLIND_TURNS = 10  # that failed in a row
+_STANDS_NS = 2_000_000_000  # since its last turn: its thread hangs, or is gone
+_PART_STANDS_NS = 4_000_000_000  # of another part, as the supervisor has it
+_LOCK_S = 1.0  # a turn takes a twentieth of it
+_ERROR, _WARNING, _NOTICE = 3, 4, 5  # MAV_SEVERITY
+
+
+class IntegrityMonitor:
+    """Watches pictures, fixes and the vehicle, tells the operator, and withholds fixes.
+
+    Pictures come from the feed's thread and fixes from the localization thread; neither waits for
+    more than the lock. What is costly happens on a thread of its own, ten times a second.
+
+    What cannot be judged is withheld: a position that nobody watches is believed unwarned. A fix
+    that fails it costs itself; a thread that fails for a second, or takes no turn for two, costs
+    all until it turns again. Then those who ask tell it: its own thread cannot.
+    """
+
+    def __init__(
+        self,
+        config: IntegrityMonitorConfig,
+        limits: IntegrityLimits,
+        bridge: Bridge,
+        memory: InhibitMemory | None = None,
+    ) -> None:
+        self._monitor, self._memory = IntegrityChecks(config, limits), memory
+        self._bridge = bridge
+        self._lock = threading.Lock()
+        self._picture: tuple[int, Image] | None = None
+        self._failed, self._stands = AlertDebouncer(FAILED), AlertDebouncer(STANDS)
+        self._turns: Callable[[], Mapping[str, int]] = dict
+        self._fails: dict[str, int] = {}  # how often in a row, by what is failing
+        self._failures = threading.Lock()
+        self.last_tick_ns = monotonic_ns()
+        """When its thread began its newest turn, CLOCK_MONOTONIC."""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="guardian", daemon=True)
+
+    def start(self) -> None:
+        """Start watching, with what forbade in a process that was killed."""
+        if self._memory is not None:
+            self._monitor.restore(self._memory.recall())
+            self._bridge.inhibit(self._monitor.inhibits)
+        self.last_tick_ns = monotonic_ns()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop watching. A thread that hangs is left behind."""
+        self._stop.set()
+        self._thread.join(2.0 * _LOCK_S)
+
+    def close(self) -> None:
+        """An orderly end: nothing is remembered."""
+        if self._memory is not None:
+            self._memory.stop()
+
+    def hand_over(self) -> None:
+        """What follows is no end in order: what is remembered stays so."""
+        if self._memory is not None:
+            self._memory.stop(clean_shutdown=False)
+
+    def watch(self, last_ticks_ns: Callable[[], Mapping[str, int]]) -> None:
+        """Tell of parts that stand. turns: when each began its newest turn, CLOCK_MONOTONIC ns."""
+        self._turns = last_ticks_ns
+
+    def see(self, time_ns: int, image: Image) -> None:
+        """Offer a picture; the newest is looked at. Never blocks."""
+        self._picture = (time_ns, image)
+
+    def add_observation(self, sighting: CalibrationObservation) -> None:
+        """Offer a registered picture, as evidence of the calibration and of the ground."""
+        with self._asked() as answers:
+            if answers:
+                self._monitor.add_observation(sighting)
+
+    def judge(self, fix: VisionFix) -> VisionFix | None:
+        """The fix as it may be injected; None withholds it."""
+        try:
+            if self._hangs():
+                return None
+            state, attitude = self._bridge.state(), self._bridge.attitude_at(fix.time_ns)
+            with self._asked() as answers:
+                if not answers:
+                    return None
+                blind = self._is_blind
+                admitted = self._monitor.admit(fix, state, attitude, held=blind)
+        except Exception:
+            self._fail("judging")
+            return None
+        self._works("judging")
+        return admitted
+
+    def submit(self, fix: VisionFix) -> None:
+        """Judge a fix and hand it to the bridge, if it may be injected."""
+        admitted = self.judge(fix)
+        if admitted is not None:
+            self._bridge.submit(admitted)
+
+    @property
+    def reason(self) -> str:
+        """Why fixes are withheld; empty while they are not."""
+        if self._hangs() or self._failed.raised:
+            return FAILED.line(0.0).removeprefix(PREFIX)
+        with self._asked() as answers:
+            return self._monitor.reason if answers else ""
+
+    @property
+    def level(self) -> ProtectionLevel | None:
+        """The newest fix's protection level."""
+        with self._asked() as answers:
+            return self._monitor.level if answers else None
+
+    def standing(self) -> dict[str, float]:
+        """The findings that stand, by name, with their figures."""
+        with self._asked() as answers:
+            return self._monitor.standing() if answers else {}
+
+    @contextmanager
+    def _asked(self) -> Iterator[bool]:
+        """The monitor's lock; False where it is not given: who asks must not hang, too."""
+        given = not self._hangs() and self._lock.acquire(timeout=_LOCK_S)
+        try:
+            yield given
+        finally:
+            if given:
+                self._lock.release()
+
+    def _hangs(self) -> bool:
+        """Whether its thread stands; told by whoever asks."""
+        now_ns = monotonic_ns()
+        if now_ns - self.last_tick_ns < _STANDS_NS:
+            return False
+        self._fail("taking turns")
+        self._tell_failure(now_ns)
+        return True
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            self.turn()
+
+    def turn(self) -> None:
+        """Look at everything once; ten times a second by its thread."""
+        self.last_tick_ns = monotonic_ns()
+        self._works("taking turns")
+        picture, self._picture = self._picture, None
+        looks = picture is not None  # a turn without one is no word that pictures can be looked at
+        try:
+            self._step(picture)
+        except Exception:
+            self._fail("looking" if looks else "watching")
+        else:
+            self._works("watching")
+            if looks:
+                self._works("looking")
+        self._tell_failure(self.last_tick_ns)
+        self._tell_what_stands(self.last_tick_ns)
+
+    def _tell_failure(self, now_ns: int) -> None:
+        with self._failures:
+            text = self._failed.update(now_ns, CheckResult(bool(self._fails)))
+        if text is not None:
+            self._bridge.say(_ERROR if self._failed.raised else _NOTICE, text)
+
+    def _tell_what_stands(self, now_ns: int) -> None:
+        """Another part that takes no turns tells nothing any more: its last word would stand."""
+        last_ticks_ns = self._turns()
+        name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
+        age_ns = now_ns - last_ticks_ns.get(name, now_ns)
+        text = self._stands.update(
+            now_ns, CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, name)
+        )
+        if text is not None:
+            self._bridge.say(_WARNING if self._stands.raised else _NOTICE, text)
+
+    @property
+    def _is_blind(self) -> bool:
+        with self._failures:
+            return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_TURNS
+
+    def _fail(self, what: str) -> None:
+        """A monitor that died in silence would be believed: told with its next turn."""
+        with self._failures:
+            count = self._fails[what] = self._fails.get(what, 0) + 1
+        if count == 1:
+            _log.error("the guardian failed %s", what, exc_info=sys.exc_info()[0] is not None)
+
+    def _works(self, what: str) -> None:
+        with self._failures:
+            self._fails.pop(what, None)
+
+    def _step(self, picture: tuple[int, Image] | None) -> None:
+        with self._lock:
+            if picture is not None:
+                self._monitor.see(*picture)
+            lines = self._monitor.step(monotonic_ns(), self._bridge)
+            suppress_ekf_ok, inhibits = self._monitor.suppress_ekf_ok, self._monitor.inhibits
+            found = self._monitor.forbidding()
+        self._bridge.suppress_ekf_ok(suppress_ekf_ok)
+        self._bridge.inhibit(inhibits)
+        if self._memory is not None:
+            # What flies is not taken back, by a restart no more than by the finding.
+            self._memory.note({} if self._bridge.injecting else found)
+        for line in lines:
+            severity = _ERROR if line.withholds else _WARNING
+            self._bridge.say(severity if line.bad else _NOTICE, line.text)

@@ -1,0 +1,275 @@
+"""A position that no flight explains: held until it proves itself, or the right one is back."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.heading import HeadingChange, HeadingHistory, turn_of
+from companion.integrity_monitor.position_checks import LocalPlace
+from companion.integrity_monitor.step import PositionStep
+from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
+
+_SIGMAS = 4.0
+_DRIFT_MPS2 = 0.2  # what a velocity carried on may be wrong by, as an acceleration
+_SPEED_MPS = 1.0  # and of its speed
+_FASTEST_MPS = 30.0
+_GAP_S = 1.0
+# What the EKF's velocity is off by without positions, one sigma. 5 s without them moved ArduPilot
+# and the embedded vehicle by 1.0 m in the mean, 1.8 at most (64 flights of dropout-5s).
+_RECKONED_MPS = 0.12
+_RECKONED_MPS2 = 0.04
+_RECKONS_S = 10.0  # afterwards an EKF without positions gives up: no evidence any more
+_HEADING_S = 60.0  # for which the gyros know the heading, as the yaw guard has it
+_TURNED_FIXES = 3  # in a row
+_CALM_FIXES = 5  # to which it led in a row: after a gap it is off by 10 m/s and more
+_KEPT = 600
+
+Metres = tuple[float, float]
+
+
+class EkfDisplacement:
+    """The way over ground by the EKF's velocity (LOCAL_POSITION_NED, 32)."""
+
+    def __init__(self) -> None:
+        self._way: deque[tuple[int, Metres, Metres]] = deque(maxlen=_KEPT)  # time, velocity, way
+
+    def add(self, state: VehicleState) -> None:
+        """The newest velocity; after a hole in them, or of the clock, the way begins anew."""
+        if state.local_velocity_ned is None:
+            return
+        north, east, _ = state.local_velocity_ned
+        way = (0.0, 0.0)
+        if self._way:
+            time_ns, before, at = self._way[-1]
+            dt = (state.local_time_ns - time_ns) * 1e-9
+            if -_GAP_S < dt <= 0.0:
+                return
+            if 0.0 < dt <= _GAP_S:
+                half = 0.5 * dt
+                way = (at[0] + half * (before[0] + north), at[1] + half * (before[1] + east))
+            else:
+                self._way.clear()
+        self._way.append((state.local_time_ns, (north, east), way))
+
+    def moved(self, from_ns: int, to_ns: int) -> Metres | None:
+        """North and east from one time to another, metres; None where it is not known."""
+        a, b = self._at(from_ns), self._at(to_ns)
+        return None if a is None or b is None else (b[0] - a[0], b[1] - a[1])
+
+    def _at(self, time_ns: int) -> Metres | None:
+        """The way at a time: between two velocities, or up to a second beyond the record."""
+        if not self._way:
+            return None
+        k = min(bisect_left(self._way, time_ns, key=lambda one: one[0]), len(self._way) - 1)
+        known_ns, (north, east), (way_north, way_east) = self._way[k]
+        dt = (time_ns - known_ns) * 1e-9
+        if abs(dt) > _GAP_S:
+            return None
+        if dt < 0.0 and k > 0:  # the mean velocity of the interval's end
+            before_ns, before, _ = self._way[k - 1]
+            share = 0.5 * (known_ns - time_ns) / (known_ns - before_ns)
+            north, east = north + share * (before[0] - north), east + share * (before[1] - east)
+        return way_north + north * dt, way_east + east * dt
+
+
+@dataclass(frozen=True)
+class _Passed:
+    fix: VisionFix
+    velocity: Metres
+
+
+class _Held:
+    """The fixes that are held, as long as one follows the other."""
+
+    def __init__(self, first: VisionFix) -> None:
+        self.first = self.newest = first
+        self.contradicted = False
+        """It moved as the EKF's velocity does not."""
+        self.headings = HeadingHistory()
+        self.turned = False
+        """Its frame turned against that of the last ones that passed."""
+        self._turned_in_a_row = 0
+
+    @property
+    def seconds(self) -> float:
+        return (self.newest.time_ns - self.first.time_ns) * 1e-9
+
+    def add_heading(self, turn: HeadingChange | None, *, is_turned: bool) -> None:
+        """Of the newest. is_turned: against those that passed."""
+        self.headings.add(turn)
+        if turn is not None:
+            self._turned_in_a_row = self._turned_in_a_row + 1 if is_turned else 0
+        self.turned = self.turned or self._turned_in_a_row >= _TURNED_FIXES
+
+
+class JumpCheck:
+    """A position that is farther from the last than any flight explains is held for a while.
+
+    Meanwhile the last one that passed is carried on by the EKF's velocity, which the held ones do
+    not reach. A fix that comes to where it leads passes at once. What moves otherwise, or whose
+    heading turned as neither gyros nor autopilot did, is not taken by waiting.
+    """
+
+    def __init__(self, config: IntegrityMonitorConfig) -> None:
+        self._config = config
+        self._place = LocalPlace()
+        self._reckoning = EkfDisplacement()
+        self._passed: _Passed | None = None
+        self._held: _Held | None = None
+        self._headings = HeadingHistory()  # of what passed
+        self._led = 0  # fixes in a row, up to the last that passed, to which the EKF's velocity led
+        self.distance_m = 0.0
+        self.step: PositionStep | None = None
+        """Of the newest fix, if it passed: how far from where the one before led."""
+        self.leaps = False
+        """Whether the newest fix is at another place than the one before: how it moves is judged
+        anew from here on.
+        """
+
+    def hear(self, state: VehicleState) -> None:
+        """The vehicle's state, a few times a second whether fixes come or not."""
+        self._reckoning.add(state)
+
+    def admit(
+        self,
+        fix: VisionFix,
+        state: VehicleState,
+        attitude: Attitude | None = None,
+        *,
+        agrees: bool,
+    ) -> bool:
+        """Whether the fix may pass. attitude: the autopilot's at the fix's time; agrees: vision
+        moves as the IMU does, or nobody knows.
+        """
+        self._reckoning.add(state)
+        was_held = self._held
+        passes = self._passes(fix, state, attitude, agrees=agrees)
+        self.leaps = self._held is not was_held
+        return passes
+
+    def _passes(
+        self, fix: VisionFix, state: VehicleState, attitude: Attitude | None, *, agrees: bool
+    ) -> bool:
+        self.step = None
+        turn = turn_of(fix, attitude)
+        is_turned = turn is not None and self._is_turned(turn)
+        step = None if self._passed is None else self._leap(self._passed, fix)
+        jump_m = 0.0 if step is None else math.hypot(*step.offset_m) - step.allowed_m
+        if step is not None and is_turned:
+            jump_m += step.growth_m  # nor does time explain it
+        announced = fix.reset and not is_turned
+        if jump_m <= (self._config.jump_m if announced else self._config.unreported_jump_m):
+            self.step = step
+            self._led = self._led + 1 if step is not None and step.is_led else 0
+            self._pass(fix, state)
+            self._headings.add(turn)
+            return True
+        self.distance_m = jump_m
+        held = self._hold(fix)
+        held.add_heading(turn, is_turned=is_turned)
+        speaks_against = held.contradicted or (held.turned and is_turned)
+        if agrees and not speaks_against and held.seconds >= self._config.jump_hold_s:
+            self._led = 0
+            self._pass(fix, state)
+            self._headings = held.headings
+            return True
+        return False
+
+    def _pass(self, fix: VisionFix, state: VehicleState) -> None:
+        north, east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
+        self._passed, self._held = _Passed(fix, (north, east)), None
+
+    def _is_turned(self, turn: HeadingChange) -> bool:
+        """Whether a fix's frame turned against that of the last ones that passed.
+
+        What gyros may have drifted grows: once a frame was seen to be turned, a fix is of the one
+        whose heading is nearer.
+        """
+        if self._passed is None or turn.time_ns - self._passed.fix.time_ns > _HEADING_S * 1e9:
+            return False
+        held = self._held
+        if held is not None and held.turned:
+            return held.headings.apart(turn) < self._headings.apart(turn)
+        return self._headings.contradict(turn)
+
+    def _hold(self, fix: VisionFix) -> _Held:
+        """The fixes held by now, with this one; one that does not follow them begins anew."""
+        held = self._held
+        if held is None or not self._follows(held.newest, fix):
+            held = self._held = _Held(fix)
+        held.newest = fix
+        since_s = 0.0 if self._passed is None else _seconds(self._passed.fix, fix)
+        held.contradicted = since_s <= _RECKONS_S and (
+            held.contradicted or self._moves_otherwise(held, since_s)
+        )
+        return held
+
+    def _moves_otherwise(self, held: _Held, since_s: float) -> bool:
+        """Whether what is held moved as the EKF's velocity does not: a turned frame on the way."""
+        led = self._reckoned(held.first, held.newest)
+        if led is None:
+            return False
+        apart_m = math.hypot(*self._off(held.first, led, held.newest))
+        return apart_m > _SIGMAS * math.hypot(
+            _sigmas(held.first, held.newest), _reckoned_m(since_s)
+        )
+
+    def _leap(self, last: _Passed, fix: VisionFix) -> PositionStep:
+        """How far the fix is from where the last one leads, and how far it may be."""
+        dt = max(_seconds(last.fix, fix), 0.0)
+        sigma = _SIGMAS * _sigmas(last.fix, fix)
+        # While another is held, to let the allowance grow would let it pass by waiting (5 degrees
+        # of a turned frame, 10 m at 120 m from home: after 3.8 s), and hold the right one behind.
+        led = self._reckoned(last.fix, fix) if self._held is not None else None
+        if led is not None:
+            allowed = math.hypot(sigma, _SIGMAS * _reckoned_m(dt))
+        else:
+            led = (last.velocity[0] * dt, last.velocity[1] * dt)
+            allowed = sigma + _SPEED_MPS * dt + 0.5 * _DRIFT_MPS2 * dt * dt
+            if dt > _GAP_S and self._held is None:  # the way may have turned
+                allowed += math.hypot(*led)
+        off = self._off(last.fix, led, fix)
+        return PositionStep(
+            fix.time_ns, off, last.velocity, _sigma(fix), allowed, allowed - sigma, dt
+        )
+
+    def _reckoned(self, last: VisionFix, fix: VisionFix) -> Metres | None:
+        """Where the EKF's velocity leads; None where it did not lead rightly before."""
+        return (
+            self._reckoning.moved(last.time_ns, fix.time_ns) if self._led >= _CALM_FIXES else None
+        )
+
+    def _off(self, last: VisionFix, led: Metres, fix: VisionFix) -> Metres:
+        """From where a fix leads to another, metres."""
+        there, here = self._place.ned(last), self._place.ned(fix)
+        return here[0] - there[0] - led[0], here[1] - there[1] - led[1]
+
+    def _follows(self, held: VisionFix, fix: VisionFix) -> bool:
+        """Whether the fix follows the held one as an aircraft flies: the EKF may know no speed."""
+        apart_m = math.hypot(*self._off(held, (0.0, 0.0), fix))
+        reach_m = _FASTEST_MPS * max(_seconds(held, fix), 0.0)
+        return apart_m <= self._config.unreported_jump_m + reach_m + _SIGMAS * _sigmas(held, fix)
+
+
+def _reckoned_m(dt: float) -> float:
+    """One sigma of the way that the EKF reckons without positions."""
+    known_s = min(dt, _RECKONS_S)
+    return math.hypot(_RECKONED_MPS * known_s, 0.5 * _RECKONED_MPS2 * known_s * known_s)
+
+
+def _seconds(a: VisionFix, b: VisionFix) -> float:
+    return (b.time_ns - a.time_ns) * 1e-9
+
+
+def _sigmas(a: VisionFix, b: VisionFix) -> float:
+    return math.hypot(_sigma(a), _sigma(b))
+
+
+def _sigma(fix: VisionFix) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))

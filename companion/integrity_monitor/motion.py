@@ -1,0 +1,165 @@
+"""Vision's displacement against the IMU's over 1, 3 and 10 s.
+
+The EKF cannot be asked: on vision alone it follows what it is fed. A small filter of its own
+predicts each fix from those before and the IMU; a frozen or foreign picture of a moving aircraft
+is metres off that prediction within a second. A hover gives the IMU little to contradict: a tenth
+of a metre per second squared is what its tilt may be wrong by. There the pictures must tell; a
+position that stands still is no fault by itself, only no proof that a fault is over.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.integrity_monitor.config import MotionCheckConfig
+from companion.integrity_monitor.inertial import InertialDisplacement, InertialTrack
+from companion.integrity_monitor.position_checks import LocalPlace
+from mavlink_bridge.messages import VisionFix
+
+Array = NDArray[np.float64]
+_ACCELERATION = 0.03  # m/s^2/sqrt(Hz): of the IMU's integral
+_BIAS_WALK = 0.002  # m/s^2/sqrt(s): of tilt and accelerometer together, in north and east
+_SIGMA_FLOOR_M = 0.2
+_SIGMAS = 4.0
+# The noisier the fixes, the longer the filter lives by the IMU alone, and the further an error of
+# tilt that it does not model carries it: honest fixes of sigma 2 m were withheld for 4 m (SITL).
+_SLOW_SHARE = 1.5
+_INDEPENDENT_HZ = 2.0  # errors of vision are alike within half a second
+_WINDOWS_S = (1.0, 3.0, 10.0)
+_GAP_S = 3.0  # without fixes, after which the prediction starts anew
+_SETTLE_S = 5.0  # until velocity and bias are known
+_BLOCK_S = 1.0
+_LEAST_FIXES = 3  # of a window
+
+
+@dataclass(frozen=True)
+class MotionVerdict:
+    """settled: there is evidence at all. share: the largest mean deviation as a share of its limit;
+    deviation_m: that deviation. still_s: how long the position has not moved.
+    """
+
+    settled: bool
+    share: float
+    deviation_m: float
+    still_s: float
+
+
+class MotionCheck:
+    """Takes fixes in the order of their times; one thread."""
+
+    def __init__(self, config: MotionCheckConfig, track: InertialTrack) -> None:
+        self._config = config
+        self._limits = dict(
+            zip(_WINDOWS_S, (config.limit_1s_m, config.limit_3s_m, config.limit_10s_m), strict=True)
+        )
+        self._track = track
+        self._place = LocalPlace()
+        self._moved: InertialDisplacement | None = None
+        self._x = np.zeros((3, 2))  # position, velocity, bias; north and east
+        self._P = np.zeros((3, 3))
+        self._began_ns = 0
+        self._restarts = 0
+        self._deviations: deque[tuple[int, float, float, float, float]] = deque(maxlen=1024)
+        self._still = StillPosition(config.still_m)
+
+    def add(self, fix: VisionFix) -> MotionVerdict:
+        """One fix that the IMU's record reaches; see `ready`."""
+        here = np.array(self._place.ned(fix)[:2])
+        still_s = self._still.add(fix.time_ns, here)
+        moved = self._track.at(fix.time_ns)
+        if moved is None:
+            self._moved = None
+            return MotionVerdict(False, 0.0, 0.0, still_s)
+        sigma = max(_sigma(fix), _SIGMA_FLOOR_M)
+        last = self._moved
+        gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
+        anew = self._restarts != self._track.restarts or gap_s > _GAP_S or fix.reset
+        self._moved, self._restarts = moved, self._track.restarts
+        if last is None or anew or gap_s <= 0.0:
+            self._start(fix.time_ns, here, sigma)
+        else:
+            self._step(last, moved, here, sigma)
+        settled = (fix.time_ns - self._began_ns) * 1e-9 >= _SETTLE_S
+        share, deviation_m = self._judge(fix.time_ns) if settled else (0.0, 0.0)
+        return MotionVerdict(settled, share, deviation_m, still_s)
+
+    def ready(self, fix: VisionFix) -> bool:
+        """Whether the IMU's record reaches the fix, or the fix is too late to wait for it."""
+        return self._track.newest_ns >= fix.time_ns
+
+    def _start(self, time_ns: int, here: Array, sigma: float) -> None:
+        self._x = np.zeros((3, 2))
+        self._x[0] = here
+        self._P = np.diag([sigma**2, 25.0, 0.3**2])
+        self._began_ns = time_ns
+        self._deviations.clear()
+
+    def _step(
+        self, last: InertialDisplacement, moved: InertialDisplacement, here: Array, sigma: float
+    ) -> None:
+        """Predict by the IMU, note the deviation, and take the fix in. Per axis: p, v, bias."""
+        h = (moved.time_ns - last.time_ns) * 1e-9
+        F = np.array([[1.0, h, -0.5 * h * h], [0.0, 1.0, -h], [0.0, 0.0, 1.0]])
+        q, b = _ACCELERATION**2, _BIAS_WALK**2
+        Q = np.array(
+            [[h**3 / 3 * q, h * h / 2 * q, 0.0], [h * h / 2 * q, h * q, 0.0], [0, 0, b * h]]
+        )
+        self._x = F @ self._x
+        self._x[0] += moved.position - last.position - last.velocity * h
+        self._x[1] += moved.velocity - last.velocity
+        self._P = F @ self._P @ F.T + Q
+        S = self._P[0, 0] + sigma**2
+        deviation = here - self._x[0]
+        north, east = float(deviation[0]), float(deviation[1])
+        self._deviations.append((moved.time_ns, north, east, float(self._P[0, 0]), sigma**2))
+        K = self._P[:, 0] / S
+        self._x = self._x + np.outer(K, deviation)
+        self._P = self._P - np.outer(K, self._P[0])
+
+    def _judge(self, now_ns: int) -> tuple[float, float]:
+        rows = np.array(self._deviations)
+        worst = (0.0, 0.0)
+        for window_s, limit_m in self._limits.items():
+            inside = rows[rows[:, 0] > now_ns - window_s * 1e9]
+            if len(inside) < _LEAST_FIXES:
+                continue
+            mean = float(np.hypot(*inside[:, 1:3].mean(axis=0)))
+            independent = min(len(inside), max(1.0, _INDEPENDENT_HZ * window_s))
+            # What the prediction is off is the same all along; only the fixes' errors average.
+            predicted, seen = inside[:, 3].mean(), inside[:, 4].mean() / independent
+            limit = limit_m + _SIGMAS * float(np.sqrt(predicted + seen))
+            limit += _SLOW_SHARE * float(np.sqrt(inside[:, 4].mean()))
+            worst = max(worst, (float(mean / limit), mean))
+        return worst
+
+
+class StillPosition:
+    """How long the position, averaged over seconds, has stayed within a distance."""
+
+    def __init__(self, within_m: float) -> None:
+        self._within_m = within_m
+        self._block: list[Array] = []
+        self._block_ns = 0
+        self._reference: tuple[int, Array] | None = None
+
+    def add(self, time_ns: int, here: Array) -> float:
+        """A position (2,), metres; seconds for which it stands still by now."""
+        if not self._block:
+            self._block_ns = time_ns
+        self._block.append(here)
+        if time_ns - self._block_ns >= _BLOCK_S * 1e9:
+            mean = np.mean(self._block, axis=0)
+            gap = time_ns - self._block_ns > 3.0 * _BLOCK_S * 1e9
+            reference = self._reference
+            if gap or reference is None or np.hypot(*(mean - reference[1])) > self._within_m:
+                self._reference = (self._block_ns, mean)
+            self._block = []
+        return 0.0 if self._reference is None else (time_ns - self._reference[0]) * 1e-9
+
+
+def _sigma(fix: VisionFix) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))

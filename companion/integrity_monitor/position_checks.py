@@ -1,0 +1,111 @@
+"""Where vision says the aircraft is, against the barometer and GNSS."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from companion.integrity_monitor.alert_rules import CheckResult
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from mavlink_bridge.injection.shadow import gnss_healthy
+from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.vehicle.origin import north_east
+
+_FORGET_S = 120.0  # the barometer's drift against vision: its zero follows with this time
+# The barometer's metres are those of the standard atmosphere: 16 % too many at -25 degrees, 9 % too
+# few at 45, of what the aircraft climbed.
+_ATMOSPHERE = 0.16
+_MEDIAN_OF = 15
+_BARO_FRESH_NS = 1_000_000_000
+_FIX_FRESH_NS = 500_000_000
+_SIGMAS = 4.0
+_GNSS_FLOOR_M = 1.0
+_GNSS_SIGMA_M = 2.5  # where the receiver does not say
+_GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cover
+
+
+class LocalPlace:
+    """A flat frame about the first fix."""
+
+    def __init__(self) -> None:
+        self._anchor: tuple[float, float] | None = None
+
+    def ned(self, fix: VisionFix) -> tuple[float, float, float]:
+        """North, east of the first fix, and down of the ellipsoid; metres."""
+        north, east = self.north_east(fix.latitude_deg, fix.longitude_deg)
+        return north, east, -fix.height_m
+
+    def north_east(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """North and east of the first fix, metres."""
+        if self._anchor is None:
+            self._anchor = (latitude_deg, longitude_deg)
+        return north_east(*self._anchor, latitude_deg, longitude_deg)
+
+
+class HeightCheck:
+    """Vision's height against the barometer's, both since they were first seen together in this
+    flight: weather and temperature change between two.
+    """
+
+    def __init__(self, config: IntegrityMonitorConfig) -> None:
+        self._limit_m = config.height_m
+        self._zero: float | None = None
+        self._altitude_m = 0.0  # that the zero is of
+        self._last_ns = 0
+        self._differences: deque[float] = deque(maxlen=_MEDIAN_OF)
+
+    def add(self, fix: VisionFix, state: VehicleState) -> CheckResult:
+        """One fix, and the state at about its time."""
+        if not state.armed:
+            self._zero = None
+            self._differences.clear()
+            return CheckResult(False)
+        altitude = state.pressure_altitude_m
+        if altitude is None or abs(fix.time_ns - state.pressure_time_ns) > _BARO_FRESH_NS:
+            return CheckResult(None)
+        difference = fix.height_m - altitude
+        self._differences.append(difference)
+        median = float(np.median(self._differences))
+        if self._zero is None:
+            if len(self._differences) == _MEDIAN_OF:
+                self._zero, self._altitude_m, self._last_ns = median, altitude, fix.time_ns
+            return CheckResult(None)
+        dt = min(max((fix.time_ns - self._last_ns) * 1e-9, 0.0), 1.0)
+        self._last_ns = fix.time_ns
+        apart = median - self._zero
+        sigma = math.sqrt(float(fix.position_covariance_ned[2, 2]))
+        climbed_m = altitude - self._altitude_m
+        bad = abs(apart) > self._limit_m + _SIGMAS * sigma + _ATMOSPHERE * abs(climbed_m)
+        if not bad:
+            self._zero += apart * dt / _FORGET_S
+            self._altitude_m += climbed_m * dt / _FORGET_S
+        return CheckResult(bad, abs(apart))
+
+
+class GnssCheck:
+    """GNSS against vision while GNSS is there, whatever mode; neither is said to be right."""
+
+    def __init__(self, config: IntegrityMonitorConfig) -> None:
+        self._cap_m = config.gnss_accuracy_cap_m
+
+    def read(
+        self, fix: VisionFix, state: VehicleState, protection_m: float, now_ns: int
+    ) -> CheckResult:
+        """The newest fix against the newest report."""
+        latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
+        if latitude is None or longitude is None or not gnss_healthy(state, now_ns):
+            return CheckResult(None)
+        if abs(state.gps_time_ns - fix.time_ns) > _FIX_FRESH_NS:
+            return CheckResult(None)
+        place = LocalPlace()
+        place.ned(fix)
+        north, east = place.north_east(latitude, longitude)
+        accuracy = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
+        accuracy = min(max(accuracy, _GNSS_FLOOR_M), self._cap_m)
+        v_north, v_east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
+        later_s = (fix.time_ns - state.gps_time_ns) * 1e-9
+        apart = math.hypot(north + v_north * later_s, east + v_east * later_s)
+        limit = _SIGMAS * accuracy + protection_m + _GNSS_AGE_S * math.hypot(v_north, v_east)
+        return CheckResult(apart > limit, apart)

@@ -1,0 +1,68 @@
+"""Protection levels: how wrong a fix may be at the stated risk, when more than noise is wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.calibration_watch.ground import UNKNOWN_HEIGHT_M
+from companion.integrity_monitor.config import ProtectionConfig
+from mavlink_bridge.messages import VehicleState, VisionFix
+
+_UNKNOWN_MPS = (15.0, 3.0)  # horizontally and vertically, of a vehicle that does not say
+
+
+@dataclass(frozen=True)
+class ProtectionLevel:
+    """Metres that the error exceeds with the configured risk at most."""
+
+    horizontal_m: float
+    vertical_m: float
+
+
+def protection_level(
+    fix: VisionFix,
+    state: VehicleState,
+    config: ProtectionConfig,
+    known_m: float,
+    height_m: float | None,
+) -> ProtectionLevel:
+    """The level of a fix. known_m: what another watch found to be wrong, added as it is; height_m:
+    above the ground, None where it is not known.
+    """
+    P = fix.position_covariance_ned
+    horizontal = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
+    vertical = math.sqrt(max(float(P[2, 2]), 0.0))
+    velocity = state.local_velocity_ned or fix.velocity_ned
+    speeds = _UNKNOWN_MPS
+    if velocity is not None:
+        speeds = (math.hypot(*velocity[:2]), abs(velocity[2]))
+    if height_m is None:
+        height_m = UNKNOWN_HEIGHT_M
+    across, up = budget((horizontal, vertical), height_m, speeds, config)
+    return ProtectionLevel(across + known_m, up + known_m)
+
+
+def budget(
+    sigma_m: tuple[float, float],
+    height_m: float,
+    speeds_mps: tuple[float, float],
+    config: ProtectionConfig,
+) -> tuple[float, float]:
+    """Horizontal and vertical level, metres: k times the root of the summed variances.
+
+    Noise, map, calibration and time fail independently. Horizontally the error is that of a
+    circular distribution of the worst axis: exp(-k^2/2) = risk; vertically a normal one, bounded by
+    the same exponential. sigma_m, speeds_mps: horizontal and vertical; height_m: above the
+    ground.
+    """
+    k = math.sqrt(-2.0 * math.log(config.risk))
+    maps = (config.map_m, config.map_height_m)
+    calibration = config.calibration_share * height_m
+    across, up = (
+        k * math.hypot(sigma, of_map, calibration, config.time_bias_s * speed)
+        for sigma, of_map, speed in zip(sigma_m, maps, speeds_mps, strict=True)
+    )
+    return across, up

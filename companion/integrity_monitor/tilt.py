@@ -1,0 +1,68 @@
+"""Vision's roll and pitch against the autopilot's and the gimbal's.
+
+Low over ground that shows little, a tilt and a shift look alike: the position is wrong by the tilt
+times the height, its motion is nearly right, and the picture matches. Gravity knows the tilt.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from mavlink_bridge.messages import Attitude, VisionFix
+
+_SIGMAS, _CALM_SIGMAS = 3.0, 2.0
+_HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
+
+
+class TiltCheck:
+    """Takes every fix. What the gimbal is off by for good is not learned: a wrong tilt that came
+    slowly and with the first fix (at 1.5 degrees in 2 s, `begins-denied`) would be learned with it.
+    """
+
+    def __init__(self, config: IntegrityMonitorConfig) -> None:
+        self._sigma_rad = math.radians(config.tilt_deg)
+        # What is larger is a jump, and held; a gimbal that was knocked costs no more.
+        self._most_m = config.unreported_jump_m
+        self._off_rad = 0.0
+        self._share = 0.0  # of its sigma
+        self._judged_ns: int | None = None
+        self.tilts = False
+        """The newest fix is tilted as neither gimbal nor autopilot explain."""
+        self.is_known = False
+        """Whether there was an attitude of late. What the last one said holds until the next: a
+        position is no better because nobody looks.
+        """
+
+    @property
+    def off_deg(self) -> float:
+        """By how much the newest fix is tilted."""
+        return math.degrees(self._off_rad)
+
+    def metres(self, height_m: float | None) -> float:
+        """By how much its position may be wrong: the tilt times the height above the ground, as far
+        as gimbal and autopilot do not explain it.
+        """
+        believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
+        shift_m = self._most_m if height_m is None else height_m * self._off_rad
+        return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
+
+    def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
+        """Another fix, and the autopilot's attitude at its time, None where it is unknown."""
+        if attitude is None or fix.roll_rad is None or fix.pitch_rad is None:
+            since = self._judged_ns
+            self.is_known = since is not None and abs(fix.time_ns - since) <= _HOLDS_NS
+            return
+        self._judged_ns, self.is_known = fix.time_ns, True
+        seen, known = (
+            _level(fix.roll_rad, fix.pitch_rad),
+            _level(attitude.roll_rad, attitude.pitch_rad),
+        )
+        self._off_rad = math.dist(seen, known)
+        self._share = self._off_rad / math.hypot(self._sigma_rad, fix.attitude_sigma_rad)
+        self.tilts = self._share > (_CALM_SIGMAS if self.tilts else _SIGMAS)
+
+
+def _level(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
+    """Where the vertical lies in body axes, forward and right: no heading is in it."""
+    return -math.sin(pitch_rad), math.sin(roll_rad) * math.cos(pitch_rad)

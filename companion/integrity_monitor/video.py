@@ -1,0 +1,206 @@
+"""Whether the video still lives: identical, standing still, or repeated pictures.
+
+A localizer registers a frozen picture as perfectly as a fresh one, and the clock of a hung encoder
+goes on. A flying camera, however, never stands still: what the aircraft sways moves the picture by
+more than the hundredth of a pixel to which two pictures can be compared as a whole. The comparison
+is a least-squares fit of shift, rotation, scale, gain and offset between two thumbnails, so the
+error of an encoder, fresh noise or another exposure on a frozen picture are not taken for motion:
+they do not move edges.
+"""
+
+from __future__ import annotations
+
+import heapq
+import zlib
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.integrity_monitor.config import VideoCheckConfig
+from localizer.types import Image
+
+Thumbnail = NDArray[np.float32]
+WIDTH, HEIGHT = 64, 48  # of a thumbnail
+_CRC_ROWS = 8  # every eighth row is enough to tell two pictures of a sensor apart
+_UNLIKE_GRAY = 2.0  # root mean square difference beyond which a fit need not be tried
+_MOST_GAIN = 3.0  # ratio of contrasts that another exposure makes; of a covered lens it is 10
+_SURE = 2e-4  # a fit with a larger sigma says nothing: the picture has no content
+_MEDIAN_OF = 5
+_CANDIDATES = 3  # for a loop, of a minute's pictures
+_FILLED = 0.7  # of the memory's pictures within a loop's time must match
+_MOVES = 10.0  # a path that repeats must be so many times longer than what counts as equal
+_LAG_SLACK_NS = 150_000_000
+_MEMORY_STEP_NS = 180_000_000
+
+
+@dataclass(frozen=True)
+class FrameVerdict:
+    """What the pictures say. still_s: how long the picture has not moved; identical_s: to the bit.
+
+    repeat_lag_s: the pictures are those of so long ago; 0 where they are new. contrast: standard
+    deviation of the thumbnail, gray levels of 255.
+    """
+
+    still_s: float
+    identical_s: float
+    repeat_lag_s: float
+    contrast: float
+
+
+@dataclass(frozen=True)
+class ImageShift:
+    """How far a picture moved, as a share of its width, and what the fit's sigma is."""
+
+    share: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class _SeenFrame:
+    time_ns: int
+    crc: int
+    thumbnail: Thumbnail
+    contrast: float
+    plain: Thumbnail
+    """The thumbnail at a contrast of 1: another exposure changes nothing."""
+
+
+def _look(time_ns: int, image: Image) -> _SeenFrame:
+    small = thumbnail(image)
+    contrast = float(small.std())
+    crc = zlib.crc32(image[::_CRC_ROWS].tobytes())
+    return _SeenFrame(time_ns, crc, small, contrast, small / np.float32(max(contrast, 1e-3)))
+
+
+class FrozenVideoDetector:
+    """Takes every picture, or as many as there is time for; one thread."""
+
+    def __init__(self, config: VideoCheckConfig) -> None:
+        self._config = config
+        self._reference: _SeenFrame | None = None
+        self._newest: _SeenFrame | None = None
+        self._identical_since_ns = 0
+        self._last_shares: deque[float] = deque(maxlen=_MEDIAN_OF)
+        self._loop = RepeatedVideoDetector(config)
+
+    def add(self, time_ns: int, image: Image) -> FrameVerdict:
+        """One picture (H, W, 3) uint8 RGB at its exposure time; what is known with it."""
+        seen = _look(time_ns, image)
+        last, self._newest = self._newest, seen
+        if last is None or last.crc != seen.crc:
+            self._identical_since_ns = time_ns
+        self._keep_reference(seen)
+        reference_ns = self._reference.time_ns if self._reference is not None else time_ns
+        identical_s = (time_ns - self._identical_since_ns) * 1e-9
+        return FrameVerdict(
+            max((time_ns - reference_ns) * 1e-9, identical_s),
+            identical_s,
+            self._loop.add(seen),
+            seen.contrast,
+        )
+
+    def _keep_reference(self, seen: _SeenFrame) -> None:
+        """The picture that all since resemble. The median spares it an encoder's key frames."""
+        if self._reference is None:
+            self._reference = seen
+            return
+        self._last_shares.append(resemblance(self._reference, seen))
+        shares = sorted(self._last_shares)
+        if shares[len(shares) // 2] > self._config.still_share:
+            self._reference = seen
+            self._last_shares.clear()
+
+
+class RepeatedVideoDetector:
+    """Finds pictures that come again, at one lag that holds, along a path on which they differ."""
+
+    def __init__(self, config: VideoCheckConfig) -> None:
+        self._config = config
+        self._hold_ns = int(config.repeat_s * 1e9)
+        self._memory: deque[_SeenFrame] = deque()
+        self._matches: deque[tuple[int, int]] = deque()  # time and lag
+
+    def add(self, seen: _SeenFrame) -> float:
+        """Seconds to the pictures that come again; 0 while they are new."""
+        before = [old for old in self._memory if seen.time_ns - old.time_ns >= self._hold_ns]
+        for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: unlikeness(old, seen)):
+            if resemblance(old, seen) < self._config.still_share:
+                self._matches.append((seen.time_ns, seen.time_ns - old.time_ns))
+        while self._matches and seen.time_ns - self._matches[0][0] > self._hold_ns:
+            self._matches.popleft()
+        self._remember(seen)
+        return self._lag_s(seen.time_ns)
+
+    def _lag_s(self, now_ns: int) -> float:
+        """The newest match's lag, if matches of that lag fill the time and the picture moved."""
+        if not self._matches:
+            return 0.0
+        lag_ns = self._matches[-1][1]
+        times = [t for t, lag in self._matches if abs(lag - lag_ns) <= _LAG_SLACK_NS]
+        steps = self._hold_ns / _MEMORY_STEP_NS
+        if now_ns - times[0] < 0.8 * self._hold_ns or len(times) < _FILLED * steps:
+            return 0.0
+        path = [old for old in self._memory if old.time_ns >= times[0]]
+        far = max(resemblance(path[0], other) for other in path)
+        return lag_ns * 1e-9 if far > _MOVES * self._config.still_share else 0.0
+
+    def _remember(self, seen: _SeenFrame) -> None:
+        if self._memory and seen.time_ns - self._memory[-1].time_ns < _MEMORY_STEP_NS:
+            return
+        self._memory.append(seen)
+        oldest_ns = seen.time_ns - int(self._config.repeat_memory_s * 1e9)
+        while self._memory[0].time_ns < oldest_ns:
+            self._memory.popleft()
+
+
+def resemblance(a: _SeenFrame, b: _SeenFrame) -> float:
+    """How far the picture moved from a to b, as a share of its width; 1 where nobody can say."""
+    if a.crc == b.crc:
+        return 0.0
+    low, high = sorted((a.contrast, b.contrast))
+    if unlikeness(a, b) > _UNLIKE_GRAY or high > _MOST_GAIN * low:
+        return 1.0
+    moved = picture_motion(a.thumbnail, b.thumbnail)
+    return moved.share if moved.sigma < _SURE else 1.0
+
+
+def unlikeness(a: _SeenFrame, b: _SeenFrame) -> float:
+    """Root mean square difference of two pictures of one contrast, gray levels of 255."""
+    return float(np.sqrt(np.mean(np.square(a.plain - b.plain)))) * min(a.contrast, b.contrast)
+
+
+def thumbnail(image: Image) -> Thumbnail:
+    """Luminance (48, 64) of a picture (H, W, 3), gray levels of 255 about their mean."""
+    small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
+    gray = small @ np.array([0.299, 0.587, 0.114], np.float32)
+    return np.asarray(gray - gray.mean(), np.float32)
+
+
+_V, _U = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+_X, _Y = (_U - (WIDTH - 1) / 2) / WIDTH, (_V - (HEIGHT - 1) / 2) / WIDTH  # shares of the width
+
+
+def picture_motion(a: Thumbnail, b: Thumbnail) -> ImageShift:
+    """Least-squares motion from a to b (48, 64): what shift, rotation and scale do at the edge.
+
+    Linear in the difference, so it is right for motions of a pixel of the thumbnail or less; what
+    moved farther comes out as more than nothing, which is all that is asked.
+    """
+    mean = 0.5 * (a + b)
+    gv, gu = np.gradient(mean)
+    gu, gv = gu * WIDTH, gv * WIDTH  # per share of the width
+    columns = (gu, gv, gv * _X - gu * _Y, gu * _X + gv * _Y, mean, np.ones_like(mean))
+    J = np.stack([c.ravel() for c in columns], axis=1).astype(np.float64)
+    difference = (a - b).ravel().astype(np.float64)
+    N = J.T @ J
+    N[np.diag_indices(6)] += 1e-6 * np.trace(N) / 6 + 1e-9
+    inverse = np.linalg.inv(N)
+    x = inverse @ (J.T @ difference)
+    variance = float(np.mean(np.square(difference - J @ x)))
+    arms = np.array([1.0, 1.0, 0.5, 0.5])  # a rotation or scale moves the edge by half the width
+    moved = np.abs(x[:4]) * arms
+    sigma = np.sqrt(variance * inverse.diagonal()[:4]) * arms
+    return ImageShift(float(np.hypot(moved[0], moved[1]) + moved[2] + moved[3]), float(sigma.max()))

@@ -1,0 +1,222 @@
+"""Roll and pitch as other sensors know them, less what their horizon is off by for good.
+
+Over some fifty metres of ground a turn of the camera and a shift of its place look nearly alike,
+and where the map is old or shows little the registration takes one for the other. Gravity tells
+them apart, but a gimbal's horizon is off by a degree that no report shows. The registration itself
+is right about that degree in the long run: over other ground it errs another way. So every fix over
+new ground measures it, and the reported rotation, corrected, is a constraint on the next frames
+(docs/explanation/registration.md, section 9a).
+
+All is about two horizontal world axes: the camera's right-hand side (pitch) and what lies ahead of
+it (roll). A gimbal's, a mounting's and an autopilot's error stay the same there while it turns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
+from localizer.registration.priors import PoseConstraint
+from localizer.tracking.motion import RotationAt
+from localizer.types import PosePrior
+
+_LEAST_LEVEL = 0.3  # of the camera's x axis that is horizontal: rolled further, there is no pitch
+_AGREES, _TAKEN = 4.0, 4.0  # sigmas: beyond, nothing is constrained, and nothing is learned
+_CAUTIOUS = 2.0  # sigmas from which a measurement counts less: over some ground vision errs
+_REFUSED_IN_ROW = 5  # then it is the constant that has changed: a gimbal that was knocked
+_LEAST_SPREAD_COUNT, _MOST_SPREAD_COUNT = 5.0, 60.0  # measurements that the spread is a mean of
+_MOST_SPREAD_RAD = float(np.radians(3.0))
+_LARGEST_SIGMA_RAD = float(np.radians(2.0))  # of a registration that has something to say
+_WALK_RAD = float(np.radians(0.01))  # of the constant, per root second: a gimbal warms up
+# Nearer to the ground fewer patches of it are in view that err by themselves: from 40 m the
+# registration's tilt was off by 1.1 degrees rms where it told 0.4 (docs/results/flights.md, `low`).
+_HONEST_M = 100.0
+_APART, _LEAST_APART_M = 0.5, 20.0  # of the distance; between two places that see other ground
+
+
+class AttitudePrior(BaseModel):
+    """How well the autopilot's attitude and the gimbal's tell the camera's roll and pitch."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    tilt_sigma_deg: float = Field(
+        0.4, ge=0.05, le=90, description="least error of roll and pitch, beside a constant"
+    )
+    alignment_sigma_deg: float = Field(
+        1.0, ge=0.05, le=90, description="their constant error, before it is learned in flight"
+    )
+
+
+@dataclass(frozen=True)
+class AttitudeBias:
+    """What the other sensors' roll and pitch are off by, as far as it is known.
+
+    mean: (2,) rad about the two axes: true = turned by it from reported; covariance: (2, 2);
+    spread: variance of what is no constant (rad²), a mean over `count` measurements; place: (2,)
+    east and north (m) of the last one, at `time_ns`; refused: measurements in a row.
+    """
+
+    covariance: Array
+    spread: float
+    mean: Array = field(default_factory=lambda: np.zeros(2))
+    count: float = _LEAST_SPREAD_COUNT
+    place: Array | None = None
+    time_ns: int = 0
+    refused: int = 0
+
+    @property
+    def sigma_rad(self) -> float:
+        """Of the reported roll and pitch once they are corrected, along their worse axis."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1] + self.spread))
+
+    @property
+    def off_deg(self) -> tuple[float, float]:
+        """The constant: pitch, roll."""
+        pitch, roll = np.degrees(self.mean)
+        return float(pitch), float(roll)
+
+    @property
+    def told_deg(self) -> tuple[float, float, float]:
+        """The constant, and the sigma of the rest: for reports."""
+        pitch, roll, sigma = (
+            round(float(v), 2) for v in (*self.off_deg, np.degrees(self.sigma_rad))
+        )
+        return pitch, roll, sigma
+
+
+def unknown(config: AttitudePrior) -> AttitudeBias:
+    """Before the first measurement."""
+    alignment, tilt = np.radians([config.alignment_sigma_deg, config.tilt_sigma_deg])
+    return AttitudeBias(np.eye(2) * alignment**2, float(tilt**2))
+
+
+def horizontal_axes(rotation: Array) -> Array | None:
+    """(3, 2) unit vectors in the world: to the right of a camera of rotation (3, 3), and ahead of
+    it. None where it is rolled on its side.
+    """
+    right = np.array([rotation[0, 0], rotation[1, 0], 0.0])
+    length = float(np.hypot(right[0], right[1]))
+    if length < _LEAST_LEVEL:
+        return None
+    right /= length
+    return np.column_stack([right, np.array([-right[1], right[0], 0.0])])
+
+
+def constraint(bias: AttitudeBias, reported: Array, predicted: PosePrior) -> PoseConstraint | None:
+    """Roll and pitch of a frame's camera, from its rotation (3, 3) as reported at its exposure.
+
+    predicted: by the tracking. None where the two contradict each other: then one of them is wrong,
+    and which is not for this to say.
+    """
+    axes = horizontal_axes(reported)
+    if axes is None:
+        return None
+    rotation = so3_exp(axes @ bias.mean) @ reported
+    known = bias.covariance + np.eye(2) * bias.spread
+    off = axes.T @ so3_log(predicted.world_from_camera.rotation @ rotation.T)
+    if _sigmas(off, known + axes.T @ predicted.covariance[3:, 3:] @ axes) > _AGREES:
+        return None
+    information = np.zeros((6, 6))
+    information[3:, 3:] = axes @ np.linalg.inv(known) @ axes.T
+    return PoseConstraint(Pose(rotation, np.zeros(3)), information)
+
+
+@dataclass(frozen=True)
+class AttitudeObservation:
+    """A registration that no attitude has constrained, at `time_ns`. covariance: (6, 6) of its
+    pose, what map and calibration err by included; distance_m: of what it shows.
+    """
+
+    pose: Pose
+    covariance: Array
+    distance_m: float
+    time_ns: int
+
+
+def is_new_ground(bias: AttitudeBias, place: Array, distance_m: float) -> bool:
+    """Whether what is seen from `place` (3,) errs by itself: over the same ground it errs alike."""
+    apart_m = max(_LEAST_APART_M, _APART * distance_m)
+    return bias.place is None or bool(np.hypot(*(place[:2] - bias.place)) >= apart_m)
+
+
+def passed(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
+    """The horizon at `place` (3,), from where nothing was learned: less sure, by the time."""
+    apart_s = abs(time_ns - bias.time_ns) * 1e-9 if bias.place is not None else 0.0
+    walked = np.eye(2) * _WALK_RAD**2 * min(apart_s, 60.0)
+    covariance = bias.covariance + walked
+    return replace(bias, covariance=covariance, place=place[:2].copy(), time_ns=time_ns)
+
+
+def measured(
+    bias: AttitudeBias, config: AttitudePrior, reported: Array, sight: AttitudeObservation
+) -> AttitudeBias:
+    """The horizon after another sight. reported: (3, 3) as in `constraint`."""
+    axes = horizontal_axes(reported)
+    if axes is None:
+        return bias
+    seen = sight.pose
+    here = passed(bias, seen.translation, sight.time_ns)
+    R = axes.T @ sight.covariance[3:, 3:] @ axes * max(1.0, _HONEST_M / sight.distance_m) ** 2
+    if np.linalg.eigvalsh(R)[-1] > _LARGEST_SIGMA_RAD**2:
+        return here
+    P = here.covariance
+    off = axes.T @ so3_log(seen.rotation @ reported.T) - bias.mean
+    S = P + R + np.eye(2) * bias.spread
+    sigmas = _sigmas(off, S)
+    if sigmas > _TAKEN:
+        if bias.refused + 1 < _REFUSED_IN_ROW:
+            return replace(here, refused=bias.refused + 1)
+        return replace(unknown(config), place=here.place, time_ns=here.time_ns)
+    S = S * max(1.0, sigmas / _CAUTIOUS) ** 2
+    gain = P @ np.linalg.inv(S)
+    count = min(bias.count + 1.0, _MOST_SPREAD_COUNT)
+    beside = float(off @ off - np.trace(P + R)) / 2.0
+    spread = bias.spread + (beside - bias.spread) / count
+    least = float(np.radians(config.tilt_sigma_deg)) ** 2
+    return replace(
+        here, mean=bias.mean + gain @ off, covariance=P - gain @ S @ gain.T, count=count,
+        spread=max(min(spread, _MOST_SPREAD_RAD**2), least), refused=0,
+    )  # fmt: skip
+
+
+class AttitudeBiasEstimator:
+    """The horizon of one camera, from frame to frame; belongs to the localization thread.
+
+    config: None constrains nothing. rotation_at: (3, 3) world_from_camera as reported of a time in
+    ns, or None.
+    """
+
+    def __init__(self, config: AttitudePrior | None, rotation_at: RotationAt) -> None:
+        self._config, self._rotation_at = config, rotation_at
+        self.bias = None if config is None else unknown(config)
+        """None where nothing is constrained."""
+
+    def constraint(self, predicted: PosePrior) -> PoseConstraint | None:
+        """On the registration of the frame for whose exposure the pose was predicted."""
+        reported = self._rotation_at(predicted.time_ns)
+        if self.bias is None or reported is None:
+            return None
+        return constraint(self.bias, reported, predicted)
+
+    def is_due(self, place: Array, distance_m: float) -> bool:
+        """Whether a sight from `place` (3,) is wanted."""
+        return self.bias is not None and is_new_ground(self.bias, place, distance_m)
+
+    def pass_by(self, place: Array, time_ns: int) -> None:
+        """What is seen from `place` (3,) tells nothing: the next sight is wanted from another."""
+        if self.bias is not None:
+            self.bias = passed(self.bias, place, time_ns)
+
+    def learn(self, sight: AttitudeObservation) -> None:
+        """Take a sight."""
+        reported = self._rotation_at(sight.time_ns)
+        if self.bias is not None and self._config is not None and reported is not None:
+            self.bias = measured(self.bias, self._config, reported, sight)
+
+
+def _sigmas(off: Array, covariance: Array) -> float:
+    """Mahalanobis distance of two numbers from zero."""
+    return float(np.sqrt(off @ np.linalg.solve(covariance, off)))

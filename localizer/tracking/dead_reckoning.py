@@ -1,0 +1,157 @@
+"""Carrying the pose on from picture to picture while the map does not match.
+
+Snow, a building site, the map's edge: the picture is good and the map says nothing. The odometry
+keeps every accepted frame as a possible beginning, which costs nothing, and steps on from it when
+frames are rejected (docs/explanation/odometry.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from localizer.errors import OdometryError
+from localizer.geometry.camera import Camera, followed
+from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
+from localizer.odometry import (
+    OdometryConfig,
+    OdometryFrame,
+    OdometryStatus,
+    TerrainModel,
+    VisualOdometry,
+    examine,
+    odometry_optimizer,
+)
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import (
+    PoseConstraint,
+    attitude_constraint,
+    combine,
+    height_constraint,
+)
+from localizer.tracking.motion import AuxiliarySensors
+from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
+
+
+def fallen_m(place: Array) -> float:
+    """By how much the ground of a place (3,) lies below the plane through the world's origin, since
+    the Earth is round: 7.8 m at 10 km, where 50 m further on are another 0.08 m.
+    """
+    return float(place[:2] @ place[:2]) / (2.0 * _EARTH_M)
+
+
+class PropagationResult(Enum):
+    """What the odometry makes of a frame that the map rejected."""
+
+    NONE = "nothing to carry on from"
+    CARRIED = "carried on"
+    GAP = "this frame shows nothing; the next one may"
+    BROKEN = "the thread is lost"
+
+
+@dataclass(frozen=True)
+class PropagatedPose:
+    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED."""
+
+    status: PropagationResult
+    world_from_camera: Pose | None = None
+    covariance: Array | None = None
+    quality: float = 0.0
+
+
+_NOTHING = PropagatedPose(PropagationResult.NONE)
+
+
+_EARTH_M = 6.371e6
+# Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
+# better (`OdometryConfig`), and constant errors are taken out by the odometry.
+_TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
+
+
+class DeadReckoning:
+    """The odometry beside the map's registration; one thread, the localization thread's.
+
+    camera: the working pinhole, which follows a lens that zooms. sensors: other sensors' accounts
+    of the camera, terrain: the ground's shape, see `Localizer`.
+    """
+
+    def __init__(
+        self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int,
+        sensors: AuxiliarySensors, terrain: TerrainModel | None = None,
+    ) -> None:  # fmt: skip
+        self._sensors, self._pinhole = sensors, camera
+        registration = odometry_optimizer(optimizer, threads)
+        self._odometry = VisualOdometry(camera, registration, config, terrain)
+        self._longest_sigma_m = config.longest_sigma_m
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is a pose to carry on from."""
+        return self._odometry.ready
+
+    def begin(
+        self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array,
+        sweep: Sweep | None = None,
+    ) -> None:  # fmt: skip
+        """The map has just said where this frame was: whatever was bridged before is over."""
+        camera = followed(self._pinhole, estimate.camera)
+        frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
+        self._odometry.begin(
+            frame,
+            estimate.world_from_camera,
+            estimate.covariance,
+            velocity=velocity,
+            surface=anchors.points_world,
+            constraint=self._constraint(estimate.exposure_time_ns, estimate.world_from_camera),
+        )
+
+    def carry(
+        self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None,
+        sweep: Sweep | None = None,
+    ) -> PropagatedPose:  # fmt: skip
+        """Carry the pose on to a frame. anchors: of the reference at the prediction, if any."""
+        if not self._odometry.ready:
+            return _NOTHING
+        camera = followed(self._pinhole, frame.camera)
+        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep, camera)
+        surface = anchors.points_world if anchors is not None else None
+        constraint = self._constraint(frame.exposure_time_ns, prediction.world_from_camera)
+        try:
+            estimate = self._odometry.step(
+                seen,
+                prediction,
+                surface=surface,
+                constraint=constraint,
+                clearance_m=self._sensors.clearance_at(frame.exposure_time_ns),
+            )
+        except OdometryError:  # no depth for a first keyframe: there will be none later
+            self._odometry.forget()
+            return PropagatedPose(PropagationResult.BROKEN)
+        if estimate.status is OdometryStatus.LOST:
+            self._odometry.forget()
+            return PropagatedPose(PropagationResult.BROKEN)
+        if not estimate.usable:
+            return PropagatedPose(PropagationResult.GAP)
+        if np.sqrt(estimate.covariance.diagonal()[:3].max()) > self._longest_sigma_m:
+            self._odometry.forget()
+            return PropagatedPose(PropagationResult.BROKEN)
+        return PropagatedPose(
+            PropagationResult.CARRIED,
+            estimate.world_from_camera,
+            estimate.covariance,
+            estimate.quality,
+        )
+
+    def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
+        """about: where the camera is, to some metres."""
+        rotation, height_m = self._sensors.rotation_at(time_ns), self._sensors.height_at(time_ns)
+        known = []
+        if rotation is not None:
+            known.append(attitude_constraint(rotation, _TILT_RAD, _HEADING_RAD))
+        if height_m is not None:
+            world_z = height_m - fallen_m(about.translation)
+            known.append(height_constraint(world_z, _HEIGHT_M))
+        return combine(*known) if known else None

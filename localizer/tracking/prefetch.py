@@ -1,0 +1,130 @@
+"""The next frame's features, extracted while the frame before is being registered.
+
+Two threads share an `FeaturePrefetcher`: one prepares frames (`prepare`), the other takes them (`take`). At
+most one is prepared ahead, and not before the taker is about to be done: no frame grows old in
+between, and what waits in front is always the newest one.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from localizer.tracking.mailbox import Mailbox
+from localizer.types import FeaturePyramid, Frame
+
+_SHARE = 0.25  # of a new duration in the smoothed one
+
+
+@dataclass(frozen=True)
+class PrefetchedFrame:
+    """A frame, its features where they were extracted ahead, and the milliseconds that took."""
+
+    frame: Frame
+    features: FeaturePyramid | None = None
+    extract_ms: float = 0.0
+
+
+@dataclass
+class ProcessingTimes:
+    """How long an extraction and the taker's work take, smoothed, in seconds."""
+
+    extract_s: float = 0.0
+    busy_s: float = 0.0
+
+    def extracted(self, spent_s: float) -> None:
+        """An extraction took so long."""
+        self.extract_s += _SHARE * (spent_s - self.extract_s)
+
+    def worked(self, spent_s: float) -> None:
+        """The taker was busy with a frame for so long."""
+        self.busy_s += _SHARE * (spent_s - self.busy_s)
+
+    def pause_s(self, since_taken_s: float) -> float:
+        """How long to wait with the next extraction, for it to end when the taker does: a newer
+        frame may come till then.
+        """
+        return max(self.busy_s - self.extract_s - since_taken_s, 0.0)
+
+
+class FeaturePrefetcher:
+    """Hands frames over, the newest first; those in front that are displaced are counted.
+
+    extract: a frame's features. may: whether features may be extracted ahead now; where not, the
+    newest frame is handed over without, once the taker waits for it.
+    """
+
+    def __init__(self, extract: Callable[[Frame], FeaturePyramid], may: Callable[[], bool]) -> None:
+        self._extract, self._may = extract, may
+        self._frames: Mailbox[Frame] = Mailbox()
+        self._prepared: Mailbox[PrefetchedFrame] = Mailbox()
+        self._wanted = threading.Event()  # nothing is prepared: the next may be
+        self._wanted.set()
+        self._waits = threading.Event()  # the taker has nothing to do
+        self._taken_s = 0.0
+        self._pace = ProcessingTimes()
+
+    @property
+    def dropped(self) -> int:
+        """How many frames were displaced by a newer one before they were prepared."""
+        return self._frames.dropped
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a frame waits that the next one would displace."""
+        return self._frames.is_full
+
+    def put(self, frame: Frame) -> None:
+        """Offer a frame, over an older one that was not yet prepared; never waits."""
+        self._frames.put(frame)
+
+    def prepare(self, timeout_s: float) -> None:
+        """Prepare the newest frame as soon as it is time; some timeouts later without, if none is.
+
+        An extraction that fails is left to the taker, who meets its error with the frame.
+        """
+        if not self._wanted.wait(timeout_s):
+            return
+        may = self._may()
+        if may:
+            pause_s = self._pace.pause_s(time.monotonic() - self._taken_s)
+            self._waits.wait(min(pause_s, timeout_s))
+        elif not self._waits.wait(timeout_s):
+            return
+        frame = self._frames.take(timeout_s)
+        if frame is None:
+            return
+        self._wanted.clear()
+        self._prepared.put(self._with_features(frame) if may else PrefetchedFrame(frame))
+
+    def _with_features(self, frame: Frame) -> PrefetchedFrame:
+        begun_s = time.monotonic()
+        try:
+            features = self._extract(frame)
+        except Exception:  # the taker's own attempt reports it
+            return PrefetchedFrame(frame)
+        spent_s = time.monotonic() - begun_s
+        self._pace.extracted(spent_s)
+        return PrefetchedFrame(frame, features, 1e3 * spent_s)
+
+    def take(self, timeout_s: float) -> PrefetchedFrame | None:
+        """The next frame, waiting for one; None after the timeout or once closed."""
+        if not self._waits.is_set():
+            if self._taken_s:
+                self._pace.worked(time.monotonic() - self._taken_s)
+            self._waits.set()
+        prepared = self._prepared.take(timeout_s)
+        if prepared is not None:
+            self._taken_s = time.monotonic()
+            self._waits.clear()
+            self._wanted.set()
+        return prepared
+
+    def close(self) -> None:
+        """Wake both threads for good."""
+        self._frames.close()
+        self._prepared.close()
+        self._wanted.set()
+        self._waits.set()

@@ -1,0 +1,46 @@
+"""A small file that is replaced as a whole: who reads it sees the old text or the new one, and
+reads no more of it than it may hold.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+PRIVATE = 0o600
+
+
+def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = False) -> None:
+    """Write the text beside the file, and put it in its place; `OSError` where the disk refuses.
+
+    The file beside it is always a new one: a link that somebody laid there is not followed.
+    durable: it is on the disk before it is in its place, for what must outlive a loss of power.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.unlink(missing_ok=True)
+    with open(
+        os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w", encoding="utf-8"
+    ) as file:
+        file.write(text)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def read_small_file(path: Path, most: int = 1000) -> str:
+    """The text, UTF-8. most: bytes, beyond which the file is another one.
+
+    `OSError` for a link, a pipe, whose reader waits for who writes, and for a longer file;
+    ValueError for what is no text.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "is no plain file", str(path))
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"is larger than {most} bytes", str(path))
+    return data.decode("utf-8")

@@ -1,0 +1,115 @@
+"""Mode ``rc``: an RC channel or a command decides between shadow and inject."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import InjectionEnableConfig
+from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
+
+_HYSTERESIS_US = 50
+_PULSE_US = (800, 2200)  # outside it no receiver speaks; 65535 means "no such channel"
+
+COMMANDS = {
+    "user_1": mavlink.MAV_CMD_USER_1,
+    "user_2": mavlink.MAV_CMD_USER_2,
+    "user_3": mavlink.MAV_CMD_USER_3,
+    "user_4": mavlink.MAV_CMD_USER_4,
+    "user_5": mavlink.MAV_CMD_USER_5,
+}
+
+
+class InjectionEnable:
+    """Open or closed by whoever spoke last: the channel when it is moved, or a command.
+
+    A receiver that falls silent changes nothing: to take the position from the EKF at that moment
+    would turn the vehicle's way home into a landing. Any thread may call.
+
+    changed: called with a line for the operator when it opens or closes. memory: of the gate that
+    a process before this one left open.
+    """
+
+    def __init__(
+        self,
+        config: InjectionEnableConfig,
+        changed: Callable[[str], None],
+        memory: InjectionEnableMemory | None = None,
+    ) -> None:
+        self._config = config
+        self._changed = changed
+        self._lock = threading.Lock()
+        self._open = False
+        self._high: bool | None = None
+        self._memory = memory
+        self._at_start = "injection off, shadow (at the start)"
+
+    def recall(self) -> None:
+        """Open it if it was left open by a process that did not end in order; `announce` tells."""
+        remembered = self._memory.recall() if self._memory is not None else None
+        if remembered is None:
+            return
+        by_channel, age_s = remembered
+        with self._lock:
+            if by_channel:
+                self._high = True  # a switch turned off meanwhile closes it at its first look
+            self._open = True
+            self._at_start = f"injection on (restored, {age_s:.0f} s old)"
+        if self._memory is not None:
+            self._memory.opened(by_channel=by_channel)
+
+    def announce(self) -> None:
+        """Tell how it stood at the start: once the links have somebody who hears it."""
+        self._changed(self._at_start)
+
+    def stop(self, *, clean_shutdown: bool = True) -> None:
+        """The end; of an orderly one nothing is remembered."""
+        if self._memory is not None:
+            self._memory.stop(clean_shutdown=clean_shutdown)
+
+    @property
+    def open(self) -> bool:
+        """Whether positions may be sent."""
+        return self._open
+
+    def channels(self, pulses_us: Sequence[int]) -> None:
+        """RC_CHANNELS came: a channel that crossed its threshold decides."""
+        number = self._config.channel
+        pulse = pulses_us[number - 1] if len(pulses_us) >= number else 0
+        if not _PULSE_US[0] <= pulse <= _PULSE_US[1]:
+            return
+        with self._lock:
+            before = self._high
+            slack = _HYSTERESIS_US if before else 0
+            self._high = pulse >= self._config.inject_above_us - slack
+            # At the first look only a switch that is on counts: a command may have come before.
+            moved = self._high if before is None else self._high != before
+        if moved:
+            self._set(bool(self._high), f"channel {number}", by_channel=True)
+
+    def command(self, command: int, wanted: float) -> int:
+        """A command to the localizer's component; the MAV_RESULT to acknowledge it with.
+
+        wanted: its param1, 1 opens and 0 closes.
+        """
+        if self._config.command is None or command != COMMANDS[self._config.command]:
+            return int(mavlink.MAV_RESULT_UNSUPPORTED)
+        if not math.isfinite(wanted) or wanted not in (0.0, 1.0):
+            return int(mavlink.MAV_RESULT_DENIED)
+        self._set(wanted == 1.0, "command", by_channel=False)
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _set(self, wanted: bool, by: str, *, by_channel: bool) -> None:
+        with self._lock:
+            if wanted == self._open:
+                return
+            self._open = wanted
+            if self._memory is not None:
+                if wanted:
+                    self._memory.opened(by_channel=by_channel)
+                else:
+                    self._memory.closed()
+        self._changed(f"injection {'on' if wanted else 'off, shadow'} ({by})")

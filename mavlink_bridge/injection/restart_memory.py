@@ -1,0 +1,194 @@
+"""What is remembered over a restart: a small file, and when it is too old to count.
+
+A companion that is killed under denial and comes back with its gate closed would leave the vehicle
+without a position: LAND. One that had seen its map 20 m beside GNSS and comes back once that is
+gone would inject it unproven. A file each says so, and is renewed while it holds.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import stat
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mavlink_bridge.atomic_file import read_small_file, replace_file
+from mavlink_bridge.link.clock import boot_id
+
+_log = logging.getLogger(__name__)
+_OLDEST_S = 600.0
+_RENEW_S = 30.0
+_STOP_S = 2.0
+_LONGEST = 80  # characters of a reason
+
+
+class RestartMemory:
+    """What holds now, for a process that takes over from one that was killed. Reads once; writes in
+    a thread of its own, so that a disk that stands still stalls nobody.
+
+    about: what it holds of, empty where that is always the same; what was kept of another counts
+    for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the
+    computer that clock counts, which nobody sets; else, where it lost its power in the air, the
+    wall clock.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        wall_s: Callable[[], float] = time.time,
+        clock_s: Callable[[], float] = time.monotonic,
+        boot: str | None = None,
+        about: str = "",
+    ) -> None:
+        self._path, self.about = path, about
+        self._wall_s, self._clock_s = wall_s, clock_s
+        self._boot = boot_id() if boot is None else boot
+        self._wake = threading.Event()
+        self._stopping = self._in_use = False
+        self._told: dict[str, Any] | None = None
+        self._thread = threading.Thread(target=self._run, name=path.stem, daemon=True)
+        self._thread.start()
+
+    def recall(self) -> tuple[dict[str, Any], float] | None:
+        """What was kept, and how long ago that was last true, s; None if nothing was, or nothing
+        that may be trusted.
+        """
+        self._in_use = True
+        try:
+            status = os.lstat(self._path)
+            private = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077
+            if not private or status.st_uid != os.geteuid():
+                _log.warning("%s is not this user's alone (mode 0600): ignored", self._path)
+                return None
+            content = json.loads(read_small_file(self._path))
+            age_s = self._age_s(content)
+            if self.about and content.get("about", self.about) != self.about:
+                _log.warning("%s is of something else than what flies now: ignored", self._path)
+                return None
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            _log.warning("%s cannot be used: %s", self._path, error)
+            return None
+        return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
+
+    def keep(self, told: dict[str, Any]) -> None:
+        """This is true from now on."""
+        self._in_use = True
+        self._told = told
+        self._wake.set()
+
+    def drop(self) -> None:
+        """Nothing is from now on."""
+        self._told = None
+        self._wake.set()
+
+    def stop(self, *, clean_shutdown: bool = True) -> None:
+        """End the thread. An orderly end is the pilot's: nothing is remembered of it. After another
+        one the next process takes over, as after a kill; who says so first is believed.
+
+        A standby that never flew leaves the file alone: it is of the process that flies.
+        """
+        if not self._stopping:
+            if clean_shutdown:
+                self._told = None
+            else:
+                self._in_use = False
+            self._stopping = True
+            self._wake.set()
+        self._thread.join(_STOP_S)
+
+    def _age_s(self, content: dict[str, Any]) -> float:
+        utc_s = float(content["utc_s"])
+        if self._boot and content.get("boot") == self._boot:
+            return self._clock_s() - float(content["clock_s"])
+        return self._wall_s() - utc_s
+
+    def _run(self) -> None:
+        known: bool | None = None  # whether there is a file of ours
+        while True:
+            self._wake.wait(_RENEW_S if self._told is not None else None)
+            self._wake.clear()
+            stopping = self._stopping  # before the write: an order to end that comes in it is next
+            told = self._told
+            try:
+                if told is not None:
+                    self._write(told)
+                elif self._in_use:
+                    self._path.unlink(missing_ok=True)
+                known = True
+            except OSError as error:
+                if known is not False:
+                    _log.warning("%s is not kept: %s", self._path, error)
+                known = False
+            if stopping:
+                return
+
+    def _write(self, told: dict[str, Any]) -> None:
+        """Whole or not at all."""
+        stamps = {"utc_s": self._wall_s(), "boot": self._boot, "clock_s": self._clock_s()}
+        about = {"about": self.about} if self.about else {}
+        replace_file(self._path, json.dumps(told | about | stamps), durable=True)
+
+
+class InjectionEnableMemory:
+    """Of the gate that is open; see `RestartMemory`."""
+
+    def __init__(self, memory: RestartMemory) -> None:
+        self._memory = memory
+
+    def recall(self) -> tuple[bool, float] | None:
+        """Whether the gate was opened by a channel (else by a command), and how long ago that was
+        last true, s; None if it was closed, or nothing is known that may be trusted.
+        """
+        found = self._memory.recall()
+        if found is None or found[0].get("open") is not True:
+            return None
+        return found[0].get("by_channel") is True, found[1]
+
+    def opened(self, *, by_channel: bool) -> None:
+        """The gate is open from now on."""
+        self._memory.keep({"open": True, "by_channel": by_channel})
+
+    def closed(self) -> None:
+        """The gate is closed from now on."""
+        self._memory.drop()
+
+    def stop(self, *, clean_shutdown: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(clean_shutdown=clean_shutdown)
+
+
+class ShadowFailureMemory:
+    """Of a shadow score that spoke against the map; see `RestartMemory`."""
+
+    def __init__(self, memory: RestartMemory) -> None:
+        self._memory = memory
+        self._kept = ""
+
+    def recall(self) -> str:
+        """What spoke against it in the process before; empty for nothing."""
+        found = self._memory.recall()
+        against = None if found is None else found[0].get("against")
+        told = against[:_LONGEST] if isinstance(against, str) and against.isprintable() else ""
+        self.note(told)
+        return told
+
+    def note(self, against: str) -> None:
+        """What speaks against it now; empty for nothing."""
+        if against == self._kept:
+            return
+        self._kept = against
+        if against:
+            self._memory.keep({"against": against})
+        else:
+            self._memory.drop()
+
+    def stop(self, *, clean_shutdown: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(clean_shutdown=clean_shutdown)

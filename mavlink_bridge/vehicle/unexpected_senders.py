@@ -1,0 +1,90 @@
+"""Others on the link who mean a wiring or a start by mistake: a second vehicle, a second us."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.vehicle.presence import DuplicateSystemIdMonitor
+from mavlink_bridge.vehicle.readings import is_autopilot
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+_TURNS = 6  # armed and disarmed again three times: nobody flies so
+_TURNS_IN_NS = 10_000_000_000
+_LIES = 3  # of TIMESYNC, which is asked once a second
+
+
+class UnexpectedSenderMonitor:
+    """Tells the operator of them, once each; one thread."""
+
+    def __init__(
+        self,
+        config: BridgeConfig,
+        tracker: VehicleTracker,
+        teller: StatusNotifier,
+        counters: Counter[str],
+    ) -> None:
+        self._config = config
+        self._tracker = tracker
+        self._teller = teller
+        self._counters = counters
+        self._twins = DuplicateSystemIdMonitor()
+        self._turns = (0, 0)  # arming's at a time
+        self._lies = (0, 0)  # of TIMESYNC likewise
+
+    def on_message(self, link: Link, message: Any) -> None:
+        """A message that is not the vehicle's; only its heartbeat says who it is from."""
+        if message.get_type() != "HEARTBEAT" or not link.system_id:
+            return
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        config, tell = self._config, self._teller.tell
+        ours = (config.localizer_component, config.companion_component, config.camera_component)
+        if system == link.system_id and component in ours:
+            tell("twin", f"another companion speaks as component {component}: stop one")
+        elif system == link.system_id and is_autopilot(message):
+            self._counters["other_autopilots"] += 1
+            tell("twins", f"another autopilot is system {system}, too: give it another id")
+        elif config.system_id is None and is_autopilot(message):
+            self._counters["other_autopilots"] += 1
+            tell(
+                "others",
+                f"autopilot {system} is heard, {link.system_id} is followed: set bridge.system_id",
+            )
+
+    def check(self, link: Link, now_ns: int) -> None:
+        """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
+        if link.stranger:
+            self._teller.tell("foreign", f"MAVLink of {link.stranger} ignored")
+        others = self._tracker.other_gimbals
+        if others and not self._config.camera.gimbal_component:
+            component, device = others[0]
+            self._teller.tell("gimbals", f"another gimbal ignored: {component}, device {device}")
+        self._check_arming(link, now_ns)
+        clock = self._tracker.clock
+        self._check_answers(clock.contradictions, now_ns)
+        ran_back = self._twins.two(now_ns, clock.strays + clock.reboots)
+        if ran_back or self._tracker.impostors:
+            system = link.system_id
+            self._teller.tell("twins", f"two autopilots speak as system {system}: change one's id")
+
+    def _check_answers(self, now: int, now_ns: int) -> None:
+        """Answers to TIMESYNC of quite another time than the vehicle's stamps are another's."""
+        lies, since_ns = self._lies
+        if now - lies >= _LIES:
+            self._teller.tell("answers", "TIMESYNC contradicts the stamps: do two answer?")
+        if now - lies >= _LIES or now_ns - since_ns > _TURNS_IN_NS:
+            self._lies = (now, now_ns)
+
+    def _check_arming(self, link: Link, now_ns: int) -> None:
+        """Forged heartbeats of the autopilot's ids: what is shut while armed stays shut then."""
+        turns, since_ns = self._turns
+        now = self._tracker.arming.turns
+        if now - turns >= _TURNS:
+            self._teller.tell(
+                "arming", f"system {link.system_id} says armed and disarmed in turn: sign the link"
+            )
+        if now - turns >= _TURNS or now_ns - since_ns > _TURNS_IN_NS:
+            self._turns = (now, now_ns)

@@ -1,0 +1,61 @@
+"""What happened to the vehicle that changes what its operator should do: GNSS gone, arming."""
+
+from __future__ import annotations
+
+from mavlink_bridge.injection.shadow import gnss_healthy
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.status_notifier import StatusNotifier
+
+_LOST_NS = 1_000_000_000  # beyond the freshness of a report, 1.5 s
+_PAID_BACK = 0.25  # of that time by each moment in which it is well: half of it is no GNSS
+_BACK_NS = 5_000_000_000
+_HELD_NS = 10_000_000_000
+
+
+class VehicleEvents:
+    """Looks ten times a second; one thread. Each change is told once, and only when it lasts."""
+
+    def __init__(self, teller: StatusNotifier) -> None:
+        self._teller = teller
+        self._gnss: bool | None = None  # None: never seen healthy
+        self._back_ns: int | None = None  # since when it is well again
+        self._bad_ns = self._looked_ns = 0  # for how long it was not, on balance
+        self._armed = False
+        self._held_ns: int | None = None
+
+    def look(self, state: VehicleState, now_ns: int, *, injecting: bool) -> None:
+        """Take in the vehicle's state. injecting: positions are being sent."""
+        healthy = gnss_healthy(state, now_ns)
+        self._follow_gnss(healthy, now_ns, injecting=injecting)
+        if state.armed and not self._armed and not healthy:
+            what = "injecting" if injecting else "nothing is injected"
+            self._teller.warn(f"armed without GNSS, {what}")
+        self._armed = state.armed
+
+    def held(self, reason: str, now_ns: int) -> None:
+        """Why fixes that come are not sent, from the interlock; empty when they are or none come.
+
+        A score needs some seconds: what goes by itself is no news.
+        """
+        if not reason:
+            self._held_ns = None
+            return
+        self._held_ns = self._held_ns or now_ns
+        if now_ns - self._held_ns >= _HELD_NS:
+            self._teller.tell("held", f"not sent: {reason}")
+
+    def _follow_gnss(self, healthy: bool, now_ns: int, *, injecting: bool) -> None:
+        passed_ns, self._looked_ns = min(now_ns - self._looked_ns, _LOST_NS), now_ns
+        if not self._gnss:
+            self._back_ns = (self._back_ns or now_ns) if healthy else None
+            well = self._back_ns is not None and now_ns - self._back_ns >= _BACK_NS
+            if healthy and (well or self._gnss is None):
+                if self._gnss is not None:
+                    self._teller.inform("GNSS is back")
+                self._gnss, self._bad_ns = True, 0
+            return
+        change_ns = round(-_PAID_BACK * passed_ns) if healthy else passed_ns
+        self._bad_ns = max(self._bad_ns + change_ns, 0)
+        if self._bad_ns > _LOST_NS:
+            self._gnss, self._back_ns = False, None
+            self._teller.warn(f"GNSS lost, {'injecting' if injecting else 'nothing is injected'}")

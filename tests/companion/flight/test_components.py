@@ -1,0 +1,133 @@
+"""The table of parts: made and started in order, undone in the reverse, whatever fails."""
+
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from companion.config import parse_config
+from companion.flight.channels import Channel
+from companion.flight.component_table import COMPONENTS
+from companion.flight.components import Assembly, Component
+
+MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
+
+
+class Lower:
+    pass
+
+
+class Upper:
+    pass
+
+
+def _config(**bridge):
+    settings = {"map": "m", "camera": {"source": "s", "model": MODEL}, "bridge": bridge}
+    return parse_config(settings, "test")
+
+
+def _part(log, kind, make=None, **columns):
+    def note(what):
+        return lambda _: log.append(f"{what} {kind.__name__}")
+
+    def made(making):
+        log.append(f"make {kind.__name__}")
+        return (make or (lambda _: kind()))(making)
+
+    steps = {step: note(step) for step in ("start", "stop", "close")}
+    return Component(kind.__name__, kind, made, **{**steps, **columns})
+
+
+def test_all_are_made_before_the_first_starts_and_undone_in_the_reverse():
+    log: list[Any] = []
+    assembly = Assembly(_config(), [_part(log, Lower), _part(log, Upper)])
+    with ExitStack() as up:
+        assembly.make(up)
+        assembly.start(up)
+    assert log == [
+        "make Lower", "make Upper", "start Lower", "start Upper",
+        "stop Upper", "stop Lower", "close Upper", "close Lower",
+    ]  # fmt: skip
+
+
+def test_a_part_that_cannot_be_made_closes_those_before_it():
+    def fail(_):
+        raise OSError("no")
+
+    log: list[Any] = []
+    assembly = Assembly(_config(), [_part(log, Lower), _part(log, Upper, fail)])
+    with pytest.raises(OSError, match="no"), ExitStack() as up:
+        assembly.make(up)
+    assert log == ["make Lower", "make Upper", "close Lower"]
+
+
+def test_a_part_sees_what_its_line_names_and_nothing_else():
+    def use(making):
+        return making[Lower]
+
+    log: list[Any] = []
+    for depends in ((), (Lower,)):
+        parts = [_part(log, Lower), _part(log, Upper, use, depends=depends)]
+        with ExitStack() as up:
+            if depends:
+                Assembly(_config(), parts).make(up)
+                continue
+            with pytest.raises(LookupError, match="'Upper' uses Lower"):
+                Assembly(_config(), parts).make(up)
+
+
+def test_a_part_that_is_asked_later_stands_below():
+    found = []
+
+    def use(making):
+        upper = making.later(Upper)
+        found.append(upper)
+        return Lower()
+
+    log: list[Any] = []
+    parts = [_part(log, Lower, use, later=(Upper,)), _part(log, Upper)]
+    assembly = Assembly(_config(), parts)
+    with ExitStack() as up:
+        assembly.make(up)
+        assert found[0]() is assembly[Upper]
+    with pytest.raises(LookupError, match="depends on Upper"):
+        Assembly(_config(), [_part(log, Lower, depends=(Upper,)), _part(log, Upper)])
+
+
+def test_what_is_not_wanted_is_not_made():
+    log: list[Any] = []
+    parts = [
+        _part(log, Lower, wanted=lambda config: config.bridge.camera.announce),
+        _part(log, Upper, lambda making: making.get(Lower) or Upper(), depends=(Lower,)),
+    ]
+    with ExitStack() as up:
+        Assembly(_config(camera={"announce": False}), parts).make(up)
+    assert log == ["make Upper", "close Upper"]
+
+
+def test_the_process_starts_and_stops_in_this_order():
+    """The bridge speaks before anything could have something to say, the feed comes last."""
+    started = [part.name for part in COMPONENTS if part.start is not None]
+    assert started == [
+        "bridge", "guardian", "record", "klv", "health", "targets", "detector", "last fix", "view",
+        "vital signs", "search",
+        "console", "engine", "feed",
+    ]  # fmt: skip
+    made = [part.name for part in COMPONENTS]
+    # A wrong source and a port in use are told before anything is compiled.
+    assert made.index("source") < made.index("detections") < made.index("localizer")
+    Assembly(_config(), COMPONENTS)
+
+
+def test_every_subscriber_is_served_though_one_fails():
+    channel: Channel[Any] = Channel()
+    taken: list[Any] = []
+
+    def fail(_):
+        raise ValueError("boom")
+
+    channel.subscribe(fail)
+    channel.subscribe(taken.append)
+    with pytest.raises(ValueError, match="boom"):
+        channel.send(1)
+    assert taken == [1]

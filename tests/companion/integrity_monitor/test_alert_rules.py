@@ -1,0 +1,87 @@
+"""Latches: time to alert, release, repetition, and what no evidence does."""
+
+import pytest
+
+from companion.integrity_monitor.alert_rules import (
+    PREFIX,
+    RULES,
+    AlertDebouncer,
+    AlertRule,
+    CheckResult,
+    OutputAction,
+)
+
+SECOND = 1_000_000_000
+BAD, GOOD, UNKNOWN = CheckResult(True, 12.0), CheckResult(False), CheckResult(None)
+
+
+def rule(**changes: float) -> AlertRule:
+    """A rule that alerts after 1 s and is over after 2 s."""
+    return AlertRule(
+        "a_fault", "fault of {0:.0f} m", OutputAction.EXCLUDE_AND_RESET, 1.0, 2.0, **changes
+    )
+
+
+@pytest.mark.parametrize("each", RULES, ids=lambda each: each.name)
+def test_every_text_fits_one_statustext(each: AlertRule) -> None:
+    """A chunked text may be cut by a lossy link just where it matters."""
+    assert len(each.line(999.0)) <= 50  # STATUSTEXT.text
+
+
+def test_it_alerts_once_after_its_time() -> None:
+    """Not before, not again, and with the newest figure."""
+    debouncer = AlertDebouncer(rule())
+    told = [debouncer.update(k * SECOND // 2, BAD) for k in range(6)]
+    assert [text is not None for text in told] == [False, False, True, False, False, False]
+    assert told[2] == f"{PREFIX}withheld: fault of 12 m"
+
+
+def test_a_moment_is_no_finding() -> None:
+    """Good evidence in between starts the time anew."""
+    debouncer = AlertDebouncer(rule())
+    for k in range(20):
+        assert debouncer.update(k * SECOND // 2, GOOD if k % 2 else BAD) is None
+    assert not debouncer.raised
+
+
+def test_it_holds_until_good_evidence_lasts() -> None:
+    """Flicker and silence do not release it."""
+    debouncer = AlertDebouncer(rule())
+    debouncer.update(0, BAD)
+    debouncer.update(SECOND, BAD)
+    assert debouncer.raised
+    for k in range(2, 9):
+        debouncer.update(k * SECOND, (GOOD, BAD, UNKNOWN)[k % 3])
+        assert debouncer.raised
+    debouncer.update(20 * SECOND, GOOD)
+    assert debouncer.update(22 * SECOND, GOOD) == f"{PREFIX}over: a fault"
+    assert not debouncer.raised
+
+
+def test_silence_is_no_good_evidence() -> None:
+    """Good once, then nothing for long, then good once more does not release it."""
+    debouncer = AlertDebouncer(rule())
+    debouncer.update(0, BAD)
+    debouncer.update(SECOND, BAD)
+    debouncer.update(2 * SECOND, GOOD)
+    for k in range(3, 10):
+        debouncer.update(k * SECOND, UNKNOWN)
+    assert debouncer.update(10 * SECOND, GOOD) is None
+    assert debouncer.raised
+    assert debouncer.update(12 * SECOND, GOOD) == f"{PREFIX}over: a fault"
+
+
+def test_silence_is_no_evidence_of_a_fault() -> None:
+    """Bad, then nothing for long, then bad again is not a fault that lasted."""
+    debouncer = AlertDebouncer(rule())
+    debouncer.update(0, BAD)
+    for k in range(1, 10):
+        debouncer.update(k * SECOND, UNKNOWN)
+    assert debouncer.update(10 * SECOND, BAD) is None
+
+
+def test_what_lasts_is_told_again() -> None:
+    """Every repeat_s, and not more often."""
+    debouncer = AlertDebouncer(rule(repeat_s=10.0))
+    told = [k for k in range(40) if debouncer.update(k * SECOND, BAD) is not None]
+    assert told == [1, 11, 21, 31]

@@ -1,0 +1,486 @@
+"""The monitor against attacks on fixes, and in honest flights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.calibration_watch.observation import CalibrationObservation
+from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from localizer.geometry.pose import matrix_from_quaternion, so3_exp
+from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.vehicle.origin import offset
+from tests.companion.integrity_monitor.simulated import (
+    HEIGHT,
+    LATITUDE,
+    LONGITUDE,
+    Flight,
+    Path,
+    hover,
+    leg,
+    outside,
+    second,
+)
+
+
+def monitor(**limits: float) -> IntegrityChecks:
+    """With the shipped limits."""
+    return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(**limits))
+
+
+def frozen(path: Path, since_s: float) -> Path:
+    """What a hung camera shows of a path."""
+    return lambda at_s: path(min(at_s, since_s))
+
+
+@pytest.mark.parametrize("path", [hover, leg])
+@pytest.mark.parametrize("noise_m", [0.02, 0.5, 2.0])
+def test_an_honest_flight_is_left_alone(path: Path, noise_m: float) -> None:
+    """Neither a hover nor a start to 10 m/s costs a fix or a text."""
+    flight = Flight(monitor(), path, noise_m=noise_m, claimed_m=noise_m).fly(40.0)
+    assert flight.lines == []
+    assert flight.held == []
+    assert len(flight.passed) == 400
+
+
+def test_a_position_that_freezes_in_flight_is_told_within_two_seconds() -> None:
+    """At 10 m/s: the IMU felt nothing that would have stopped the aircraft."""
+    flight = Flight(monitor(), leg, frozen(leg, 12.0), noise_m=0.03).fly(40.0)
+    assert flight.told("withheld: motion is not the IMU's") < 14.0
+    assert max(flight.held) > 39.0
+    assert min(flight.held) < 14.0
+    assert not [fix for fix in flight.passed if fix.time_ns > 14.5e9]
+
+
+@dataclass
+class Filmed:
+    """A flight and its pictures, 0.2 m to a pixel, each with fresh noise: a sensor hung behind an
+    encoder that goes on.
+    """
+
+    flight: Flight
+    looks_at: Path
+
+    def fly(self, until_s: float) -> Flight:
+        """On to a time of the flight, with a picture every 0.1 s."""
+        rng = np.random.default_rng(3)
+        ground = cv2.resize(rng.integers(40, 215, (150, 400), np.uint8), (800, 2400))
+        while self.flight.at_s < until_s:
+            north, east = self.looks_at(self.flight.at_s)
+            y, x = 60 + 5.0 * north, 200 + 5.0 * east
+            shift = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y]])
+            picture = cv2.warpAffine(ground, shift, (320, 240))[..., None].astype(np.float64)
+            noisy = np.clip(picture + rng.normal(0.0, 2.0, (240, 320, 3)), 0, 255)
+            self.flight.monitor.see(second(self.flight.at_s), noisy.astype(np.uint8))
+            self.flight.fly(self.flight.at_s + 0.1)
+        return self.flight
+
+
+def test_a_picture_that_freezes_on_the_way_is_told_before_5_m() -> None:
+    """At 10 m/s. By the IMU alone it took 1.4 s, in which 9 m were injected (ArduPilot)."""
+    flight = Filmed(Flight(monitor(), leg, frozen(leg, 12.0), noise_m=0.03), frozen(leg, 12.0))
+    flight.fly(14.0)
+    assert flight.flight.told("withheld: video frozen") <= 12.6
+    assert not [fix for fix in flight.flight.passed if fix.time_ns > 12.5e9]
+
+
+def test_fog_is_no_frozen_video() -> None:
+    """Found on ArduPilot: a bank of fog was told as a feed that hangs."""
+    fog = Flight(monitor(), leg, noise_m=0.03)
+    while fog.fly(fog.at_s + 0.1).at_s < 12.0:
+        fog.monitor.see(second(fog.at_s), np.full((240, 320, 3), 205, np.uint8))
+    assert fog.lines == []
+
+
+def test_a_filmed_flight_is_left_alone() -> None:
+    """Hover, start, 10 m/s."""
+    flight = Filmed(Flight(monitor(), leg, noise_m=0.03), leg).fly(14.0)
+    assert flight.lines == []
+    assert flight.held == []
+
+
+def test_a_calm_hover_on_good_fixes_is_left_alone() -> None:
+    """Within 0.1 m for a minute: both vehicles do so without wind."""
+    flight = Flight(monitor(), lambda at_s: hover(0.0), noise_m=0.02).fly(60.0)
+    assert flight.lines == []
+    assert flight.held == []
+
+
+def test_what_moves_again_is_believed_again_with_a_reset() -> None:
+    """The EKF holds what was wrong: the first fix afterwards must not be fought."""
+
+    def thaws(at_s: float) -> tuple[float, float]:
+        return leg(12.0 if 12.0 < at_s < 16.0 else at_s)
+
+    flight = Flight(monitor(), leg, thaws, noise_m=0.03).fly(60.0)
+    assert 16.0 < flight.told("over: motion") < 55.0
+    back = [fix for fix in flight.passed if fix.time_ns > 16e9]
+    assert back[0].reset
+    assert not any(fix.reset for fix in back[1:])
+
+
+def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
+    """Held and told at once; what comes back in time is not."""
+
+    def relocalized(at_s: float) -> tuple[float, float]:
+        north, east = hover(at_s)
+        return north + (60.0 if 10.0 <= at_s < 13.0 else 0.0), east
+
+    flight = Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(20.0)
+    assert flight.told("withheld: position jumped 5") < 10.2
+    assert min(flight.held) == pytest.approx(10.0)
+    assert max(flight.held) <= 13.1  # until the next step
+    assert len(flight.passed) >= 168
+
+
+def test_a_jump_in_fast_flight_does_not_pass_by_waiting_a_second() -> None:
+    """10 m aside at 10 m/s, as of a frame that turns by 5 degrees 120 m from home."""
+
+    def cruise(at_s: float) -> tuple[float, float]:
+        return 10.0 * at_s, 0.0
+
+    def turned(at_s: float) -> tuple[float, float]:
+        north, east = cruise(at_s)
+        return north, east + (10.0 if 10.0 <= at_s < 14.0 else 0.0)
+
+    flight = Flight(monitor(), cruise, turned).fly(20.0)
+    assert flight.told("withheld: position jumped") < 10.5
+    assert not [fix for fix in flight.passed if 10e9 <= fix.time_ns < 14e9]
+
+
+def test_a_jump_that_agrees_in_motion_is_taken_with_a_reset() -> None:
+    """The old place may have been the wrong one: after 5 s it is believed, and announced."""
+
+    def relocalized(at_s: float) -> tuple[float, float]:
+        north, east = hover(at_s)
+        return north + (60.0 if at_s >= 10.0 else 0.0), east
+
+    flight = Flight(monitor(), hover, relocalized).fly(30.0)
+    back = [fix for fix in flight.passed if fix.time_ns > 10e9]
+    assert 15e9 <= back[0].time_ns < 16e9
+    assert back[0].reset
+
+
+def test_a_jump_within_the_alert_limit_passes_if_it_is_announced() -> None:
+    """A relocalization after bridging; without a word it is held."""
+
+    def relocalized(at_s: float) -> tuple[float, float]:
+        north, east = hover(at_s)
+        return north + (8.0 if at_s >= 10.0 else 0.0), east
+
+    assert Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(12.0).held == []
+    assert Flight(monitor(), hover, relocalized).fly(12.0).held != []
+
+
+def late(from_s: float, until_s: float = np.inf) -> Path:
+    """What a stream that lags 0.3 s shows of `leg`, stamped as if it did not."""
+    return lambda at_s: leg(at_s - 0.3 if from_s <= at_s < until_s else at_s)
+
+
+def test_positions_of_a_stream_that_begins_to_lag_are_within_their_level() -> None:
+    """`late-300ms` at 10 m/s on ArduPilot: 149 of 590 were up to 1.9 times their level off, until a
+    turn told of the stamps. The step at its beginning was seen, and below what is held.
+    """
+    flight = Flight(monitor(), leg, late(12.0), noise_m=0.1, claimed_m=0.1).fly(30.0)
+    assert flight.held == []
+    assert outside(flight) == []
+    assert flight.told("position stepped 3 m, unexplained") <= 12.5
+    assert flight.passed[-1].protection_m is not None
+    assert flight.passed[-1].protection_m[0] < 6.0  # a bound, not a refusal
+    # The EKF was told 0.1 m of positions 3 m behind: it believed them, and turned its yaw away.
+    told = [np.sqrt(fix.position_covariance_ned[0, 0]) for fix in flight.passed]
+    assert max(told[:100]) == pytest.approx(0.1)
+    assert 2.5 < min(told[-100:]) <= max(told[-100:]) < 3.5
+
+
+def test_a_lag_that_ends_leaves_no_doubt() -> None:
+    """The step back takes away what the step had brought: told once as over, level as before."""
+    flight = Flight(monitor(), leg, late(12.0, 20.0), noise_m=0.1, claimed_m=0.1).fly(30.0)
+    before = next(fix for fix in flight.passed if fix.time_ns >= second(11.5))
+    assert flight.passed[-1].protection_m == pytest.approx(before.protection_m, abs=0.01)
+    assert flight.passed[-1].position_covariance_ned[0, 0] == pytest.approx(0.1**2)
+    assert [line for _, line in flight.lines] == [
+        "PiLoT: position stepped 3 m, unexplained",
+        "PiLoT: over: step",
+    ]
+
+
+def test_a_step_aside_is_settled_where_the_place_is_found_anew() -> None:
+    """2 m across the way: a second likely place beside the first, and who knows which is true."""
+
+    def aside(at_s: float) -> tuple[float, float]:
+        north, east = leg(at_s)
+        return north, east + (2.0 if at_s >= 12.0 else 0.0)
+
+    flight = Flight(monitor(), leg, aside, noise_m=0.1, claimed_m=0.1, reset_at_s=20.0).fly(24.0)
+    assert flight.told("position stepped 2 m, unexplained") <= 12.5
+    assert 20.0 <= flight.told("over: step") <= 20.2
+
+
+@pytest.mark.parametrize("accuracy_m", [1.0, 12.0])
+def test_gnss_apart_from_vision_is_told_as_long_as_it_lasts(accuracy_m: float) -> None:
+    """However bad the receiver claims to be: 12 m times a number of sigma would excuse 60 m."""
+    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0, gnss_accuracy_m=accuracy_m).fly(35.0)
+    told = [at_s for at_s, text in flight.lines if "from vision: neither proven" in text]
+    assert told[0] < 4.0
+    assert np.diff(told) == pytest.approx(10.0, abs=0.5)
+    assert len(told) == 4
+    assert flight.held == []  # neither is said to be right
+
+
+def test_gnss_that_is_gone_is_not_told_as_apart_for_the_rest_of_the_flight() -> None:
+    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0).fly(6.0)
+    told = len(flight.lines)
+    assert told == 1
+    flight.gnss_north_m = None
+    assert len(flight.fly(30.0).lines) == told
+    flight.gnss_north_m = lambda _: 20.0  # and as soon as it is there again, it is
+    assert len(flight.fly(32.0).lines) == told + 1
+
+
+def test_gnss_that_is_dragged_away_slowly_is_told_below_the_alert_limit() -> None:
+    """0.6 m/s from 5 s on."""
+    flight = Flight(monitor(), gnss_north_m=lambda at_s: 0.6 * max(at_s - 5.0, 0.0)).fly(40.0)
+    away_m = 0.6 * (flight.told("from vision: neither proven") - 5.0)
+    assert 3.0 < away_m < 10.0
+
+
+def test_a_receiver_that_lags_is_left_alone_and_a_dragged_one_is_told_at_speed() -> None:
+    """At 10 m/s a report that is 0.3 s old when it comes is 3 m behind; 10 m are told all the same.
+
+    Found on ArduPilot: 0.6 m/s of spoofing was told at 13 m in flight, at 8 m in a hover.
+    """
+
+    def behind(at_s: float) -> float:
+        return leg(at_s - 0.3)[0] - leg(at_s)[0]
+
+    honest = Flight(monitor(), leg, gnss_north_m=behind).fly(16.0)
+    assert honest.lines == []
+    dragged = Flight(monitor(), leg, gnss_north_m=lambda at_s: -0.6 * max(at_s - 10.0, 0.0))
+    assert 0.6 * (dragged.fly(40.0).told("GNSS") - 10.0) < 10.0
+
+
+def test_our_own_gps_input_is_no_gnss() -> None:
+    """Agreement or not with what we fed ourselves is no evidence."""
+    own = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(gnss_is_ours=True))
+    assert Flight(own, gnss_north_m=lambda _: 20.0).fly(10.0).lines == []
+
+
+def test_a_height_that_leaves_the_barometers_is_withheld() -> None:
+    """By a focal length that is wrong, or another place's ground."""
+    flight = Flight(monitor(), height_m=lambda at_s: 2.0 * max(at_s - 10.0, 0.0)).fly(25.0)
+    assert 14.0 < flight.told("off barometer") < 18.0
+    assert max(flight.held) > 24.0
+
+
+def test_a_barometer_that_drifts_is_no_finding() -> None:
+    """1.5 m a minute, as a front or a warming sensor makes it."""
+    assert Flight(monitor(), height_m=lambda at_s: 0.025 * at_s).fly(60.0).lines == []
+
+
+class Twice(Flight):
+    """Two flights of one process, on the ground from 20 to 40 s; meanwhile the weather changed."""
+
+    weather_m = 17.0
+
+    def state(self) -> VehicleState:
+        on_ground, later = 20.0 <= self.at_s < 40.0, self.at_s >= 30.0
+        return replace(
+            super().state(),
+            armed=not on_ground,
+            pressure_altitude_m=500.0 + (self.weather_m if later else 0.0),
+        )
+
+
+def test_the_weather_between_two_flights_is_no_finding() -> None:
+    """2 hPa in some hours are 17 m: the second flight was withheld from its first position on, and
+    to its end, because the zero of the first stood while it was off.
+    """
+    flight = Twice(monitor()).fly(60.0)
+    assert flight.lines == []
+    assert flight.held == []
+
+
+def test_a_height_that_was_off_in_one_flight_is_watched_anew_in_the_next() -> None:
+    def height(at_s: float) -> float:
+        return 30.0 if 10.0 <= at_s < 20.0 or at_s >= 50.0 else 0.0
+
+    flight = Twice(monitor(), height_m=height).fly(60.0)
+    told = [at_s for at_s, text in flight.lines if "off barometer" in text]
+    assert told == pytest.approx([12.8, 52.8], abs=1.0)
+    assert not [at_s for at_s in flight.held if 27.0 < at_s < 50.0]
+
+
+@dataclass
+class InAir(Flight):
+    """Climbs at 5 m/s by 100 m; the barometer's altitude is of the standard atmosphere, which is
+    15 degrees at sea level. celsius: the air's.
+    """
+
+    celsius: float = 15.0
+
+    def state(self) -> VehicleState:
+        climbed_m = self.height_m(self.at_s)
+        standard = climbed_m * 288.15 / (self.celsius + 273.15)
+        return replace(super().state(), pressure_altitude_m=500.0 + standard)
+
+
+def climb(at_s: float) -> float:
+    return min(5.0 * max(at_s - 10.0, 0.0), 100.0)
+
+
+@pytest.mark.parametrize("celsius", [-25.0, 0.0, 45.0])
+def test_a_climb_through_cold_or_hot_air_is_no_finding(celsius: float) -> None:
+    """At -25 degrees 100 m are 116 by the barometer: withheld at 60 m, and for the whole flight,
+    because its zero stands while it is off.
+    """
+    flight = InAir(monitor(), height_m=climb, celsius=celsius).fly(60.0)
+    assert flight.lines == []
+    assert flight.held == []
+
+
+@pytest.mark.parametrize("celsius", [-25.0, 45.0])
+def test_a_climb_that_vision_makes_half_is_withheld_in_any_air(celsius: float) -> None:
+    """It saw 50 m of 100: another place's ground."""
+
+    class Halved(InAir):
+        def state(self) -> VehicleState:
+            standard = climb(self.at_s) * 288.15 / (self.celsius + 273.15)
+            return replace(super().state(), pressure_altitude_m=500.0 + standard)
+
+    flight = Halved(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
+    assert flight.told("off barometer") < 21.0
+    assert max(flight.held) > 59.0
+
+
+def test_beyond_the_alert_limit_nothing_is_injected() -> None:
+    """A sigma of 3 m is honest, and too much for the risk."""
+    flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
+    assert flight.told("withheld: position only to") <= 3.0
+    assert max(flight.held) > 9.8
+    relaxed = Flight(monitor(alert_limit_m=20.0), noise_m=0.2, claimed_m=3.0).fly(10.0)
+    assert relaxed.held == []
+
+
+@pytest.mark.parametrize("raise_s", [0.3, 3.0])
+def test_the_alert_limit_is_told_within_the_time_to_alert(raise_s: float) -> None:
+    """What passes says how wrong it may be; what may be more wrong than the limit does not pass."""
+    flight = Flight(monitor(time_to_alert_s=raise_s), claimed_m=0.3, noise_m=0.1).fly(5.0)
+    levels = [fix.protection_m for fix in flight.passed]
+    assert all(level is not None and 0.0 < level[0] < 10.0 for level in levels)
+    flight.claimed_m = 3.5
+    flight.fly(12.0)
+    assert 5.0 < flight.told("withheld: position only to") <= 5.0 + min(raise_s, 1.0) + 0.21
+    flight.claimed_m = 0.3
+    flight.fly(15.6)
+    assert 15.0 <= flight.told("over: limit") < 15.5  # 3 s below it, or it would flap
+    assert max(flight.held) < 15.5
+
+
+def test_an_alert_limit_that_is_touched_now_and_then_does_not_flap() -> None:
+    """One fix in ten beyond it: neither told nor withheld."""
+    flight = Flight(monitor(), noise_m=0.1)
+    for tenth in range(1, 100):
+        flight.claimed_m = 3.5 if tenth % 10 == 0 else 0.3
+        flight.fly(0.1 * tenth)
+    assert flight.lines == []
+    assert flight.held == []
+
+
+def looking(flight: Flight, yaw_off_deg: float) -> CalibrationObservation:
+    """What the map says of a camera that looks 45 degrees down, north but for an angle."""
+    now_ns = second(flight.at_s)
+    gimbal = flight.gimbal_at(now_ns)
+    assert gimbal is not None
+    reported = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    turned = so3_exp(np.array([0.0, 0.0, np.radians(yaw_off_deg)])) @ reported
+    return CalibrationObservation(now_ns, (LATITUDE, LONGITUDE, HEIGHT), 0.1, turned, 85.0, 60.0)
+
+
+@pytest.mark.parametrize(("off_deg", "told"), [(4.0, True), (-12.0, True), (1.5, False)])
+def test_a_camera_that_is_mounted_wrong_is_told_and_injection_does_not_begin(
+    off_deg: float, told: bool
+) -> None:
+    """It is no reason to take back what already flies: positions do not depend on it."""
+    watched = monitor()
+    flight = Flight(watched, noise_m=0.1)
+    for quarter in range(1, 37):
+        flight.fly(0.25 * quarter)
+        watched.add_observation(looking(flight, off_deg))
+    text = f"PiLoT: camera {abs(off_deg):.0f} deg off in yaw"
+    assert [line for _, line in flight.lines] == ([text] if told else [])
+    assert watched.inhibits == (text.removeprefix("PiLoT: ") if told else "")
+    assert flight.held == []
+    if told:
+        assert flight.told(text) < 9.0
+    if off_deg == 4.0:
+        for quarter in range(37, 110):  # put right
+            flight.fly(0.25 * quarter)
+            watched.add_observation(looking(flight, 0.0))
+        assert flight.told("over: boresight") < 27.0
+        assert watched.inhibits == ""
+
+
+def swung(at_s: float) -> tuple[float, float]:
+    """To and fro by 12 m with 12 s: what shows a delay within half a minute."""
+    return 6.0 * np.sin(2 * np.pi * at_s / 12.0), 0.0
+
+
+def test_a_frozen_picture_is_no_evidence_of_its_stamps() -> None:
+    """A frozen hover was blamed on the time stamps, 413 ms late (ArduPilot): the place stands, and
+    the aircraft moves.
+    """
+    watched, shown = monitor(), frozen(swung, 12.0)
+    filmed = Filmed(Flight(watched, swung, shown, noise_m=0.05), shown)
+    flight = filmed.flight
+    while flight.at_s < 26.0:
+        # Until the freeze every tenth picture is enough.
+        (filmed if flight.at_s > 11.0 else flight).fly(flight.at_s + 0.25)
+        place = offset(LATITUDE, LONGITUDE, *shown(flight.at_s))
+        watched.add_observation(replace(looking(flight, 0.0), place=(*place, HEIGHT)))
+    texts = [line for _, line in flight.lines]
+    assert flight.told("withheld: video") < 16.0
+    assert not [line for line in texts if "stamped" in line or "focal" in line or "off in" in line]
+
+
+class WithoutPosition(Flight):
+    """Its EKF lost its position at 10 m/s, 30 s before, and says none any more: what it said last
+    stands. The pilot has stopped it since.
+    """
+
+    said_s = -30.0
+
+    def state(self) -> VehicleState:
+        return replace(
+            super().state(), local_velocity_ned=(10.0, 0.0, 0.0), local_time_ns=second(self.said_s)
+        )
+
+
+def calm(at_s: float) -> tuple[float, float]:
+    """A hover without wind: 0.02 m, which a picture shows, take 1.3 s."""
+    return hover(0.1 * at_s)
+
+
+def test_a_speed_of_before_the_ekf_lost_its_position_makes_no_picture_frozen() -> None:
+    """The place was found again, and withheld as `video frozen 0 s` every other second."""
+    flight = Filmed(WithoutPosition(monitor(), calm, noise_m=0.03), calm).fly(20.0)
+    assert flight.lines == []
+    assert flight.held == []
+
+
+def test_a_speed_of_before_the_ekf_lost_its_position_makes_no_level_small() -> None:
+    """It hovered when it lost it, and may fly at any speed since."""
+    fix = VisionFix(second(2.0), LATITUDE, LONGITUDE, HEIGHT)
+    hovered = replace(Flight(monitor()).state(), local_velocity_ned=(0.0, 0.0, 0.0))
+    levels = [
+        passed.protection_m[0]
+        for said_ns in (fix.time_ns, second(-30.0))
+        if (passed := monitor().admit(fix, replace(hovered, local_time_ns=said_ns))) is not None
+        and passed.protection_m is not None
+    ]
+    assert levels[1] > levels[0]

@@ -1,0 +1,133 @@
+"""What forbids injection is as true after a restart, until evidence speaks against it."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from companion.integrity_monitor.alert_rules import InhibitMemory
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
+from mavlink_bridge.injection.restart_memory import RestartMemory
+from mavlink_bridge.messages import VehicleState
+from tests.companion.integrity_monitor.simulated import Flight
+from tests.companion.integrity_monitor.test_checks import looking
+
+LONG = {"focal_length": (5.0, "long")}
+
+
+class Kept:
+    """A `RestartMemory` of this test."""
+
+    def __init__(self, found: object = None) -> None:
+        self.told: Any = None if found is None else json.loads(json.dumps({"forbids": found}))
+
+    def recall(self) -> tuple[dict[str, Any], float] | None:
+        return None if self.told is None else (self.told, 4.0)
+
+    def keep(self, told: dict[str, Any]) -> None:
+        self.told = json.loads(json.dumps(told))
+
+    def drop(self) -> None:
+        self.told = None
+
+    def stop(self, *, clean_shutdown: bool = True) -> None:
+        self.told = None if clean_shutdown else self.told
+
+
+def integrity_monitor(kept: Any, *, injecting: bool = False) -> tuple[IntegrityMonitor, list[str]]:
+    """Over a vehicle on the ground. What it forbids with each turn."""
+    forbidden: list[str] = []
+    flight = Flight(IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits()))
+    bridge: Any = SimpleNamespace(
+        injecting=injecting, state=VehicleState, inertial_since=lambda _: (), say=lambda *_: None,
+        attitude_at=lambda _: None, gimbal_at=flight.gimbal_at, suppress_ekf_ok=lambda _: None,
+        inhibit=forbidden.append, gnss_place_at=lambda _: None,
+    )  # fmt: skip
+    return IntegrityMonitor(
+        IntegrityMonitorConfig(), IntegrityLimits(), bridge, InhibitMemory(kept)
+    ), forbidden
+
+
+def test_what_forbade_in_a_process_that_was_killed_forbids_from_the_start() -> None:
+    """A focal length that was 5 % long: the next process injected after two seconds, and it took a
+    turn or a climb until it was found again.
+    """
+    kept = Kept(LONG)
+    again, forbidden = integrity_monitor(kept)
+    again.start()
+    assert forbidden[0] == "focal length looks 5.0 % long"
+    again.stop()
+    again.turn()
+    assert forbidden[-1] == "focal length looks 5.0 % long"
+    assert kept.told == {"forbids": {"focal_length": [5.0, "long"]}}  # for the next, too
+    again.close()
+    assert kept.told is None
+
+
+def test_an_end_that_is_none_in_order_leaves_it() -> None:
+    kept = Kept(LONG)
+    again, _ = integrity_monitor(kept)
+    again.start()
+    again.hand_over()
+    again.stop()
+    assert kept.told is not None
+
+
+def test_what_flies_is_not_taken_back_by_a_restart() -> None:
+    """Found after injection had begun: a process that was killed goes on, as without the kill."""
+    kept = Kept(LONG)
+    flying, _ = integrity_monitor(kept, injecting=True)
+    flying.start()
+    flying.stop()
+    flying.turn()
+    assert kept.told is None
+
+
+def test_evidence_ends_what_was_kept() -> None:
+    """The camera looks where it is said to: 4 degrees off was another, or wrong."""
+    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
+    monitor.restore({"boresight": (4.0, "yaw")})
+    flight = Flight(monitor, noise_m=0.05)
+    for quarter in range(1, 160):
+        flight.fly(0.25 * quarter)
+        monitor.add_observation(looking(flight, 0.0))
+    assert flight.told("over: boresight") < 40.0
+    assert monitor.inhibits == ""
+
+
+def test_without_evidence_it_stands() -> None:
+    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
+    monitor.restore(LONG)
+    Flight(monitor, noise_m=0.05).fly(40.0)
+    assert monitor.inhibits == "focal length looks 5.0 % long"
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        5, [], {"focal_length": 5}, {"focal_length": [5.0]}, {"focal_length": ["x", "long"]},
+        {"focal_length": [float("nan"), "long"]}, {"focal_length": [5.0, "\x1b[2J"]},
+        {"motion": [5.0, ""]}, {"no rule": [5.0, ""]}, {"focal_length": [5.0, 30 * "x"]},
+    ],
+)  # fmt: skip
+def test_what_is_no_finding_that_forbids_is_none(found: object) -> None:
+    assert InhibitMemory(Kept(found)).recall() == {}  # type: ignore[arg-type]
+
+
+def test_it_is_of_the_camera_and_the_map_that_flew(tmp_path: Path) -> None:
+    """Who mends the deployment and begins anew is not kept from it by what was."""
+    path = tmp_path / "guardian-forbids.json"
+    path.write_text(json.dumps({"forbids": LONG, "utc_s": time.time(), "about": "this camera"}))
+    path.chmod(0o600)
+    for about, found in (("another", {}), ("this camera", LONG)):
+        memory = RestartMemory(path, about=about)
+        assert InhibitMemory(memory).recall() == found
+        memory.stop(clean_shutdown=False)
+    assert path.exists()

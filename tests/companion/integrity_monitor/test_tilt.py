@@ -1,0 +1,171 @@
+"""Positions that follow a tilt: low down the two look alike, and gravity knows better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.tilt import TiltCheck
+from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
+from tests.companion.integrity_monitor.simulated import Flight, leg, outside, second
+
+Angle = Callable[[float], float]
+LEVEL = Attitude(0, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0))
+CLAIMED_DEG = 0.3
+
+
+def valley(at_s: float) -> float:
+    """Degrees that vision's pitch leaves the truth by, from the first fix on, and back."""
+    return float(np.interp(at_s, [0.0, 3.0, 9.0, 13.0, 16.0], [0.0, 2.2, 3.7, 4.0, 0.0]))
+
+
+def never(at_s: float) -> float:
+    """No tilt."""
+    return 0.0
+
+
+@dataclass
+class Tilted(Flight):
+    """A flight low over the ground whose fixes have an attitude. vision_deg: its pitch's error,
+    which shifts the position with it; gimbal_deg: what autopilot and gimbal err by in pitch.
+    """
+
+    vision_deg: Angle = never
+    gimbal_deg: float = 0.5
+    above_m: float = 30.0
+
+    def state(self) -> VehicleState:
+        """So high."""
+        return replace(super().state(), altitude_relative_m=self.above_m)
+
+    def _fix(self, at_s: float) -> VisionFix:
+        pitch = self.tilt_rad + np.radians(self.vision_deg(at_s) - self.gimbal_deg)
+        sigma = float(np.radians(CLAIMED_DEG))
+        fix = replace(super()._fix(at_s), attitude_sigma_rad=sigma)
+        return replace(fix, roll_rad=0.0, pitch_rad=float(pitch), yaw_rad=0.0)
+
+
+def low(vision_deg: Angle = never, gimbal_deg: float = 0.5, above_m: float = 30.0) -> Tilted:
+    """With the shipped limits; what is seen is shifted by the tilt times the height."""
+
+    def seen(at_s: float) -> tuple[float, float]:
+        north, east = leg(at_s)
+        return north + above_m * np.tan(np.radians(vision_deg(at_s))), east
+
+    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
+    return Tilted(
+        monitor, leg, seen, noise_m=0.05, claimed_m=0.2, vision_deg=vision_deg,
+        gimbal_deg=gimbal_deg, above_m=above_m,
+    )  # fmt: skip
+
+
+def test_a_shift_that_follows_a_tilt_is_told_and_inside_the_level() -> None:
+    """`begins-denied` at 30 m: 4 degrees and 2.7 m for ten seconds, under a level of 1.2 m."""
+    flight = low(valley).fly(20.0)
+    assert flight.told("deg off the autopilot's") <= 9.0
+    assert outside(flight) == []
+    assert flight.held == []
+    assert flight.lines[-1][1] == "PiLoT: over: tilt"
+    assert flight.passed[-1].protection_m == pytest.approx(flight.passed[0].protection_m, abs=0.1)
+
+
+def test_a_gimbal_that_is_knocked_costs_no_position() -> None:
+    """8 degrees at 120 m would be 17 m: told, and the level is widened, but nothing is withheld."""
+    flight = low(gimbal_deg=8.0, above_m=120.0).fly(6.0)
+    assert flight.told("tilt 8 deg off the autopilot's") < 3.0
+    assert flight.held == []
+
+
+def fixes(seed: int, constant_deg: float, wander_deg: float, seconds: int) -> Iterator[VisionFix]:
+    """Ten a second; the gimbal's alignment, its wander (6 s) and vision's noise in their angles."""
+    rng = np.random.default_rng(seed)
+    aligned = np.radians(constant_deg) * rng.standard_normal(2)
+    kept = np.exp(-0.1 / 6.0)
+    wander = np.radians(wander_deg) * rng.standard_normal(2)
+    sigma = float(np.radians(CLAIMED_DEG))
+    for k in range(10 * seconds):
+        drive = np.radians(wander_deg) * np.sqrt(1.0 - kept**2)
+        wander = kept * wander + drive * rng.standard_normal(2)
+        roll, pitch = aligned + wander + 0.5 * sigma * rng.standard_normal(2)
+        yield VisionFix(
+            second(0.1 * k), 47.4, 8.5, 535.0, float(roll), float(pitch), 0.0,
+            attitude_sigma_rad=sigma,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_gimbal_that_is_off_and_wanders_is_left_alone(seed: int) -> None:
+    """Half a degree that stays and 0.3 that wander, per axis, drawn for 20 flights."""
+    check = TiltCheck(IntegrityMonitorConfig())
+    for fix in fixes(seed, 0.5, 0.3, 60):
+        check.add(fix, LEVEL)
+        assert not check.tilts
+
+
+@dataclass
+class Unheard(Tilted):
+    """Some attitudes are missing. heard: whether there is one at a time, seconds."""
+
+    heard: Callable[[float], bool] = lambda at_s: True
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """None where it is missing."""
+        return super().attitude_at(time_ns) if self.heard(time_ns * 1e-9) else None
+
+
+def unheard(heard: Callable[[float], bool], vision_deg: Angle = never) -> Unheard:
+    """As `low`."""
+    flight = low(vision_deg)
+    return Unheard(
+        flight.monitor, leg, flight.seen, noise_m=0.05, claimed_m=0.2, vision_deg=vision_deg,
+        heard=heard,
+    )  # fmt: skip
+
+
+def test_a_tilt_is_not_over_because_the_attitude_is_gone() -> None:
+    """The attitude ends at 10 s, and what it said of the position was forgotten with it."""
+    flight = unheard(lambda at_s: at_s < 10.0, valley).fly(13.0)
+    assert flight.told("deg off the autopilot's") <= 9.0
+    assert flight.told("over: tilt") == np.inf
+    assert outside(flight) == []
+
+
+def test_a_tilt_is_told_and_bounded_by_every_other_attitude() -> None:
+    """A link that loses some must not hide it."""
+    flight = unheard(lambda at_s: round(10.0 * at_s) % 2 == 0, valley).fly(12.5)
+    assert flight.told("deg off the autopilot's") <= 9.0
+    assert outside(flight) == []
+
+
+def test_attitudes_that_are_missing_are_no_tilt() -> None:
+    """Whether some or all, of a flight that is right."""
+    for heard in (lambda at_s: round(10.0 * at_s) % 3 == 0, lambda at_s: at_s > 4.0):
+        flight = unheard(heard).fly(8.0)
+        assert flight.told("autopilot's") == np.inf
+        assert flight.held == []
+
+
+def test_a_tilt_at_an_unknown_height_is_widened() -> None:
+    """A vehicle without a home says no height, and its position was taken to be right."""
+    check = TiltCheck(IntegrityMonitorConfig())
+    for fix in fixes(1, 0.0, 0.0, 1):
+        check.add(replace(fix, pitch_rad=0.1), LEVEL)
+    assert check.metres(None) == IntegrityMonitorConfig().unreported_jump_m
+    for fix in fixes(1, 0.5, 0.3, 1):
+        check.add(fix, LEVEL)
+    assert check.metres(None) == 0.0
+
+
+def test_without_an_attitude_nothing_is_said() -> None:
+    """No attitude of the camera: no evidence."""
+    check = TiltCheck(IntegrityMonitorConfig())
+    for fix in fixes(1, 20.0, 0.3, 2):
+        check.add(fix, None)
+        check.add(replace(fix, roll_rad=None), LEVEL)
+    assert not check.tilts
+    assert check.metres(30.0) == 0.0

@@ -1,0 +1,397 @@
+"""The EKF's answer, clocks, and a monitor that fails: each told, and none of them by accident."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
+from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
+from tests.companion.integrity_monitor.simulated import Flight, hover, leg, second
+
+PICTURE = np.random.default_rng(3).integers(0, 255, (120, 160, 3)).astype(np.uint8)
+
+
+def monitor() -> IntegrityChecks:
+    return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
+
+
+class Answering(Flight):
+    """The EKF's innovation ratio and a leap of its position, by the time."""
+
+    ratio: Any = staticmethod(lambda at_s: 0.2)
+    leap_m: Any = staticmethod(lambda at_s: 0.0)
+
+    def state(self) -> VehicleState:
+        state = super().state()
+        north, east, down = state.local_position_ned or (0.0, 0.0, 0.0)
+        return replace(
+            state,
+            ekf_horizontal_variance=self.ratio(self.at_s),
+            local_position_ned=(north + self.leap_m(self.at_s), east, down),
+        )
+
+
+def flown(path: Any, seconds: float, **answers: Any) -> Answering:
+    flight = Answering(monitor(), path, noise_m=0.05)
+    for name, answer in answers.items():
+        setattr(flight, name, answer)
+    flight.fly(seconds)
+    return flight
+
+
+def test_an_ekf_that_refuses_is_told_again_as_long_as_it_does() -> None:
+    flight = flown(hover, 30.0, ratio=lambda at_s: 1.4 if 5.0 <= at_s < 20.0 else 0.3)
+    told = [at_s for at_s, text in flight.lines if "EKF refuses vision (1.4)" in text]
+    assert told[0] == pytest.approx(7.0, abs=0.3)
+    assert np.diff(told) == pytest.approx([10.0], abs=0.3)
+    assert 23.0 <= flight.told("over: ekf refuses") < 23.5
+    assert flight.held == []  # what it refuses does no harm; silence would
+
+
+@pytest.mark.parametrize("ratio", [float("nan"), float("inf"), None])
+def test_a_ratio_that_says_nothing_is_no_refusal(ratio: float | None) -> None:
+    known = None if ratio is None or np.isnan(ratio) else ratio
+    assert flown(hover, 6.0, ratio=lambda _: known).lines == []
+
+
+def test_a_refusal_of_a_second_is_none() -> None:
+    """A gust, a turn: the ratio passes 1 now and then."""
+    assert flown(hover, 12.0, ratio=lambda at_s: 1.5 if 5.0 <= at_s < 6.5 else 0.3).lines == []
+
+
+def test_a_reset_of_the_ekf_is_unconfirmed_until_the_imu_has_agreed_for_a_while() -> None:
+    flight = flown(leg, 30.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
+    assert flight.lines[0][1] == "PiLoT: EKF jumped 15 m: unconfirmed"
+    assert flight.lines[0][0] == pytest.approx(12.0, abs=0.15)
+    assert 21.5 <= flight.told("over: ekf jumped") <= 24.0
+
+
+def test_while_it_is_unconfirmed_nobody_says_that_the_ekf_follows() -> None:
+    flight = flown(leg, 14.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
+    assert flight.monitor.suppress_ekf_ok == "EKF jumped 15 m: unconfirmed"
+
+
+@dataclass
+class Waiting(Answering):
+    """On the ground until 20 s, then off to 10 m/s."""
+
+    def state(self) -> VehicleState:
+        return replace(super().state(), armed=self.at_s >= 20.0)
+
+
+def departs(at_s: float) -> tuple[float, float]:
+    return leg(at_s - 20.0) if at_s >= 20.0 else leg(0.0)
+
+
+def test_an_ekf_that_begins_on_the_ground_is_no_jump_when_it_is_armed() -> None:
+    """From its origin onto the first position 300 m away: told at the moment of arming, and "the
+    EKF follows" was not said for the first ten seconds of flight.
+    """
+    flight = Waiting(monitor(), departs, noise_m=0.05)
+    flight.leap_m = lambda at_s: 300.0 if at_s >= 8.0 else 0.0
+    flight.fly(30.0)
+    assert flight.lines == []
+    assert flight.monitor.suppress_ekf_ok == ""
+
+
+def test_an_ekf_that_jumps_right_after_arming_is_told() -> None:
+    flight = Waiting(monitor(), departs, noise_m=0.05)
+    flight.leap_m = lambda at_s: 300.0 if at_s >= 20.5 else 0.0
+    flight.fly(22.0)
+    assert [text for _, text in flight.lines] == ["PiLoT: EKF jumped 300 m: unconfirmed"]
+
+
+def test_hard_flight_is_no_jump() -> None:
+    """Out of a hover with 2.5 m/s^2, and a metre of an EKF's own correction."""
+    assert flown(leg, 12.0, leap_m=lambda at_s: 1.0 if at_s >= 8.0 else 0.0).lines == []
+
+
+@pytest.mark.parametrize("stamp", [lambda _: 5.0, lambda at_s: 20.0 - at_s])
+def test_pictures_whose_clock_stands_or_runs_back_are_withheld(stamp: Any) -> None:
+    """From 5 s on; the fixes go on under stamps of their own."""
+    watched = monitor()
+    flight = Flight(watched, noise_m=0.05)
+    told_s = np.inf
+    for tenth in range(1, 100):
+        flight.fly(0.1 * tenth)
+        at_s = 0.1 * tenth
+        moved = np.roll(PICTURE, 7 * tenth, axis=1)
+        watched.see(second(at_s if at_s < 5.0 else stamp(at_s)), moved)
+        told_s = min(told_s, flight.told("withheld: video clock ran back or stands"))
+    assert 5.5 <= told_s < 6.5
+    assert max(flight.held) > 9.7
+    assert not [at_s for at_s in flight.held if at_s < 5.5]
+
+
+def test_pictures_that_come_twice_now_and_then_are_no_broken_clock() -> None:
+    watched = monitor()
+    flight = Flight(watched, noise_m=0.05)
+    for tenth in range(1, 60):
+        flight.fly(0.1 * tenth)
+        watched.see(second(0.1 * tenth), PICTURE)
+        watched.see(second(0.1 * tenth), PICTURE)  # as a feed repeats a frame
+    assert not [text for _, text in flight.lines if "clock" in text]
+
+
+class Faulty:
+    """A bridge that fails where the monitor asks it, while it is told to."""
+
+    def __init__(self, flight: Flight) -> None:
+        self.flight = flight
+        self.fails_at: set[str] = set()
+        self.said: list[tuple[int, str]] = []
+
+    def state(self) -> VehicleState:
+        if "state" in self.fails_at:
+            raise RuntimeError("boom")
+        return self.flight.state()
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        if "inertial_since" in self.fails_at:
+            raise RuntimeError("bang")
+        return ()
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        return None
+
+    def say(self, severity: int, text: str) -> None:
+        self.said.append((severity, text))
+
+    def suppress_ekf_ok(self, why: str) -> None:
+        pass
+
+    def inhibit(self, why: str) -> None:
+        pass
+
+
+@pytest.fixture
+def faulty(monkeypatch: pytest.MonkeyPatch) -> tuple[IntegrityMonitor, Any]:
+    """A monitor whose clock goes on by its period at each turn, and its bridge."""
+    clock = iter(range(second(10.0), second(100.0), second(0.1)))
+    monkeypatch.setattr(
+        "companion.integrity_monitor.integrity_monitor.monotonic_ns", lambda: next(clock)
+    )
+    bridge: Any = Faulty(Flight(monitor()))
+    return IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge), bridge
+
+
+FIX = VisionFix(second(1.0), 47.0, 8.0, 500.0)
+
+
+def test_a_fix_that_cannot_be_judged_is_withheld_told_and_costs_itself_only(
+    faulty: tuple[IntegrityMonitor, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    """It passed unjudged: whatever position fails the monitor would have been believed."""
+    integrity_monitor, bridge = faulty
+    bridge.fails_at = {"state"}
+    assert integrity_monitor.judge(FIX) is None
+    assert "boom" in caplog.text
+    bridge.fails_at = set()
+    assert integrity_monitor.judge(FIX) is not None
+    integrity_monitor.turn()
+    assert bridge.said == []  # one of many
+    bridge.fails_at = {"state"}
+    assert integrity_monitor.judge(FIX) is None
+    integrity_monitor.turn()
+    assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    assert integrity_monitor.reason == "withheld: guardian failed"
+    bridge.fails_at = set()
+    assert integrity_monitor.judge(FIX) is not None
+    for _ in range(30):
+        integrity_monitor.turn()
+    assert [text for _, text in bridge.said[1:]] == ["PiLoT: over: guardian failed"]
+    assert integrity_monitor.reason == ""
+
+
+def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
+    faulty: tuple[IntegrityMonitor, Any],
+) -> None:
+    """Fixes can be judged, but nobody watches the pictures, the IMU, the EKF."""
+    integrity_monitor, bridge = faulty
+    bridge.fails_at = {"inertial_since"}
+    integrity_monitor.turn()
+    assert integrity_monitor.judge(FIX) is not None
+    for _ in range(9):
+        integrity_monitor.turn()
+    assert integrity_monitor.judge(FIX) is None
+    assert (3, "PiLoT: withheld: guardian failed") in bridge.said
+    bridge.fails_at = set()
+    integrity_monitor.turn()
+    assert integrity_monitor.judge(FIX) is not None
+
+
+def test_a_guardian_that_fails_at_each_picture_of_a_slow_video_withholds(
+    faulty: tuple[IntegrityMonitor, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 5 pictures a second every other turn had none, and was well: fixes passed under the text
+    that they were withheld, and no picture was ever looked at.
+    """
+    integrity_monitor, bridge = faulty
+
+    def fails(*_: object) -> None:
+        raise ValueError("no picture")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(IntegrityChecks, "see", fails)
+        for turn in range(20):
+            if turn % 2:
+                integrity_monitor.see(second(10.0 + turn), PICTURE)
+            integrity_monitor.turn()
+        assert integrity_monitor.judge(FIX) is None
+        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    integrity_monitor.turn()
+    assert integrity_monitor.judge(FIX) is None  # without a picture it saw nothing
+    integrity_monitor.see(second(40.0), PICTURE)
+    integrity_monitor.turn()
+    assert integrity_monitor.judge(FIX) is not None
+
+
+def test_a_picture_that_fails_now_and_then_withholds_nothing(
+    faulty: tuple[IntegrityMonitor, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    integrity_monitor, _ = faulty
+    see = IntegrityChecks.see
+
+    def fails(watched: IntegrityChecks, time_ns: int, image: Any) -> None:
+        if time_ns % second(4.0) == 0:
+            raise ValueError("no picture")
+        see(watched, time_ns, image)
+
+    monkeypatch.setattr(IntegrityChecks, "see", fails)
+    for turn in range(60):
+        integrity_monitor.see(second(10.0 + turn), np.roll(PICTURE, 7 * turn, axis=1))
+        integrity_monitor.turn()
+        assert integrity_monitor.judge(replace(FIX, time_ns=second(1.0) + turn)) is not None
+
+
+def test_a_reset_that_falls_into_a_blind_time_is_announced_after_it(
+    faulty: tuple[IntegrityMonitor, Any],
+) -> None:
+    """A jumped place proved itself while nobody watched: the EKF would have fought it, untold."""
+    integrity_monitor, bridge = faulty
+    integrity_monitor.judge(FIX)
+    jumped = [replace(FIX, time_ns=second(1.0 + k), latitude_deg=47.01) for k in range(1, 9)]
+    assert [integrity_monitor.judge(fix) for fix in jumped[:3]] == [None, None, None]
+    bridge.fails_at = {"inertial_since"}
+    for _ in range(10):
+        integrity_monitor.turn()
+    assert [integrity_monitor.judge(fix) for fix in jumped[3:7]] == [None, None, None, None]
+    bridge.fails_at = set()
+    integrity_monitor.turn()
+    passed = integrity_monitor.judge(jumped[7])
+    assert passed is not None
+    assert passed.reset
+
+
+def test_a_failure_is_told_again_as_long_as_it_lasts_and_not_more_often(
+    faulty: tuple[IntegrityMonitor, Any],
+) -> None:
+    """The operator of an aircraft without positions must know why."""
+    integrity_monitor, bridge = faulty
+    bridge.fails_at = {"inertial_since"}
+    for _ in range(125):  # of 0.2 s by this clock
+        integrity_monitor.turn()
+    told = [text for _, text in bridge.said]
+    assert told == 3 * ["PiLoT: withheld: guardian failed"]
+
+
+def test_a_gnss_that_jumps_is_told_and_nothing_is_withheld() -> None:
+    """100 km off, as a spoofer or a cold start may say; it is a receiver's word against ours."""
+    flight = Flight(monitor(), gnss_north_m=lambda at_s: 1e5 if at_s >= 5.0 else 0.0).fly(9.0)
+    assert 7.0 <= flight.told("GNSS 100000 m from vision") < 8.0
+    assert flight.held == []
+
+
+class Hand:
+    """A clock that goes on when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_ns = second(10.0)
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Hand:
+    hand = Hand()
+    monkeypatch.setattr("companion.integrity_monitor.integrity_monitor.monotonic_ns", hand)
+    return hand
+
+
+def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock: Hand) -> None:
+    """Its last findings stood for ever: fixes passed, and neither health nor a text said a word."""
+    bridge: Any = Faulty(Flight(monitor()))
+    integrity_monitor = IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge)
+    integrity_monitor.turn()
+    clock.now_ns += second(1.9)  # a busy computer
+    assert integrity_monitor.judge(FIX) is not None
+    clock.now_ns += second(0.2)
+    assert integrity_monitor.judge(FIX) is None
+    assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    assert integrity_monitor.reason == "withheld: guardian failed"
+    assert (integrity_monitor.level, integrity_monitor.standing()) == (None, {})
+    clock.now_ns += second(10.0)
+    integrity_monitor.judge(FIX)
+    assert len(bridge.said) == 2
+    integrity_monitor.turn()  # it was only asleep
+    assert integrity_monitor.judge(FIX) is not None
+    clock.now_ns += second(1.5)
+    integrity_monitor.turn()
+    clock.now_ns += second(1.6)
+    integrity_monitor.turn()
+    assert [text for _, text in bridge.said[2:]] == ["PiLoT: over: guardian failed"]
+
+
+def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> None:
+    """The localization thread waited for it for ever, and the health behind it."""
+    stuck, on = threading.Event(), threading.Event()
+    bridge: Any = Faulty(Flight(monitor()))
+
+    def hangs(time_ns: int) -> tuple[InertialSample, ...]:
+        stuck.set()
+        on.wait()
+        return ()
+
+    bridge.inertial_since = hangs
+    integrity_monitor = IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge)
+    integrity_monitor.start()
+    try:
+        assert stuck.wait(30.0)
+        clock.now_ns += second(2.5)
+        assert integrity_monitor.judge(FIX) is None
+        assert integrity_monitor.reason == "withheld: guardian failed"
+        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    finally:
+        on.set()
+        integrity_monitor.stop()
+
+
+def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Hand) -> None:
+    """Its last level went out with every heartbeat, for ever."""
+    bridge: Any = Faulty(Flight(monitor()))
+    integrity_monitor = IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge)
+    turned_ns = clock.now_ns
+    integrity_monitor.watch(lambda: {"health": turned_ns})
+    for _ in range(39):
+        integrity_monitor.turn()
+        clock.now_ns += second(0.1)
+    assert bridge.said == []
+    for _ in range(112):
+        clock.now_ns += second(0.1)
+        integrity_monitor.turn()
+    assert [text for _, text in bridge.said] == [
+        "PiLoT: health stands 4 s", "PiLoT: health stands 14 s"
+    ]  # fmt: skip
+    integrity_monitor.watch(lambda: {"health": clock.now_ns})
+    for _ in range(32):
+        clock.now_ns += second(0.1)
+        integrity_monitor.turn()
+    assert [text for _, text in bridge.said[2:]] == ["PiLoT: over: part stands"]
