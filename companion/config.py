@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from companion.errors import ConfigError
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.live.config import ConsoleConfig
+from companion.renamed_keys import with_current_keys
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
 from companion.sources.zoom import ZoomTable
@@ -283,7 +284,7 @@ def load_config(path: Path) -> CompanionConfig:
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
     """Check a configuration given as plain data; `where` names it in errors."""
     try:
-        config = validated(CompanionConfig, data)
+        config = validated(CompanionConfig, with_current_keys(data, where))
         config.camera.model.camera()
     except SettingsError as error:
         count = len(str(error).splitlines())

@@ -62,8 +62,8 @@ class DirectMethod:
 
 @dataclass(frozen=True)
 class Levelled:
-    """`DirectMethod` that hears an autopilot's roll and pitch: off by `tilt_deg` an axis, one sigma. No
-    heading: where vision feeds the autopilot's, hearing it would be hearing oneself.
+    """`DirectMethod` that also uses an autopilot's roll and pitch, off by `tilt_deg` an axis, one
+    sigma. It uses no heading: where vision feeds the autopilot, that heading is vision's own.
     """
 
     direct: DirectMethod

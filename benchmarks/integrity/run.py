@@ -92,8 +92,8 @@ class MapRegistrar:
         self._stack.close()
 
     def outcomes(
-        self, name: str, view: BasinView, index: int, here: Sequence[BasinView], others: Sequence[BasinView],
-        shift: tuple[float, float],
+        self, name: str, view: BasinView, index: int, here: Sequence[BasinView],
+        others: Sequence[BasinView], shift: tuple[float, float],
     ) -> Iterator[StartOutcome]:  # fmt: skip
         """Of every beginning of a view that meets the map; shift: of the map's picture, m."""
         query = self._extractor.extract(view.query)
@@ -103,8 +103,8 @@ class MapRegistrar:
                 yield _outcome(name, view, index, begun, found, shift)
 
     def repeated(
-        self, name: str, view: BasinView, index: int, begun: RegistrationStart, shift: tuple[float, float],
-        kept: StartOutcome,
+        self, name: str, view: BasinView, index: int, begun: RegistrationStart,
+        shift: tuple[float, float], kept: StartOutcome,
     ) -> StartOutcome:  # fmt: skip
         """The outcome of one beginning once more; it has to be the one that is kept."""
         found = self._register(self._extractor.extract(view.query), begun, index)

@@ -71,8 +71,8 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
     if args.terrain is not None:
         info = WorldInfo.load(args.terrain)
         terrain = _Terrain(info, info.origin.height_m - known.cache.frame.origin.height_m)
-    scene = FlownScene(args.map.parent.name, NumbaRenderer(seen, 1), NumbaRenderer(known, 1), camera,
-                  terrain)  # fmt: skip
+    renderers = NumbaRenderer(seen, 1), NumbaRenderer(known, 1)
+    scene = FlownScene(args.map.parent.name, *renderers, camera, terrain)
     extractor = DetailExtractor(load_extractor(threads=1, size=(camera.width, camera.height)))
     config = OdometryConfig(**dict.fromkeys(_GROWTHS, _NONE)) if args.fit else OdometryConfig()
     flyer = Flyer(scene, extractor, JNGO(threads=args.threads), config)

@@ -104,9 +104,8 @@ def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> PrintedTabl
     table = _of_markdown(markdown(rows))
     if not title:
         return table
-    return PrintedTable(
-        table.columns, tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows)
-    )
+    named = tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows)
+    return PrintedTable(table.columns, named)
 
 
 def _of_markdown(text: str) -> PrintedTable:

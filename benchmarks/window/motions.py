@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -65,9 +66,7 @@ def by_autopilot(
         way = way + wrong * interval_s + rng.normal(0.0, _WALK_M, 3)
         turn = turns @ turned.T
         noise = _noise(_WALK_M + _VELOCITY_MPS * interval_s, 1.4 * _JITTER_DEG)
-        steps.append(
-            MotionStep(lambda pose, w=way, t=turn: _shifted(pose, w, t), np.zeros(3), noise)
-        )  # type: ignore[misc]
+        steps.append(MotionStep(partial(_shifted, way=way, turn=turn), np.zeros(3), noise))
     return steps
 
 

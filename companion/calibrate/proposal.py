@@ -17,6 +17,7 @@ from companion.calibrate.flight import Calibrated
 from companion.calibrate.lens import LensEstimate
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
+from companion.renamed_keys import with_current_keys
 from companion.settings_file import read_settings, validated
 from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
 from mavlink_bridge.atomic_file import replace_file
@@ -167,7 +168,7 @@ def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -
     """Replace the deployment file, if the result is one; the old one stays beside it under the name
     that is returned. Both may be read by whom the old one might.
     """
-    document = read_settings(path, ConfigError)
+    document = with_current_keys(read_settings(path, ConfigError), str(path))
     _apply(document, wanted)
     today = datetime.now(timezone.utc).date().isoformat()
     _apply(document, (SettingChange(("camera", "calibrated"), None, today),))

@@ -150,9 +150,9 @@ class Companion:
         last_ticks_ns |= {"feed": parts[Feed].last_tick_ns, **parts[Bridge].last_ticks_ns()}
         health, integrity_monitor = parts.get(HealthMonitor), parts.get(IntegrityMonitor)
         last_ticks_ns |= {} if health is None else {"health": health.last_tick_ns}
-        return last_ticks_ns | (
-            {} if integrity_monitor is None else {"guardian": integrity_monitor.last_tick_ns}
-        )
+        if integrity_monitor is not None:
+            last_ticks_ns["integrity monitor"] = integrity_monitor.last_tick_ns
+        return last_ticks_ns
 
     def _untold_turns(self) -> dict[str, int]:
         """The turns of what nobody else tells of. What hangs on a frame's way, health tells."""

@@ -1,7 +1,7 @@
-"""The table of what runs: every part of the flight process, how it is made, started and stopped.
+"""The table of components: how each one of the flight process is made, started and stopped.
 
-A new part is a line in `COMPONENTS` and a function that makes it. It takes what it needs from the parts
-above it and subscribes to the channels that it reads.
+A new component is a line in `COMPONENTS` and a function that makes it. It takes what it needs from
+the components above it and subscribes to the channels that it reads.
 """
 
 from __future__ import annotations
@@ -480,8 +480,10 @@ COMPONENTS: tuple[Component[Any], ...] = (
     Component("injection", FixInjection, _injection, depends=(Bridge, CameraExtrinsics)),
     Component("map shift", MapOffsetEstimator, _map_shift, depends=(Bridge, FixInjection)),
     Component(
-        "guardian", IntegrityMonitor, _integrity_monitor, depends=(Bridge, CameraExtrinsics, FixInjection),
-        start=IntegrityMonitor.start, stop=IntegrityMonitor.stop, close=IntegrityMonitor.close, hand_over=IntegrityMonitor.hand_over,
+        "integrity monitor", IntegrityMonitor, _integrity_monitor,
+        depends=(Bridge, CameraExtrinsics, FixInjection),
+        start=IntegrityMonitor.start, stop=IntegrityMonitor.stop, close=IntegrityMonitor.close,
+        hand_over=IntegrityMonitor.hand_over,
         wanted=lambda config: config.integrity_monitor.enabled,
     ),
     Component(
@@ -500,7 +502,10 @@ COMPONENTS: tuple[Component[Any], ...] = (
     Component("source", FrameSource, _source, depends=(Bridge, KlvRelay, FrameTimes)),
     Component(
         "health", HealthMonitor, _health,
-        depends=(MapStack, Bridge, MapOffsetEstimator, RecordKeeper, FrameSource, IntegrityMonitor, FrameTimes),
+        depends=(
+            MapStack, Bridge, MapOffsetEstimator, RecordKeeper, FrameSource, IntegrityMonitor,
+            FrameTimes,
+        ),
         later=(DualThreadEngine, AutopilotPose, TargetReporter, BoxDetector, PlaceSearch),
         start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),

@@ -63,7 +63,7 @@ class IntegrityMonitor:
         self.last_tick_ns = monotonic_ns()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="guardian", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="integrity", daemon=True)
 
     def start(self) -> None:
         """Start watching, with what forbade in a process that was killed."""

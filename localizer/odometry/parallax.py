@@ -60,7 +60,8 @@ class ParallaxAlignment:
 
 
 def align(
-    backend: Backend, first: ParallaxView, second: ParallaxView, points: Array, prior: Array, noise: float
+    backend: Backend, first: ParallaxView, second: ParallaxView, points: Array, prior: Array,
+    noise: float,
 ) -> ParallaxAlignment | None:  # fmt: skip
     """Both pictures' poses on surface points (N, 3) of the map; None where it cannot be told.
 

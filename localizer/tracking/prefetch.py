@@ -1,8 +1,8 @@
 """The next frame's features, extracted while the frame before is being registered.
 
-Two threads share an `FeaturePrefetcher`: one prepares frames (`prepare`), the other takes them (`take`). At
-most one is prepared ahead, and not before the taker is about to be done: no frame grows old in
-between, and what waits in front is always the newest one.
+Two threads share a `FeaturePrefetcher`: one prepares frames (`prepare`), the other takes them
+(`take`). At most one frame is extracted ahead. Extraction starts just early enough to finish when
+the previous registration ends, so no frame waits.
 """
 
 from __future__ import annotations

@@ -27,9 +27,9 @@ _SEES = (TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.BRIDGING)
 class TrackStatus:
     """State of the machine: immutable, `judge` returns the next one.
 
-    tentative: the place was proposed, and counts only once it is confirmed. probation: the run of
-    acceptances there. independent: of the newest proposal, see `TentativeTrack`. last_fix_ns: exposure
-    of the newest fix that was given out, None before the first.
+    tentative: the position was proposed, and counts only once it is confirmed. tentative_track: the
+    acceptances there. independent: of the newest proposal, see `TentativeTrack`. last_fix_ns:
+    exposure of the newest fix that was given out, None before the first.
     """
 
     state: TrackingState = TrackingState.INITIALIZING

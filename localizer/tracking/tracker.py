@@ -207,8 +207,8 @@ class Tracker:
         return IndependentEvidence(rotation, way)
 
     def _next_motion(
-        self, ahead: MotionState, result: Registration | None, use_map: bool, carried: PropagatedPose,
-        lost: bool,
+        self, ahead: MotionState, result: Registration | None, use_map: bool,
+        carried: PropagatedPose, lost: bool,
     ) -> MotionState:  # fmt: skip
         if use_map and result is not None:
             return motion.update(ahead, result.world_from_camera, result.covariance)

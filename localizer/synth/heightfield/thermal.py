@@ -51,8 +51,8 @@ def thermal_scene(
     apparent = np.zeros(cover.shape, np.float32)
     for kind in np.unique(cover):
         here = cover == kind
-        every = day_apparent(day, np.broadcast_to(by_sun[here], (len(ThermalCover), by_sun[here].size)),
-                             open_sky[here])  # fmt: skip
+        lit = np.broadcast_to(by_sun[here], (len(ThermalCover), by_sun[here].size))
+        every = day_apparent(day, lit, open_sky[here])
         apparent[here] = every[kind]
     apparent += _texture(cover, scene, rng) + _engines(scene, prisms, rng)
     walls, sun = _walls(scene, day, rng)

@@ -37,7 +37,10 @@ def make(*_):
     print("went on", flush=True)
     raise SystemExit(1)
 
-module = {"build_localizer": companion.flight.component_table, "write_manifest": companion.flight.recorder}
+module = {
+    "build_localizer": companion.flight.component_table,
+    "write_manifest": companion.flight.recorder,
+}
 setattr(module[part], part, make)
 main()
 """

@@ -194,7 +194,7 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
 def test_the_gate_the_last_fix_and_what_forbids_are_what_is_left():
     assert {p.name for p in COMPONENTS if p.hand_over is not None} == {
         "bridge",
-        "guardian",
+        "integrity monitor",
         "last fix",
     }
 

@@ -109,8 +109,8 @@ def test_the_process_starts_and_stops_in_this_order():
     """The bridge speaks before anything could have something to say, the feed comes last."""
     started = [part.name for part in COMPONENTS if part.start is not None]
     assert started == [
-        "bridge", "guardian", "record", "klv", "health", "targets", "detector", "last fix", "view",
-        "vital signs", "search",
+        "bridge", "integrity monitor", "record", "klv", "health", "targets", "detector",
+        "last fix", "view", "vital signs", "search",
         "console", "engine", "feed",
     ]  # fmt: skip
     made = [part.name for part in COMPONENTS]

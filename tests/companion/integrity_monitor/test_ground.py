@@ -119,8 +119,8 @@ def test_a_tilt_over_a_valley_below_take_off_is_in_the_level() -> None:
     """4 degrees at 30 m above a valley, 50 m below take-off, had no share in the level."""
     watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
     flight = Tilted(watched, noise_m=0.05, claimed_m=0.2, vision_deg=valley, above_m=-50.0)
-    plain = Tilted(IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits()), noise_m=0.05, claimed_m=0.2,
-                   vision_deg=never, above_m=-50.0)  # fmt: skip
+    unwatched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
+    plain = Tilted(unwatched, noise_m=0.05, claimed_m=0.2, vision_deg=never, above_m=-50.0)
     for tenth in range(1, 120):
         for one in (flight, plain):
             one.monitor.add_observation(sighting(0.1 * tenth, 30.0))

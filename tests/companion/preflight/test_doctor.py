@@ -150,8 +150,9 @@ def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
     diagnosis = Diagnosis(
         (
             DoctorFinding("localizer", "tiny (onnxruntime, CPU); numba", "a net", "", True, True),
-            DoctorFinding("GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False,
-                    True),
+            DoctorFinding(
+                "GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False, True
+            ),
         )
     )  # fmt: skip
     print_diagnosis(Console(width=80, force_terminal=False), diagnosis)
