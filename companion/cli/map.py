@@ -58,7 +58,7 @@ def build(
     ] = None,
     up_axis: Annotated[
         Literal["y", "z"] | None,
-        typer.Option(help="of meshes and tilesets: y (glTF's default) or z (OBJ's)"),
+        typer.Option(help="of a mesh or tileset: y (glTF's default) or z (OBJ's)"),
     ] = None,
     height_unit: Annotated[
         str | None, typer.Option(help="of a DSM that does not say it: m, ft or us-ft")
