@@ -12,6 +12,7 @@ import mmap
 import re
 import struct
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -50,8 +51,14 @@ def _entry(folder: Path, name: str) -> Path:
     path = folder / name
     if name == ".." or _exists(path) or not folder.is_dir():
         return path
-    alike = [entry for entry in folder.iterdir() if entry.name.casefold() == name.casefold()]
-    return min(alike, default=path)
+    return folder / _entries(folder, folder.stat().st_mtime_ns).get(name.casefold(), name)
+
+
+@lru_cache(maxsize=64)
+def _entries(folder: Path, _modified_ns: int) -> dict[str, str]:
+    """Names of a folder by how they read in any letter case; kept, as many files may be missing."""
+    names = sorted((entry.name for entry in folder.iterdir()), reverse=True)
+    return {name.casefold(): name for name in names}
 
 
 def _exists(path: Path) -> bool:

@@ -29,6 +29,7 @@ _SEAM_M = 0.5  # median step of heights along a border of tiles
 _SEAM_GREY = 12.0  # likewise of grey values
 _LEAST_SEAM_PX = 20
 _SHIFT_M = 1.5
+_GROUND = "ground"
 
 
 class Grade(Enum):
@@ -122,6 +123,8 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
     rows, columns = gaps.shape
     faulty = gaps | blank | (_texel_ratio(cache, mosaic, use) > _TOO_COARSE)
     usable = usable_part(mosaic, faulty, use.height_m, cache.frame)
+    if any(f.name == _GROUND and f.grade is Grade.BAD for f in findings):
+        usable = None
     return MapCheck(findings, pictures, (columns * mosaic.gsd_m, rows * mosaic.gsd_m), usable)
 
 
@@ -218,9 +221,9 @@ def _intact(cache: TileCache) -> list[MapFinding]:
     words = f"build it again: {damaged[0]}" if damaged else "each as its hash says"
     return [
         MapFinding("damaged", found, Grade.BAD if damaged else Grade.GOOD, words),
-        MapFinding("ground", "faces up", Grade.GOOD, "as it should be")
+        MapFinding(_GROUND, "faces up", Grade.GOOD, "as it should be")
         if fault is None
-        else MapFinding("ground", fault, Grade.BAD, "build it again with another --up-axis"),
+        else MapFinding(_GROUND, fault, Grade.BAD, "build it again with another --up-axis"),
     ]
 
 

@@ -180,7 +180,8 @@ def built_from(folder, make, *, up="y", trusted=(), image=None, materials=None):
     )
     rules = ImportRules(trusted=frozenset(trusted))
     build.build_cache(source, folder / "c", BuildOptions(workers=1, rules=rules))
-    return {f.name: f for f in check_map(TileCache.open(folder / "c"), FINE).findings}
+    found = check_map(TileCache.open(folder / "c"), FINE)
+    return {f.name: f for f in found.findings} | {"usable": found.usable}
 
 
 def test_a_map_on_its_edge_will_not_do(tmp_path, make):
@@ -188,12 +189,14 @@ def test_a_map_on_its_edge_will_not_do(tmp_path, make):
     made = built_from(tmp_path / "a", make, up="z", trusted=["upright", "volume"])
     assert (made["ground"].grade, made["ground"].found) == (Grade.BAD, "stands on its edge")
     assert "stands on its edge" in made["build warnings"].words
+    assert made["usable"] is None
     assert built_from(tmp_path / "b", make)["ground"].grade is Grade.GOOD
 
 
 def test_a_map_of_colours_has_no_picture(tmp_path, make):
     green = [{"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.5, 0.1, 1]}}]
     made = built_from(tmp_path / "a", make, materials=green)
+    del made["usable"]
     assert {n for n, f in made.items() if f.grade is Grade.BAD} == {"without picture", "texel size"}
     assert made["without picture"].found.startswith("100.00 %")
     plain = cv2.imencode(".png", np.full((64, 64, 3), (40, 120, 60), np.uint8))[1].tobytes()
