@@ -19,13 +19,13 @@ from companion.sources.zoom import ZoomTable
 from companion.targets.detections import CLICKED, parse_host_port
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
-from localizer.geometry.camera import MAX_READOUT_MS, Camera
+from localizer.geometry.camera import MAX_READOUT_MS, Camera, lens_fault
+from localizer.geometry.lens import LensModel, whole_coefficients
 from mavlink_bridge.config import BridgeConfig
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
 _CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
 _SQUAREST = 1.5  # between fx and fy: pixels of 4:3 and 16:11 are the oddest in use
-_MOST_BENT = 0.7  # of a corner's distance from the principal point
 
 
 class _Model(BaseModel):
@@ -41,9 +41,11 @@ class CameraModel(_Model):
     fy: float = Field(gt=0)
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = Field(
-        (0.0, 0.0, 0.0, 0.0, 0.0), description="Brown: k1 k2 p1 p2 k3"
+    distortion: tuple[float, ...] = Field(
+        (0.0, 0.0, 0.0, 0.0, 0.0),
+        description="opencv: k1 k2 p1 p2 k3, or 8, 12, 14 of OpenCV's; fisheye: k1 k2 k3 k4",
     )
+    distortion_model: LensModel = Field("opencv", description="fisheye: Kannala-Brandt")
     readout_ms: float = Field(
         0.0, ge=0, le=MAX_READOUT_MS, description="rolling shutter: first row to last; 0: global"
     )
@@ -70,29 +72,20 @@ class CameraModel(_Model):
                     f"{name} {c:g} is far from the middle of {side} pixels; give the principal "
                     "point in pixels"
                 )
-        bent = max(self._bent(u, v) for u in (0, self.width) for v in (0, self.height))
-        if bent > _MOST_BENT:
-            raise ValueError(
-                f"the distortion moves a corner by {bent:.3g} of its distance from the middle; "
-                "give Brown's k1 k2 p1 p2 k3 in this order"
-            )
+        try:
+            fault = lens_fault(self.camera())
+        except CameraError as error:
+            raise ValueError(str(error)) from error
+        if fault:
+            raise ValueError(fault)
         return self
-
-    def _bent(self, u: float, v: float) -> float:
-        """How far Brown's model moves the pinhole's pixel, as a share of its radius."""
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
-        r2 = x * x + y * y
-        radial = r2 * (k1 + r2 * (k2 + r2 * k3))
-        dx = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        dy = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        return math.hypot(dx, dy) / math.sqrt(r2)
 
     def camera(self) -> Camera:
         """As the geometry type."""
         return Camera(
-            self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion,
-            self.readout_ms,
+            self.width, self.height, self.fx, self.fy, self.cx, self.cy,
+            whole_coefficients(self.distortion_model, self.distortion), self.readout_ms,
+            self.distortion_model,
         )  # fmt: skip
 
 
@@ -103,7 +96,9 @@ Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were giv
 class FeedConfig(_Model):
     """Where the video comes from. How the camera is mounted stands under ``bridge.camera``."""
 
-    source: str = Field(description="udp://, rtsp://, /dev/videoN, a video file or a folder")
+    source: str = Field(
+        description="udp:// (MPEG-TS, RTP, H.264), .sdp file, rtsp://, /dev/videoN, video or folder"
+    )
     model: CameraModel
     calibrated: date | None = Field(
         None, description="when `companion calibrate` last changed model or mounting; null: never"
@@ -131,7 +126,8 @@ class FeedConfig(_Model):
 
     @model_validator(mode="after")
     def _sender_is_of_udp(self) -> FeedConfig:
-        if self.settings.sender is not None and not self.source.startswith("udp://"):
+        udp = self.source.startswith(("udp://", "rtp://")) or self.source.endswith(".sdp")
+        if self.settings.sender is not None and not udp:
             raise ValueError(
                 "settings.sender chooses among the senders of a udp:// feed; this source has none: "
                 "remove it"

@@ -8,7 +8,7 @@ frames, so that derivatives are differences: 25 evaluations of some milliseconds
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,12 +99,7 @@ class CalibrationProblem:
         away = self._points - guess.places[self.owner]
         x, y, z = np.einsum("nji,nj->in", guess.rotations[self.owner], away)
         c = self.camera_of(guess.shared)
-        k1, k2, p1, p2, k3 = c.distortion
-        x, y = x / z, y / z
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        xd, yd = c.distorted(x / z, y / z)
         off = np.stack([c.fx * xd + c.cx, c.fy * yd + c.cy], axis=1) - self._pixels
         weighted: Array = np.einsum("nij,nj->ni", self._root, off)
         return weighted
@@ -135,11 +130,10 @@ def changed_camera(camera: Camera, shared: Array) -> Camera:
     """A camera's model with the optics' numbers added to it."""
     scale = float(np.exp(shared[u.FOCAL]))
     right, down = shared[u.CENTRE]
-    b = shared[u.BEND]
-    k1, k2, p1, p2, k3 = camera.distortion
-    return Camera(
-        camera.width, camera.height, camera.fx * scale, camera.fy * scale,
-        camera.cx + float(right), camera.cy + float(down),
-        (k1 + float(b[0]), k2 + float(b[1]), p1 + float(b[2]), p2 + float(b[3]), k3),
-        camera.readout_ms,
+    bent = np.array(camera.distortion)
+    bends = 4 if camera.distortion_model == "opencv" else 2  # a fisheye has no p1, p2
+    bent[:bends] += shared[u.BEND][:bends]
+    return replace(
+        camera, fx=camera.fx * scale, fy=camera.fy * scale, cx=camera.cx + float(right),
+        cy=camera.cy + float(down), distortion=tuple(float(k) for k in bent),
     )  # fmt: skip

@@ -20,6 +20,7 @@ from companion.errors import ConfigError
 from companion.renamed_keys import with_current_keys
 from companion.settings_file import read_settings, validated
 from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
+from localizer.plain_files import plain_text
 from mavlink_bridge.atomic_file import replace_file
 
 _LEAST = {"focal_percent": 0.05, "principal_percent": 0.05, "distortion": 0.001, "stamp_ms": 2.0}
@@ -109,6 +110,8 @@ def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[Se
         **{name: round(getattr(c, name), 2) for name in ("fx", "fy", "cx", "cy")},
         "distortion": [round(k, 5) for k in c.distortion],
     }  # fmt: skip
+    if model is not None and model.distortion_model != c.distortion_model:
+        values["distortion_model"] = c.distortion_model
     made = [
         SettingChange(
             ("camera", "model", name), None if model is None else getattr(model, name), value
@@ -180,7 +183,7 @@ def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
-        replace_file(kept, path.read_bytes().decode("utf-8"), mode)
+        replace_file(kept, plain_text(path), mode)
         replace_file(path, f"# {heading}\n# Before it: {kept.name}\n\n{text}", mode)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error

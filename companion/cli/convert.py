@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
@@ -83,11 +84,14 @@ def convert_command(
         if heights is HeightDatum.AMSL and separation is None:
             raise ConfigError("--heights amsl needs --geoid-separation or --map")
         above = Heights(heights.value, separation or 0.0)
-    place = MapReference(frame, above)
+    notes: list[str] = []
+    place = MapReference(frame, above, notes.append)
     with shown_work(Console(stderr=True), f"converting {source}"):
         poses = _dated(READERS[of.value](source, place), times, needed=to is OutputFormat.TUM)
         with writing(out):
             WRITERS[to.value](out, poses, place)
+    for note in notes:
+        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
     typer.echo(f"{out}: {len(poses)} poses")
 
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
 from companion.redaction import redacted
+from localizer.plain_files import plain_text
 
 _MOST_BYTES = 64 << 10
 
@@ -22,7 +23,7 @@ _MOST_BYTES = 64 << 10
 def shown(path: Path, editable: bool) -> dict[str, Any]:
     """The file's text, and the help; credentials only for somebody who may change the file."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = plain_text(path)
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     return {

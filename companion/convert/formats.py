@@ -6,6 +6,7 @@ All poses are `StampedPose` in the map's ENU frame in between.
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,15 +36,19 @@ AUTOPILOT_COLUMNS = (
     "roll_deg", "pitch_deg", "yaw_deg",
     "gimbal_roll_deg", "gimbal_pitch_deg", "gimbal_yaw_deg", "gimbal_frame",
 )  # fmt: skip
+_COUNTED = re.compile(r"#\s*Number of images:\s*(\d+)")
 _IMAGES_TXT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 
 @dataclass(frozen=True)
 class MapReference:
-    """What is known of the map. heights: of photos' tags, None if not known."""
+    """What is known of the map. heights: of photos' tags, None if not known. tell: takes what is
+    odd about a source and does not make it wrong.
+    """
 
     map_frame: LocalFrame | None
     heights: Heights | None = None
+    tell: Callable[[str], None] = lambda _: None
 
     @property
     def frame(self) -> LocalFrame:
@@ -81,18 +86,39 @@ def _write_tum(path: Path, poses: Sequence[StampedPose], place: MapReference) ->
 
 
 def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    """Poses of an ``images.txt``: camera from world, two lines an image, the second of points."""
-    rows = [
-        (number, line)
-        for number, line in enumerate(_lines(path), start=1)
-        if not line.startswith("#")
-    ]
-    while rows and not rows[0][1].strip():
-        rows.pop(0)
-    poses = tuple(_parse_colmap(line, f"{path}:{n}") for n, line in rows[::2] if line.strip())
+    """Poses of an ``images.txt``: camera from world, two lines an image, the second of points; it
+    may be left out, as in files of known poses that are written by hand.
+    """
+    if path.suffix.lower() == ".bin":
+        raise PoseFileError(
+            f"{path}: a binary model; colmap model_converter --output_type TXT writes its text"
+        )
+    poses: list[StampedPose] = []
+    counted, points_follow = None, False
+    for number, line in enumerate(_lines(path), start=1):
+        if line.startswith("#"):
+            counted = _COUNTED.match(line) or counted
+        elif points_follow and _are_points(line):
+            points_follow = False
+        elif line.strip():
+            poses.append(_parse_colmap(line, f"{path}:{number}"))
+            points_follow = True
     if not poses:
         raise PoseFileError(f"{path}: holds no image; expected '{_IMAGES_TXT}'")
-    return poses
+    if counted is not None and int(counted[1]) != len(poses):
+        raise PoseFileError(f"{path}: says {counted[1]} images, holds {len(poses)}; write it again")
+    return tuple(poses)
+
+
+def _are_points(line: str) -> bool:
+    """Whether it is an image's second line: X Y POINT3D_ID, any number of times. An image's own
+    has ten fields.
+    """
+    try:
+        numbers = [float(x) for x in line.split()]
+    except ValueError:
+        return False
+    return len(numbers) % 3 == 0
 
 
 def _parse_colmap(line: str, where: str) -> StampedPose:
@@ -181,7 +207,7 @@ def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
 
 
 def _read_photos(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    return read_photos(path, place.frame, place.heights)
+    return read_photos(path, place.frame, place.heights, place.tell)
 
 
 def _write_photos(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:

@@ -2,13 +2,17 @@
 
 XMP stands in the JPEG itself (an APP1 segment) or beside it as NAME.xmp, which wins. Gimbal angles:
 roll, pitch (0 horizontal, -90 down), yaw from north clockwise, Rz(yaw) Ry(pitch) Rx(roll).
+
+Tags that cannot be true are no measurements: angles that are all 0, a place at 0, 0, and heights of
+one flight that are above different surfaces.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -19,11 +23,13 @@ from companion.convert.angles import Angles, gimbal_of_pose, pose_of_gimbal
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
-from localizer.plain_files import plain_text
+from localizer.plain_files import files_of, plain_text
 
 _PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
 _LARGEST_BYTES = 1 << 20  # of a photo's head, in which its tags stand
+_HOME_STEP_M = 15.0  # of absolute less relative height, which drift by metres
+_RTK = {16, 34, 50}  # RtkFlag: single, float, fixed
 _ANGLES = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
 _SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -47,18 +53,86 @@ class Heights:
         return self.separation_m if self.datum == "amsl" else 0.0
 
 
-def read_photos(path: Path, frame: LocalFrame, heights: Heights | None) -> tuple[StampedPose, ...]:
-    """The pose of each photo of a folder, by name, or of one photo."""
+def read_photos(
+    path: Path,
+    frame: LocalFrame,
+    heights: Heights | None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[StampedPose, ...]:
+    """The pose of each photo of a folder, by name, or of one photo. tell: takes what is odd about
+    the tags and does not make them wrong.
+    """
     lift = _known(path, heights).lift_m
     photos = [path]
     if path.is_dir():
-        photos = sorted(p for p in path.iterdir() if p.suffix.lower() in _PHOTO_SUFFIXES)
+        photos = files_of(path, _PHOTO_SUFFIXES)
         # Sidecars alone, as `write_sidecars` leaves them.
         stems = {p.stem for p in photos}
-        photos += sorted(p for p in path.glob("*.xmp") if p.stem not in stems)
+        photos += [p for p in files_of(path, (".xmp",)) if p.stem not in stems]
     if not photos:
         raise PoseFileError(f"{path}: holds no photo (.jpg, .jpeg) and no sidecar (.xmp)")
-    return tuple(_read_photo(photo, frame, lift) for photo in photos)
+    tags = {photo.name: _xmp_tags(photo) for photo in photos}
+    _require_measured(path, tags)
+    _require_one_datum(path, tags, tell)
+    return tuple(_read_photo(photo, tags[photo.name], frame, lift) for photo in photos)
+
+
+def _require_measured(path: Path, photos: dict[str, dict[str, str]]) -> None:
+    """No photo's angles are all 0.00: to a hundredth of a degree level and north is no gimbal."""
+    zero = [
+        name
+        for name, tags in photos.items()
+        if all(k in tags for k in _ANGLES) and not any(_number(tags, k) for k in _ANGLES)
+    ]
+    if zero:
+        raise PoseFileError(
+            f"{path}: the gimbal's angles are all 0 in {len(zero)} of {len(photos)} photos, first "
+            f"{zero[0]}: this camera did not measure them; where it looked must be told: by "
+            f"{', '.join(_ANGLES)} in NAME.xmp beside each photo, or by a pose file"
+        )
+
+
+def _require_one_datum(
+    path: Path, photos: dict[str, dict[str, str]], tell: Callable[[str], None]
+) -> None:
+    """All heights of a flight are above the same surface, as far as the tags say."""
+    kinds: dict[str, list[str]] = {}
+    for name, tags in photos.items():
+        rtk = "with RTK" if _number(tags, "RtkFlag") in _RTK else "without RTK"
+        kinds.setdefault(tags.get("AltitudeType", rtk), []).append(name)
+    if len(kinds) > 1:
+        named = ", ".join(f"{kind}: {len(n)} photos, first {n[0]}" for kind, n in kinds.items())
+        raise PoseFileError(
+            f"{path}: the heights of these photos are above different surfaces ({named}): RtkAlt "
+            "is above the ellipsoid, GpsFusionAlt above the geoid; put each kind into a folder of "
+            "its own and convert it with its --heights"
+        )
+    flags = {_number(tags, "RtkFlag") for tags in photos.values()} - {None}
+    if len(flags) > 1:
+        tell(
+            f"RtkFlag {', '.join(f'{flag:.0f}' for flag in sorted(filter(None, flags)))}: not all "
+            "photos have an RTK fix (50); the others' places may be metres off"
+        )
+    for (_, before), (name, tags) in pairwise(photos.items()):
+        step = _home_m(tags) - _home_m(before)
+        if abs(step) > _HOME_STEP_M:
+            tell(
+                f"{name}: AbsoluteAltitude less RelativeAltitude steps by {step:+.1f} m: the "
+                "height's reference or another flight begins"
+            )
+
+
+def _home_m(tags: dict[str, str]) -> float:
+    """The height of where it took off, as the photo has it; NaN where it is not told."""
+    height, above = (_number(tags, f"{kind}Altitude") for kind in ("Absolute", "Relative"))
+    return float("nan") if height is None or above is None else height - above
+
+
+def _number(tags: dict[str, str], name: str) -> float | None:
+    try:
+        return float(tags[name])
+    except (KeyError, ValueError):
+        return None
 
 
 def write_sidecars(
@@ -92,8 +166,7 @@ def _known(path: Path, heights: Heights | None) -> Heights:
     return heights
 
 
-def _read_photo(path: Path, frame: LocalFrame, lift_m: float) -> StampedPose:
-    tags = _xmp_tags(path)
+def _read_photo(path: Path, tags: dict[str, str], frame: LocalFrame, lift_m: float) -> StampedPose:
     missing = [name for name in _ANGLES if name not in tags]
     if missing:
         raise PoseFileError(f"{path}: its XMP lacks {', '.join(missing)}; which camera took it?")
@@ -102,6 +175,8 @@ def _read_photo(path: Path, frame: LocalFrame, lift_m: float) -> StampedPose:
         angles = Angles(*(float(tags[name]) for name in _ANGLES))
         if not np.isfinite(angles.radians).all():
             raise ValueError("angles must be finite")
+        if lat == lon == 0.0:
+            raise ValueError("latitude and longitude are 0: it had no GNSS fix; remove the photo")
         position = Geodetic(lat, lon, height + lift_m)
     except (ValueError, GeoreferenceError) as error:
         raise PoseFileError(f"{path}: {error}") from error
@@ -110,9 +185,9 @@ def _read_photo(path: Path, frame: LocalFrame, lift_m: float) -> StampedPose:
 
 def _xmp_tags(path: Path) -> dict[str, str]:
     """DJI's tags by name: as attributes or as elements, both occur."""
-    sidecar = path.with_suffix(".xmp")
+    sidecar = next((p for p in map(path.with_suffix, (".xmp", ".XMP")) if p.is_file()), path)
     try:
-        if sidecar.is_file():
+        if sidecar is not path or path.suffix.lower() == ".xmp":
             text = plain_text(sidecar)
         else:
             with path.open("rb") as file:
@@ -120,11 +195,11 @@ def _xmp_tags(path: Path) -> dict[str, str]:
             begin = head.find(_XMP_HEADER)
             end = head.find(b"</x:xmpmeta>", begin)
             if begin < 0 or end < 0:
-                raise PoseFileError(f"{path}: has no XMP tags, and there is no {sidecar.name}")
+                raise PoseFileError(f"{path}: has no XMP tags, and there is no {path.stem}.xmp")
             text = head[begin:end].decode("utf-8", errors="replace")
     except (OSError, UnicodeDecodeError) as error:
         raise PoseFileError(f"{path}: cannot be read: {error}") from error
-    tags = dict(re.findall(r'drone-dji:(\w+)\s*=\s*"([^"]*)"', text))
+    tags = dict(re.findall(r"""drone-dji:(\w+)\s*=\s*["']([^"']*)["']""", text))
     return tags | dict(re.findall(r"<drone-dji:(\w+)>([^<]*)</", text))
 
 
@@ -151,8 +226,8 @@ def _exif_position(path: Path) -> tuple[float, float, float]:
         height = float(gps[ExifTags.GPS.GPSAltitude])
     except (KeyError, TypeError, ZeroDivisionError) as error:
         raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP: {error}") from error
-    # 1 and b"\\x01" both occur; Pillow gives the byte as it stands.
-    below = gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, b"\x01")
+    # 1 and b"\\x01" both occur; Pillow gives the byte as it stands. EXIF 3 has 3 for below the sea.
+    below = gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, 3, b"\x01", b"\x03")
     return lat, lon, -height if below else height
 
 

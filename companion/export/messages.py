@@ -157,9 +157,16 @@ def calibration(camera: Camera, time_ns: int) -> CameraCalibration:
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5
     return CameraCalibration(
         timestamp=stamp(time_ns), frame_id=CAMERA, width=camera.width, height=camera.height,
-        distortion_model="plumb_bob", D=camera.distortion, K=[fx, 0, cx, 0, fy, cy, 0, 0, 1],
+        distortion_model=_distortion_model(camera), D=camera.distortion,
+        K=[fx, 0, cx, 0, fy, cy, 0, 0, 1],
         R=[1, 0, 0, 0, 1, 0, 0, 0, 1], P=[fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
     )  # fmt: skip
+
+
+def _distortion_model(camera: Camera) -> str:
+    if camera.distortion_model == "fisheye":
+        return "kannala_brandt"
+    return {5: "plumb_bob", 8: "rational_polynomial"}.get(len(camera.distortion), "opencv")
 
 
 def target(row: Row, time_ns: int) -> SceneUpdate:

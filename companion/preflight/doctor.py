@@ -15,12 +15,13 @@ from companion.preflight.map_pin import require_pinned
 from companion.preflight.meanings import check_meanings, check_ports
 from companion.preflight.places import check_places
 from companion.redaction import redacted
-from companion.sources import SourceSettings, StreamState, open_source
+from companion.sources import StreamState, open_source
 from companion.targets.detector.network import DetectorNetwork
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geometry.geo import LocalFrame
 from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.kind import map_kind
 from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding, examine
@@ -85,7 +86,18 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[DoctorFi
         f"{_extent_km(m.extent, cache.frame):.2f} km from corner to corner "
         f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}"
     )
-    return cache, [DoctorFinding("map", found, "a tile cache", "", True, True)]
+    return cache, [
+        DoctorFinding("map", found, "a tile cache", "", True, True),
+        _check_kind(cache, config),
+    ]
+
+
+def _check_kind(cache: TileCache, config: CompanionConfig) -> DoctorFinding:
+    """What accuracy the map allows; a map without buildings is flown, with attitude and care."""
+    kind = map_kind(cache)
+    half_view_deg = config.camera.model.camera().horizontal_fov_deg / 2
+    why = kind.advice(half_view_deg)
+    return DoctorFinding("map's kind", kind.line(), "buildings in the heights", why, not why, False)
 
 
 def _check_mission(config: CompanionConfig, cache: TileCache) -> DoctorFinding:
@@ -140,7 +152,7 @@ def _check_camera(config: CompanionConfig) -> DoctorFinding:
     delivers is read for less time than one that must be called silent.
     """
     feed = config.camera
-    settings = SourceSettings.model_validate(feed.settings.model_dump() | {"realtime": True})
+    settings = feed.settings.model_copy(update={"realtime": True})
     told: list[str] = []
 
     def on_state(state: StreamState, text: str) -> None:
@@ -168,8 +180,8 @@ def _check_camera(config: CompanionConfig) -> DoctorFinding:
         source.close()
     if len(times) < 2:
         where = redacted(feed.source)
-        why = f"nothing arrived from {where} in {_FEED_S:.0f} s: is the stream running?"
-        why += f" ({told[0].removeprefix(f'{where}: ')})" if told else ""
+        why = f"no pictures from {where} in {_FEED_S:.0f} s: "
+        why += told[-1].removeprefix(f"{where}: ") if told else "is the stream running?"
         return _failed("camera", "silent", "pictures", why)
     rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
     found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"

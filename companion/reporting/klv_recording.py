@@ -18,7 +18,7 @@ from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.transport import TransportWriter
 from companion.offline.tables import Columns, poses
 from companion.reporting.record import RecordTables, read_record
-from companion.sources.base import fitted_camera
+from companion.sources.base import fitted_camera, video_stream
 from companion.sources.misp import parse_message
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler
@@ -75,7 +75,7 @@ def describe_recording(
         track = _RecordTrack(tables, scene)
         try:
             source = stack.enter_context(av.open(str(video)))
-            stream = source.streams.video[0]
+            stream = video_stream(source, str(video))
         except (OSError, ValueError, IndexError) as error:
             raise StreamOpenError(f"{video}: not a video: {error}") from error
         camera = fitted_camera(stream.width, stream.height, tables.camera, str(video))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import StreamError, StreamSizeError
-from companion.sources import SourceSettings, open_source
+from companion.sources import SourceSettings, StreamState, open_source
 from companion.sources.folder_source import list_images, read_image
 from localizer.geometry.camera import Camera
 
@@ -29,7 +29,13 @@ def first_picture(source: str) -> Seen:
     if "://" not in source and Path(source).is_dir():  # pictures are taken at their own size there
         height, width = read_image(list_images(Path(source))[0], _ANY_GREY).shape[:2]
         return Seen(width, height)
-    feed = open_source(source, _GUESS, SourceSettings(grey_range=_ANY_GREY))
+    told: list[str] = []
+
+    def on_state(state: StreamState, text: str) -> None:
+        if state is StreamState.STALLED:
+            told.append(text)
+
+    feed = open_source(source, _GUESS, SourceSettings(grey_range=_ANY_GREY), on_state)
     timer = threading.Timer(_FIRST_PICTURE_S, feed.close)
     timer.start()
     try:
@@ -43,4 +49,5 @@ def first_picture(source: str) -> Seen:
     finally:
         timer.cancel()
         feed.close()
-    raise StreamError(f"no picture in {_FIRST_PICTURE_S:.0f} s")
+    why = f": {told[-1]}" if told else ""
+    raise StreamError(f"no picture in {_FIRST_PICTURE_S:.0f} s{why}")

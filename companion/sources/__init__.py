@@ -1,4 +1,4 @@
-"""Camera feeds: UDP MPEG-TS, RTSP, V4L2 devices, video files and image folders."""
+"""Camera feeds: UDP (MPEG-TS, RTP, H.264), RTSP, V4L2 devices, video files and image folders."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
     "open_source",
 ]
 
-_LIVE = ("udp://", "rtsp://", "v4l2://", "/dev/")
+_LIVE = ("udp://", "rtp://", "rtsp://", "v4l2://", "/dev/")
 
 
 def open_source(
@@ -44,19 +44,21 @@ def open_source(
     on_stranger: Callable[[str], None] | None = None,
     tap: PacketTap | None = None,
 ) -> FrameSource:
-    """The feed at `location`: ``udp://host:port``, ``rtsp://...``, ``/dev/videoN`` (or
-    ``v4l2:///dev/videoN``), a video file, or a folder of images.
+    """The feed at `location`: ``udp://host:port`` (MPEG-TS, RTP or H.264, H.265 by itself), the
+    ``.sdp`` file of an RTP feed, ``rtsp://...``, ``/dev/videoN`` (or ``v4l2:///dev/videoN``), a
+    video file, or a folder of images.
 
     on_stranger: told, once for each address, that somebody else sends video to a UDP feed.
     tap: takes the packets of a video beside the decoding; a folder of images has none.
     Raises `StreamOpenError` for what is not there. A live stream may come later.
     """
     text = str(location)
-    if text.startswith(_LIVE):
+    if text.startswith(_LIVE) or text.endswith(".sdp"):
         return LiveVideoSource(text, camera, settings, on_state, on_stranger, tap)
     if "://" in text:
         raise StreamOpenError(
-            f"{text}: unknown kind of source; use udp://, rtsp://, /dev/videoN, a file or a folder"
+            f"{text}: unknown kind of source; use udp://, rtsp://, /dev/videoN, a file (.sdp of an "
+            "RTP feed, or a video) or a folder"
         )
     path = Path(location)
     if path.is_dir():

@@ -14,6 +14,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.format import Flags
 from av.sidedata.sidedata import Type as SideDataType
 from av.video.frame import PictureType
 
@@ -34,6 +35,7 @@ from companion.sources.base import (
     StreamState,
     fitted_camera,
     scaling_text,
+    video_stream,
 )
 from companion.sources.datagrams import (
     SenderLock,
@@ -43,6 +45,7 @@ from companion.sources.datagrams import (
 )
 from companion.sources.misp import MispTime, parse_message
 from companion.sources.references import Damage, References
+from companion.sources.sdp import Session
 from companion.sources.timing import ExposureClock, FrameTimestamps
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange, grey_levels
@@ -58,6 +61,9 @@ _UNCONVERTED = (
     "channel"
 )
 _ABORTING = {f"yaf{bits}{end}" for bits in (16, 32) for end in ("le", "be")}  # the process, too
+# Without noparse FFmpeg's H.264 parser holds each picture until the next one begins: one frame
+# period. MPEG-TS carries one picture per PES packet, so the parser is not needed.
+_TRANSPORT = {"fflags": "nobuffer+noparse+nofillin"}
 _LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: hand a picture out at once, not in display order
 
 
@@ -83,20 +89,22 @@ class VideoDecoder:
     ) -> None:
         self._tap = tap
         timeout = None if read_timeout_s is None else (_OPEN_TIMEOUT_S, read_timeout_s)
+        form, options = source.format, source.options
         if source.datagrams is not None:
             source.datagrams.begin(_OPEN_TIMEOUT_S)
+            form = source.datagrams.format()
+            options = options | (_TRANSPORT if form == "mpegts" else {})
         self._container = av.open(
-            source.datagrams or source.url,
-            format=source.format,
-            options=source.options,
-            timeout=timeout,
+            source.datagrams or source.url, format=form, options=options, timeout=timeout
         )
         if source.datagrams is not None and read_timeout_s is not None:
             source.datagrams.patience_s = read_timeout_s
-        if not self._container.streams.video:
+        try:
+            self.stream = video_stream(self._container, source.url)
+        except StreamOpenError:
             self._container.close()
-            raise StreamOpenError(f"{source.url}: has no video stream; give a video")
-        self.stream = self._container.streams.video[0]
+            raise
+        self.has_times = not self._container.format.flags & Flags.no_timestamps.value
         self.late = 0  # pictures that packets before theirs held back (B-frames)
         context = self.stream.codec_context
         live = read_timeout_s is not None
@@ -166,6 +174,7 @@ class VideoFileSource:
         self._counters = SourceCounters()
         self._state = StreamState.IDLE
         self._rgb = _ToRgb(self._settings.grey_range)
+        self._rate_hz: float | None = None  # of a file without times
 
     @property
     def counters(self) -> SourceCounters:
@@ -185,7 +194,7 @@ class VideoFileSource:
             raise StreamOpenError(
                 f"{self._path}: not a video, or damaged from the start: {error}"
             ) from error
-        self._report(StreamState.LIVE, f"{self._path}: playing")
+        self._report(StreamState.LIVE, f"{self._path}: {self._told_rate(decoder)}")
         try:
             yield from self._play(decoder)
         except StreamError as error:
@@ -224,6 +233,18 @@ class VideoFileSource:
         text = f"{self._path}: end of file, {self._delivered} pictures"
         self._report(StreamState.ENDED, text + (f", {lost} undecodable" if lost else ""))
 
+    def _told_rate(self, decoder: VideoDecoder) -> str:
+        """Settles the rate of a file that has no times, as raw H.264, and says which it is."""
+        if decoder.has_times:
+            return "playing"
+        stated = float(decoder.stream.codec_context.framerate or 0.0)
+        given = "rate_hz" in self._settings.model_fields_set or not stated
+        self._rate_hz = self._settings.rate_hz if given else stated
+        by = "by camera.settings.rate_hz" if given else "as its headers say"
+        text = f"has no times in it: {self._rate_hz:g} pictures a second, {by}"
+        _log.warning("%s: %s", self._path, text)
+        return text
+
     def _tell_scaling(self, camera: Camera) -> None:
         if camera is not self._camera and self._state is not StreamState.SCALED:
             text = scaling_text(camera.width, camera.height, self._camera, str(self._path))
@@ -251,9 +272,9 @@ class VideoFileSource:
 
     def _pts_ns(self, picture: av.VideoFrame, decoder: VideoDecoder) -> int:
         stamp = _pts_ns(picture)
-        if stamp is not None:
+        if stamp is not None and self._rate_hz is None:
             return stamp
-        rate = float(decoder.stream.average_rate or self._settings.rate_hz)
+        rate = self._rate_hz or float(decoder.stream.average_rate or self._settings.rate_hz)
         return round(self._delivered * 1e9 / rate)
 
     def _report(self, state: StreamState, text: str) -> None:
@@ -360,6 +381,7 @@ class LiveVideoSource:
     def _receive(self) -> None:
         wait_s = _RETRY_FIRST_S
         connections = 0
+        told_instead = False  # what comes and is not read
         while not self._closing.is_set():
             if self._state is not StreamState.STALLED:
                 self._report(StreamState.CONNECTING, f"{self._location}: connecting")
@@ -371,8 +393,13 @@ class LiveVideoSource:
                 self._report(StreamState.FAILED, str(error))
                 self._newest.close(error.retold(redacted(str(error))))
                 return
-            except (av.error.ExitError, SilentSenderError):  # the open time-out
-                reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
+            except av.error.ExitError:  # the open time-out
+                reason = _nothing_came()
+            except SilentSenderError as error:
+                reason = error.instead or _nothing_came()
+                if error.instead and not told_instead:  # though it is stalled already
+                    told_instead = True
+                    self._report(StreamState.STALLED, f"{self._location}: {reason}")
             except (av.error.FFmpegError, OSError) as error:
                 reason = f"cannot connect: {error}"
             except Exception as error:  # whatever a stream may contain, the next try may be well
@@ -403,8 +430,10 @@ class LiveVideoSource:
                     return "closed"
                 self._take(picture, arrival_ns, clock)
             return "the sender ended the stream"
-        except (av.error.ExitError, SilentSenderError):  # the read time-out
+        except av.error.ExitError:  # the read time-out
             return f"no data for {self._settings.stall_timeout_s:g} s"
+        except SilentSenderError as error:
+            return str(error)
         except av.error.FFmpegError as error:
             return f"the stream broke off: {error}"
         finally:
@@ -472,6 +501,10 @@ class LiveVideoSource:
             self._on_state(state, redacted(text))  # FFmpeg's own errors name the whole address
 
 
+def _nothing_came() -> str:
+    return f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
+
+
 def live_input(
     location: str,
     camera: Camera,
@@ -481,15 +514,20 @@ def live_input(
     """FFmpeg's options for a live location, chosen for low delay."""
     timeout_us = str(round(settings.stall_timeout_s * 1e6))
     common = {"probesize": "65536", "analyzeduration": "200000", "flags": "low_delay"}
-    if location.startswith("udp://"):
-        # Without noparse FFmpeg's H.264 parser holds each picture until the next one begins: one
-        # frame period. MPEG-TS carries one picture per PES packet, so the parser is not needed.
-        flags = {"fflags": "nobuffer+noparse+nofillin"}
+    if location.startswith(("udp://", "rtp://")) or location.endswith(".sdp"):
         lock = SenderLock(settings.sender, round(settings.stall_timeout_s * 1e9))
-        datagrams = VideoDatagrams(UdpAddress.parse(location), lock, on_stranger)
-        return _Input(location, common | flags, format="mpegts", datagrams=datagrams)
+        sets = b""
+        if location.endswith(".sdp"):
+            session = Session.read(Path(location))
+            address, sets = UdpAddress(session.host, session.port), session.sets
+        else:
+            address = UdpAddress.parse(location)
+        datagrams = VideoDatagrams(address, lock, on_stranger, sets)
+        return _Input(location, common | {"fflags": "nobuffer"}, datagrams=datagrams)
     if location.startswith("rtsp://"):
-        rtsp = {"fflags": "nobuffer", "rtsp_transport": "tcp", "timeout": timeout_us}
+        # TCP first; some servers refuse it (461) and send over UDP only.
+        transport = {"rtsp_transport": "udp+tcp", "rtsp_flags": "prefer_tcp"}
+        rtsp = {"fflags": "nobuffer", "timeout": timeout_us} | transport
         return _Input(location, common | rtsp)
     device = Path(location.removeprefix("v4l2://"))
     if not device.exists():

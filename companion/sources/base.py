@@ -9,9 +9,10 @@ from fractions import Fraction
 from typing import Annotated, Protocol
 
 import av
+from av.stream import Disposition
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from companion.errors import StreamSizeError
+from companion.errors import StreamOpenError, StreamSizeError
 from companion.sources.datagrams import parse_sender
 from companion.sources.timing import Timing
 from localizer.errors import CameraError
@@ -106,7 +107,7 @@ class SourceSettings(BaseModel):
         default=10.0,
         ge=0.01,
         le=1000,
-        description="frame rate of an image folder without timestamps.txt",
+        description="frame rate of an image folder without timestamps.txt, and of raw H.264",
     )
     realtime: bool = Field(
         default=False,
@@ -180,6 +181,16 @@ class PacketTaps:
         """As of `PacketTap`."""
         for tap in self._taps:
             tap.picture(pts, exposure_time_ns)
+
+
+def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
+    """The video among a container's streams, not a cover picture, wherever they stand; of several
+    FFmpeg's choice: the largest. `StreamOpenError` where there is none.
+    """
+    best = container.streams.best("video")
+    if not isinstance(best, av.VideoStream) or best.disposition & Disposition.attached_pic:
+        raise StreamOpenError(f"{where}: has no video stream; give a video")
+    return best
 
 
 class FrameSource(Protocol):

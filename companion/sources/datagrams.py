@@ -17,20 +17,25 @@ from dataclasses import dataclass
 from urllib.parse import parse_qs, urlsplit
 
 from companion.errors import StreamOpenError
+from companion.sources.rtp import FORMATS, Kind, RtpPictures, kind_of, named, payload_of
 from mavlink_bridge.link.waking import WakePipe
 
 _LARGEST = 65_535
 _PER_READ = 64  # datagrams; then the decoder has its turn
 _RECEIVE_BUFFER = 2_000_000
-_PACKET = 188  # bytes of an MPEG-TS packet
-_SYNC = 0x47  # which begins with it
 _UNPROVEN_NS = 6_000_000_000  # a camera gives its first picture within its key frame interval
 
 Address = tuple[str, int]
 
 
 class SilentSenderError(Exception):
-    """Nothing came from the sender within the patience."""
+    """Nothing that is read came from the sender within the patience. instead: what came, "" where
+    nothing did.
+    """
+
+    def __init__(self, patience_s: float, instead: str) -> None:
+        super().__init__(instead or f"no data for {patience_s:g} s")
+        self.instead = instead
 
 
 @dataclass(frozen=True)
@@ -141,7 +146,7 @@ class SenderLock:
             return False
         if self._sender is not None and not self._makes_room(sender, now_ns):
             return False
-        if not _looks_like_video(data):
+        if kind_of(data) is None:
             return False
         if self._sender is None or sender[0] != self._sender[0]:
             self._proven = False
@@ -158,10 +163,12 @@ class SenderLock:
 class VideoDatagrams:
     """The feed's socket, kept bound from the first open to `close`, so that the sender is, too.
 
-    FFmpeg reads it as a file (`read`) in the decoding thread; `close` may be called from any.
+    FFmpeg reads it as a file (`read`) in the decoding thread; `close` may be called from any. What
+    comes is MPEG-TS, RTP (its pictures are put together here) or H.264, H.265 by itself.
 
     on_stranger: told (a text of at most 43 characters, the address) of each address that is
-    refused, once, in the reading thread.
+    refused, once, in the reading thread. sets: of RTP, the parameter sets that a session
+    description gives, where the stream itself may lack them.
     """
 
     def __init__(
@@ -169,7 +176,9 @@ class VideoDatagrams:
         address: UdpAddress,
         lock: SenderLock,
         on_stranger: Callable[[str], None] = lambda _: None,
+        sets: bytes = b"",
     ) -> None:
+        self._sets = sets
         self.patience_s = 1.0
         self.foreign = 0
         self._address = address
@@ -178,6 +187,9 @@ class VideoDatagrams:
         self._told: set[str] = set()
         self._socket: socket.socket | None = None
         self._pending = b""
+        self._kind: Kind | None = None
+        self._pictures: RtpPictures | None = None
+        self._unread: tuple[str, bytes] | None = None  # newest sender and datagram, not taken
         self._silent = False
         self._closed = threading.Event()
         self._waker = WakePipe()
@@ -188,12 +200,18 @@ class VideoDatagrams:
         Raises OSError while the address cannot be bound.
         """
         self.patience_s = patience_s
-        self._pending, self._silent = b"", False
+        self._pending, self._silent, self._unread = b"", False, None
+        self._kind = self._pictures = None
         if self._socket is None:
             self._socket = self._address.bound()
         for _ in range(100 * _PER_READ):  # bounded: a flood would be drained for ever
             if self._received() is None:
                 return
+
+    def format(self) -> str:
+        """FFmpeg's name of what comes, once something comes; `SilentSenderError` otherwise."""
+        self._pending = self._next()
+        return FORMATS[self._kind or "mpegts"]  # None: closed
 
     def prove(self) -> None:
         """A picture was decoded: who is followed stays."""
@@ -237,7 +255,7 @@ class VideoDatagrams:
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
                 self._silent = True
-                raise SilentSenderError(f"no data for {self.patience_s:g} s")
+                raise SilentSenderError(self.patience_s, self._instead())
             poller.poll(left_s * 1e3)
         return b""
 
@@ -249,11 +267,38 @@ class VideoDatagrams:
             if received is None:
                 break
             data, sender = received
-            if self._lock.admits(sender, data, time.monotonic_ns()):
-                taken.append(data)
-            else:
+            if not self._lock.admits(sender, data, time.monotonic_ns()):
+                self._unread = sender[0], data
                 self._refuse(sender)
+            elif self._kind is None and not self._begins(data):
+                self._unread = sender[0], data
+            else:
+                taken.append(self._read(data))
         return b"".join(taken)
+
+    def _begins(self, data: bytes) -> bool:
+        """Whether a datagram says of which kind the feed is."""
+        self._kind = kind_of(data)
+        if self._kind in ("rtp h264", "rtp hevc"):
+            self._pictures = RtpPictures("h264" if self._kind == "rtp h264" else "hevc", self._sets)
+        return self._kind is not None
+
+    def _read(self, data: bytes) -> bytes:
+        """What FFmpeg is given of a datagram."""
+        if self._pictures is not None:
+            return self._pictures.take(data)
+        return payload_of(data) if self._kind == "rtp mpegts" else data
+
+    def _instead(self) -> str:
+        """What comes and is not read."""
+        if self._pictures is not None and self._pictures.is_under_way:
+            return "RTP comes, but no whole picture: packets are lost"
+        if self._unread is None:
+            return ""
+        host, data = self._unread
+        if kind_of(data) is None:
+            return f"from {host} come {named(data)}"
+        return f"video comes from {host}, which is not the feed's sender (camera.settings.sender)"
 
     def _received(self) -> tuple[bytes, Address] | None:
         assert self._socket is not None
@@ -292,13 +337,3 @@ def parse_sender(text: str) -> tuple[str, int | None]:
 def _is(sender: Address, wanted: tuple[str, int | None]) -> bool:
     host, port = wanted
     return sender[0] == host and port in (None, sender[1])
-
-
-def _looks_like_video(data: bytes) -> bool:
-    """Whether MPEG-TS packets follow one another in it; a datagram may begin inside one."""
-    if len(data) < _PACKET:
-        return False
-    return any(
-        data[i] == _SYNC and (i + _PACKET >= len(data) or data[i + _PACKET] == _SYNC)
-        for i in range(_PACKET)
-    )

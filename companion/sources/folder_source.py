@@ -23,7 +23,7 @@ from companion.sources.base import (
 from localizer.errors import GreyRangeError
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange, decode_rgb
-from localizer.plain_files import plain_bytes, plain_text
+from localizer.plain_files import files_of, plain_bytes, plain_text
 from localizer.types import Frame, Image
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"})
@@ -34,7 +34,7 @@ def list_images(folder: Path) -> list[Path]:
     """The folder's images by name, numbers in names counted as numbers (img2 before img10)."""
     if not folder.is_dir():
         raise StreamOpenError(f"{folder}: no such folder; give a folder of images")
-    images = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    images = files_of(folder, IMAGE_SUFFIXES)
     if not images:
         raise StreamOpenError(
             f"{folder}: holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); "

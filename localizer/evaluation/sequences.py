@@ -23,7 +23,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.pictures import read_rgb
-from localizer.plain_files import plain_text
+from localizer.plain_files import files_of, plain_text
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
 
@@ -141,7 +141,7 @@ def _times(images: Path, paths: tuple[Path, ...]) -> tuple[int, ...]:
     try:
         stamps = {
             name: int(time_ns)
-            for name, time_ns in (x.split() for x in plain_text(file).split("\n") if x)
+            for name, time_ns in (x.split() for x in plain_text(file).splitlines() if x.strip())
         }
         times = tuple(stamps[path.name] for path in paths)
     except (OSError, ValueError, KeyError) as error:
@@ -155,7 +155,8 @@ def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:
     """(image folder, pose file, camera file) of a sequence folder."""
     if (path / "poses.txt").is_file():
         return path / "images", path / "poses.txt", path / "camera.json"
-    names = sorted(p.stem for p in (path / "poses").glob("*.txt"))
+    poses = path / "poses"
+    names = [p.stem for p in files_of(poses, (".txt",))] if poses.is_dir() else []
     if not names:
         raise SequenceError(f"{path}: holds neither poses.txt nor poses/NAME.txt")
     if name is None and len(names) > 1:

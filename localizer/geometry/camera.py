@@ -1,4 +1,4 @@
-"""Pinhole camera with Brown distortion.
+"""A camera: pinhole and lens (`localizer.geometry.lens`).
 
 Pixel convention: the centre of the first pixel is (0.5, 0.5), the image spans [0, width] x
 [0, height]. OpenCV puts that centre at (0, 0); conversions to it happen here and nowhere else.
@@ -6,8 +6,8 @@ Pixel convention: the centre of the first pixel is (0.5, 0.5), the image spans [
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from localizer.errors import CameraError
+from localizer.geometry import lens
+from localizer.geometry.camera_file import KEYS, camera_numbers, read_numbers
+from localizer.geometry.lens import LensModel
 from localizer.geometry.pose import Array
-from localizer.plain_files import plain_text
 
 MAX_READOUT_MS = 200.0
 _ALIKE, _ALIKE_PX = 1e-3, 0.01  # of a focal length, a share: 0.2 px at a working picture's edge
-_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+_NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
+_EDGE = 33  # points along each side
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels. `distortion` is Brown's (k1, k2, p1, p2, k3), all 0 for a pinhole.
-    readout_ms: from the first row's exposure to the last one's, 0 of a global shutter.
+    """Intrinsics in pixels. distortion: of the model ``opencv`` Brown's (k1, k2, p1, p2, k3), all 0
+    for a pinhole, or 8, 12 or 14 of OpenCV's; of ``fisheye`` its (k1, k2, k3, k4). readout_ms: from
+    the first row's exposure to the last one's, 0 of a global shutter.
     """
 
     width: int
@@ -36,8 +40,9 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = _NONE
     readout_ms: float = 0.0
+    distortion_model: LensModel = "opencv"
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
@@ -52,8 +57,9 @@ class Camera:
             raise CameraError(f"camera size {self.width}x{self.height} is below 8x8 pixels")
         if self.fx <= 0 or self.fy <= 0:
             raise CameraError(f"focal lengths must be positive, got fx={self.fx} fy={self.fy}")
-        if len(self.distortion) != 5:
-            raise CameraError(f"distortion needs k1 k2 p1 p2 k3, got {self.distortion}")
+        if len(self.distortion) not in lens.COUNTS.get(self.distortion_model, ()):
+            names = " ".join(lens.COEFFICIENTS.get(self.distortion_model, lens.COUNTS))
+            raise CameraError(f"distortion needs {names}, got {self.distortion}")
 
     @classmethod
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float) -> Camera:
@@ -63,42 +69,29 @@ class Camera:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], where: str = "camera") -> Camera:
-        """From width, height, fx, fy, cx, cy and optional ``distortion`` (k1 k2 p1 p2 k3) and
-        ``readout_ms``.
+        """From width, height, fx, fy, cx, cy and optional ``distortion``, ``distortion_model`` and
+        ``readout_ms``, as other programs call them, too (`localizer.geometry.camera_file`).
 
-        The distortion may also stand as the single keys k1, k2, p1, p2, k3.
+        `CameraError` for a lens that is not read, and for one that cannot be.
         """
-        missing = [k for k in _KEYS if k not in data]
-        if missing:
-            raise CameraError(f"{where}: missing {', '.join(missing)}")
-        d = data.get("distortion") or [data.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")]
         try:
-            k = (*(float(x) for x in d), 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-            fx, fy, cx, cy = (float(data[key]) for key in _KEYS[2:])
-            width, height = int(data["width"]), int(data["height"])
-            bent = (k[0], k[1], k[2], k[3], k[4])
-            readout_ms = float(data.get("readout_ms", 0.0))
-            return cls(width, height, fx, fy, cx, cy, bent, readout_ms)
+            camera = cls(**camera_numbers(data))
+            if fault := lens_fault(camera):
+                raise CameraError(fault)
         except (TypeError, ValueError, OverflowError, CameraError) as error:
             raise CameraError(f"{where}: {error}") from error
+        return camera
 
     @classmethod
     def from_json(cls, path: Path | str) -> Camera:
-        """From a ``camera.json`` file."""
-        try:
-            data = json.loads(plain_text(Path(path)))
-        except FileNotFoundError as error:
-            raise CameraError(f"{path}: does not exist") from error
-        except (OSError, ValueError, RecursionError) as error:
-            raise CameraError(f"{path}: cannot be read as JSON: {error}") from error
-        if not isinstance(data, dict):
-            raise CameraError(f"{path}: expected an object with {', '.join(_KEYS)}")
-        return cls.from_dict(data, str(path))
+        """From a ``camera.json`` file, or another program's (`camera_file.read_numbers`)."""
+        return cls.from_dict(read_numbers(Path(path)), str(path))
 
     def to_dict(self) -> dict[str, Any]:
         """Inverse of `from_dict`."""
-        return {k: getattr(self, k) for k in _KEYS} | {
-            "distortion": list(self.distortion), "readout_ms": self.readout_ms
+        return {k: getattr(self, k) for k in KEYS} | {
+            "distortion": list(self.distortion), "distortion_model": self.distortion_model,
+            "readout_ms": self.readout_ms,
         }  # fmt: skip
 
     @property
@@ -108,8 +101,8 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether any distortion coefficient is not zero."""
-        return any(k != 0.0 for k in self.distortion)
+        """Whether a straight line may look bent."""
+        return self.distortion_model != "opencv" or any(k != 0.0 for k in self.distortion)
 
     def is_like(self, other: Camera) -> bool:
         """Whether pictures of both can be taken for one another: focal lengths to 0.1 %, principal
@@ -117,7 +110,7 @@ class Camera:
         """
         scales = self.fx / other.fx, self.fy / other.fy
         apart = max(abs(self.cx - other.cx), abs(self.cy - other.cy))
-        same = ("width", "height", "distortion")
+        same = ("width", "height", "distortion", "distortion_model")
         return (
             all(abs(s - 1.0) <= _ALIKE for s in scales)
             and apart <= _ALIKE_PX
@@ -151,7 +144,7 @@ class Camera:
 
     def without_distortion(self) -> Camera:
         """The ideal pinhole with the same K."""
-        return replace(self, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+        return replace(self, distortion=_NONE, distortion_model="opencv")
 
     def project(self, points: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Points (..., 3) in the camera frame to pixels (..., 2) and a mask of what is in view.
@@ -163,7 +156,7 @@ class Camera:
         front = z > 1e-6
         safe = np.where(front, z, np.nan)
         x, y = points[..., 0] / safe, points[..., 1] / safe
-        xd, yd = self._distort(x, y)
+        xd, yd = self.distorted(x, y)
         pixels = np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
         inside = (
             front
@@ -172,6 +165,8 @@ class Camera:
             & (pixels[..., 1] >= 0)
             & (pixels[..., 1] <= self.height)
         )
+        if self.is_distorted:
+            inside &= np.hypot(x, y) <= self._reach
         return pixels, inside
 
     def rays(self, pixels: ArrayLike) -> Array:
@@ -180,38 +175,57 @@ class Camera:
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
         if self.is_distorted:
-            flat = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
-            flat = cv2.undistortPoints(
-                flat, np.eye(3), np.asarray(self.distortion), criteria=criteria
-            )
-            x, y = flat[:, 0, 0].reshape(x.shape), flat[:, 0, 1].reshape(y.shape)
+            x, y = lens.undistorted(self.distortion_model, self.distortion, x, y)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def undistortion_maps(self, target: Camera) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
         """Fixed-point maps for ``cv2.remap`` from this camera's image to the pinhole `target`.
 
-        They undo the distortion and resize in one pass.
+        They undo the distortion and resize in one pass. What the lens does not show stays black.
         """
-        maps = cv2.initUndistortRectifyMap(
-            _opencv_matrix(self),
-            np.asarray(self.distortion),
-            np.eye(3),
-            _opencv_matrix(target),
-            (target.width, target.height),
-            cv2.CV_16SC2,
-        )
-        return maps[0].astype(np.int16), maps[1].astype(np.uint16)
+        if self.distortion_model == "opencv":
+            maps = cv2.initUndistortRectifyMap(
+                _opencv_matrix(self),
+                np.asarray(self.distortion),
+                np.eye(3),
+                _opencv_matrix(target),
+                (target.width, target.height),
+                cv2.CV_16SC2,
+            )
+        else:
+            pixels = self.project(target.rays(_centres(target)))[0] - 0.5
+            maps = cv2.convertMaps(pixels.astype(np.float32), None, cv2.CV_16SC2)
+        places = maps[0].astype(np.int16)
+        corners = [[0, 0], [target.width, 0], [0, target.height], [target.width, target.height]]
+        if self.is_distorted and np.hypot(*target.rays(corners).T[:2]).max() > self._reach:
+            x, y, _ = np.moveaxis(target.rays(_centres(target)), -1, 0)
+            places[np.hypot(x, y) > self._reach] = np.iinfo(np.int16).min
+        return places, maps[1].astype(np.uint16)
 
-    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+    def distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The picture's tangents, by focal length and principal point its pixels, of rays' x / z
+        and y / z, any shape.
+        """
         if not self.is_distorted:
             return x, y
-        k1, k2, p1, p2, k3 = self.distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return xd, yd
+        return lens.distorted(self.distortion_model, self.distortion, x, y)
+
+    @cached_property
+    def _reach(self) -> float:
+        """Tangent of the farthest ray from the axis in the picture: a polynomial brings rays beyond
+        it back into the picture, a lens does not.
+        """
+        u, v = np.linspace(0.0, self.width, _EDGE), np.linspace(0.0, self.height, _EDGE)
+        edges = [np.stack(np.broadcast_arrays(u, side), -1) for side in (0.0, self.height)]
+        edges += [np.stack(np.broadcast_arrays(side, v), -1) for side in (0.0, self.width)]
+        x, y, _ = self.rays(np.concatenate(edges)).T
+        return float(np.fmax.reduce(np.hypot(x, y), initial=0.0)) * (1.0 + _ALIKE)
+
+
+def lens_fault(camera: Camera) -> str:
+    """Why no lens is so, "" where one may be (`lens.fault`)."""
+    size = camera.width, camera.height
+    return lens.fault(size, camera.rays, camera.project) if camera.is_distorted else ""
 
 
 def followed(pinhole: Camera, camera: Camera) -> Camera:
@@ -220,6 +234,12 @@ def followed(pinhole: Camera, camera: Camera) -> Camera:
     """
     own = camera.without_distortion().resized(pinhole.width, pinhole.height)
     return pinhole if own.is_like(pinhole) else own
+
+
+def _centres(camera: Camera) -> Array:
+    """(H, W, 2): of every pixel."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    return np.stack([u, v], axis=-1) + 0.5
 
 
 def _opencv_matrix(camera: Camera) -> Array:

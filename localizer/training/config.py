@@ -17,6 +17,7 @@ from pydantic import (
 )
 
 from localizer.errors import ModelError
+from localizer.plain_files import plain_text
 from localizer.strict_yaml import load_yaml, misread_booleans
 from localizer.synth.heightfield.scene import BLOCK
 from localizer.training.models.networks import NetworkConfig
@@ -203,7 +204,7 @@ def _fits(crop: tuple[int, int], image: tuple[int, int]) -> None:
 def load_config(path: Path) -> TrainConfig:
     """Read a YAML file; unknown keys and bad values raise `ModelError` with their names."""
     try:
-        data = load_yaml(path.read_text(encoding="utf-8"))
+        data = load_yaml(plain_text(path))
         config = TrainConfig.model_validate(data)
     except OSError as error:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error

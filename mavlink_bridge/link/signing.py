@@ -24,7 +24,7 @@ def load_key(path: Path) -> bytes:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # a pipe would be waited for without end
             raise SigningKeyError(f"{path}: signing key is no file")
-        with path.open(encoding="ascii") as file:
+        with path.open(encoding="utf-8-sig") as file:
             text = file.read(_LONGEST_TEXT).strip()
     except (OSError, UnicodeDecodeError) as error:
         raise SigningKeyError(f"{path}: signing key cannot be read ({error})") from error

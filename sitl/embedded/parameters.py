@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from localizer.plain_files import plain_text
 from sitl.embedded.errors import ParameterFileError
 
 # MAV_PARAM_TYPE as ArduPilot reports them (values travel as float in every case).
@@ -148,7 +149,7 @@ def read_parameter_file(path: Path) -> dict[str, float]:
     """Values of an ArduPilot .parm file: name and value, split by blanks or comma; # comments."""
     values: dict[str, float] = {}
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = plain_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterFileError(f"cannot read the parameter file {path}: {error}") from error
     for number, line in enumerate(lines, start=1):

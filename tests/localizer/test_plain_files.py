@@ -12,7 +12,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.posefile import read_poses
 from localizer.geometry.trajectory import read_tum
 from localizer.map.cache.cache import TileCache
-from localizer.plain_files import plain_bytes, plain_text
+from localizer.plain_files import files_of, plain_bytes, plain_text
 
 
 def test_a_plain_file_is_read_whole_up_to_its_bound(tmp_path):
@@ -22,6 +22,30 @@ def test_a_plain_file_is_read_whole_up_to_its_bound(tmp_path):
     assert plain_bytes(path, 4) == plain_bytes(path, None) == path.read_bytes()
     with pytest.raises(OSError, match="is larger than 0 MiB"):
         plain_bytes(path, 3)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_text_is_read_whatever_editor_saved_it(tmp_path, encoding):
+    """Notepad writes a byte order mark, and CRLF."""
+    path = tmp_path / "poses.txt"
+    path.write_bytes("# name lon lat\r\nß.jpg 8 47 500 0 0 0\r\n".encode(encoding))
+    assert plain_text(path).startswith("# name")
+    assert [row.name for row in read_poses(path)] == ["ß.jpg"]
+
+
+def test_another_encoding_is_a_named_error(tmp_path):
+    path = tmp_path / "poses.txt"
+    path.write_bytes("ß.jpg 8 47 500 0 0 0\n".encode("cp1252"))
+    with pytest.raises(PoseFileError, match="save the file as UTF-8"):
+        read_poses(path)
+
+
+def test_the_files_of_a_folder_are_the_users(tmp_path):
+    """A Mac puts ._NAME beside each NAME that it copies to a stick."""
+    for name in ("b.JPG", "._b.JPG", "a.jpg", ".hidden.jpg", "a.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "folder.jpg").mkdir()
+    assert [p.name for p in files_of(tmp_path, (".jpg",))] == ["a.jpg", "b.JPG"]
 
 
 def test_a_link_to_a_plain_file_is_one(tmp_path):

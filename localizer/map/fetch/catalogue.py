@@ -15,6 +15,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.terms import require_allowed
 from localizer.map.source import VerticalDatum
+from localizer.plain_files import as_text
 from localizer.strict_yaml import load_yaml
 
 Kind = Literal["wms", "wmts", "wcs", "xyz", "tms", "cog", "stac"]
@@ -119,7 +120,7 @@ def _entries(path: Path) -> list[Any]:
         text = path.read_bytes()
         if len(text) > _MOST_BYTES:
             raise MapFetchError(f"{path}: over {_MOST_BYTES >> 20} MiB; that is no file of sources")
-        document = load_yaml(text.decode("utf-8"))
+        document = load_yaml(as_text(text))
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise MapFetchError(f"{path}: cannot be read: {error}") from error
     entries = document.get("sources") if isinstance(document, dict) else None

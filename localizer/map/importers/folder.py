@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from localizer.errors import MapSourceError
+from localizer.plain_files import files_of, visible
 
 MESHES = (".glb", ".gltf", ".obj")
 RASTERS = (".tif", ".tiff", ".vrt")
@@ -69,7 +70,7 @@ def source_in(folder: Path, georeference_given: bool) -> FoundSource:
 
 
 def _ways(folder: Path, georeference_given: bool) -> Iterator[FoundSource]:
-    for path in sorted(folder.glob("*tileset*.json")):  # under another name
+    for path in visible(folder.glob("*tileset*.json")):  # under another name
         yield FoundSource((path,))
     for name in _ODM_TILESETS:
         if (folder / name / TILESET).is_file():
@@ -82,28 +83,24 @@ def _ways(folder: Path, georeference_given: bool) -> Iterator[FoundSource]:
     if all(map(Path.is_file, rasters)):
         yield FoundSource(rasters)
     offset = _first(folder, _OFFSETS)
-    meshes = _files(folder, MESHES)
+    meshes = files_of(folder, MESHES)
     if offset or georeference_given:
         yield from (FoundSource((m,), None if georeference_given else offset) for m in meshes)
-    plain = tuple(_files(folder, RASTERS))
+    plain = tuple(files_of(folder, RASTERS))
     if len(plain) == 2:
         yield FoundSource(plain)
 
 
 def _found(folder: Path) -> str:
     """What is in a folder, two levels deep, that an importer might take."""
-    deep = [folder, *sorted(p for p in folder.iterdir() if p.is_dir())]
-    files = [p for place in deep for p in _files(place, (*MESHES, *RASTERS))]
+    deep = [folder, *visible(p for p in folder.iterdir() if p.is_dir())]
+    files = [p for place in deep for p in files_of(place, (*MESHES, *RASTERS))]
     files += [p.parent / p.name for p in sorted(folder.glob(f"*/{TILESET}"))]
     if not files:
         return "nothing else that can be imported"
     shown = ", ".join(str(p.relative_to(folder)) for p in files[:_LISTED])
     more = f" and {len(files) - _LISTED} more" if len(files) > _LISTED else ""
     return f"what it holds is not one source: {shown}{more}"
-
-
-def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file())
 
 
 def _first(folder: Path, names: tuple[str, ...]) -> Path | None:

@@ -159,6 +159,76 @@ def test_a_photo_without_angles_is_named(tmp_path):
         _convert(tmp_path, tmp_path / "o", *options)
 
 
+PHOTOS = ("--from", "photos", "--to", "poses", "--heights", "ellipsoidal", *PLACE)
+PLACED = (
+    '<x:xmpmeta><rdf:Description drone-dji:GpsLatitude="47.2" drone-dji:GpsLongitude="{longitude}" '
+    'drone-dji:AbsoluteAltitude="{height:+.2f}" drone-dji:GimbalRollDegree="+0.00" '
+    'drone-dji:GimbalYawDegree="{yaw:+.2f}" drone-dji:GimbalPitchDegree="{pitch:+.2f}" {more}/>'
+    "</x:xmpmeta>"
+)
+
+
+def _placed(path, *, yaw=12.0, pitch=-89.9, height=520.0, longitude=8.2, more=""):
+    _photo(path, PLACED.format(yaw=yaw, pitch=pitch, height=height, longitude=longitude, more=more))
+
+
+def test_angles_that_were_not_measured_are_named(tmp_path):
+    """Mini 2, and P1 on the M400, write 0.00 while the camera looks down."""
+    for k in range(3):
+        _placed(tmp_path / f"DJI_{k}.JPG", yaw=0.0 if k else 12.0, pitch=0.0 if k else -89.9)
+    with pytest.raises(
+        PoseFileError, match=r"all 0 in 2 of 3 photos, first DJI_1\.JPG: .*not meas"
+    ):
+        _convert(tmp_path, tmp_path / "o", *PHOTOS)
+    for k in (1, 2):  # the user says where it looked
+        (tmp_path / f"DJI_{k}.xmp").write_text(
+            PLACED.format(yaw=12, pitch=-90, height=520, longitude=8.2, more="")
+        )
+    _convert(tmp_path, tmp_path / "o", *PHOTOS)
+    assert [row.pitch_deg for row in read_poses(tmp_path / "o")] == pytest.approx([0.1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        ('drone-dji:AltitudeType="RtkAlt" drone-dji:RtkFlag="50"',
+         'drone-dji:AltitudeType="GpsFusionAlt" drone-dji:RtkFlag="0"'),
+        ('drone-dji:RtkFlag="50"', 'drone-dji:RtkFlag="0"'),
+        ('drone-dji:RtkFlag="50"', ""),
+    ],
+)  # fmt: skip
+def test_heights_above_two_surfaces_in_one_flight_are_named(tmp_path, kinds):
+    for k in range(4):
+        _placed(tmp_path / f"DJI_{k}.JPG", height=(567.5, 519.8)[k // 2], more=kinds[k // 2])
+    with pytest.raises(PoseFileError, match=r"different surfaces .*2 photos, first DJI_2\.JPG"):
+        _convert(tmp_path, tmp_path / "o", *PHOTOS)
+
+
+def test_what_is_odd_about_a_flights_tags_is_told(tmp_path):
+    flags = (50, 34, 50)
+    for k, (height, above) in enumerate(((520, 80), (521, 81), (569, 81))):
+        more = f'drone-dji:RtkFlag="{flags[k]}" drone-dji:RelativeAltitude="{above:+}"'
+        _placed(tmp_path / f"DJI_{k}.JPG", height=height, more=more)
+    told = _convert(tmp_path, tmp_path / "o", *PHOTOS).output
+    assert "RtkFlag 34, 50: not all photos have an RTK fix" in told
+    assert "DJI_2.JPG: AbsoluteAltitude less RelativeAltitude steps by +48.0 m" in told
+    assert "DJI_1.JPG" not in told
+
+
+def test_a_photo_without_a_fix_is_named(tmp_path):
+    xmp = PLACED.format(longitude=0.0, height=0.0, yaw=1, pitch=-90, more="").replace("47.2", "0.0")
+    _photo(tmp_path / "DJI_0.JPG", xmp)
+    with pytest.raises(PoseFileError, match=r"DJI_0\.JPG: .*no GNSS fix"):
+        _convert(tmp_path, tmp_path / "o", *PHOTOS)
+
+
+def test_what_a_mac_leaves_beside_photos_is_none(tmp_path):
+    _placed(tmp_path / "DJI_0.JPG")
+    (tmp_path / "._DJI_0.JPG").write_bytes(bytes(4096))
+    _convert(tmp_path, tmp_path / "o", *PHOTOS)
+    assert len(read_poses(tmp_path / "o")) == 1
+
+
 @pytest.mark.parametrize("gimbal_frame", ["heading", "earth", "body"])
 def test_autopilot_angles_by_hand(tmp_path, gimbal_frame):
     """Nose east, rolled 10 degrees right, a gimbal 30 degrees down: three meanings of one row."""
@@ -195,6 +265,27 @@ def test_colmap_by_hand(tmp_path):
     with pytest.raises(PoseFileError, match="cannot hold the name"):
         _convert(tmp_path / "images.txt", tmp_path / "p", "--from", "colmap", "--to", "poses",
                  *PLACE)  # fmt: skip
+
+
+@pytest.mark.parametrize("points", ["", "\n", "1.5 2 -1 3 4 17\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_colmap_with_and_without_its_lines_of_points(tmp_path, points, mark):
+    """Known poses that are written by hand often have one line an image."""
+    head = f"{mark}# Number of images: 6, mean observations per image: 0\n"
+    lines = [f"{k} 0 1 0 0 {-10 * k} {5 * k} 100 1 DJI {k}.JPG\n{points}" for k in range(1, 7)]
+    (tmp_path / "images.txt").write_text(head + "".join(lines), encoding="utf-8")
+    out = tmp_path / "o.csv"
+    options = ("--from", "colmap", "--to", "autopilot", *PLACE)
+    _convert(tmp_path / "images.txt", out, *options)
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows] == [f"DJI {k}.JPG" for k in range(1, 7)]
+    east_m = [FRAME.enu_from_geodetic(float(r["latitude_deg"]), float(r["longitude_deg"]),
+                                      float(r["height_m"]))[0] for r in rows]  # fmt: skip
+    assert east_m == pytest.approx([10 * k for k in range(1, 7)], abs=1e-3)
+    (tmp_path / "images.txt").write_text(head.replace("6", "7") + "".join(lines), "utf-8")
+    with pytest.raises(PoseFileError, match="says 7 images, holds 6"):
+        _convert(tmp_path / "images.txt", out, *options)
 
 
 def test_a_flights_record_becomes_a_trajectory(tmp_path):

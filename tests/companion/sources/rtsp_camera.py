@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
 import threading
 import time
@@ -25,9 +26,13 @@ SDP = (
 
 
 class RtspCamera:
-    """Serves one client at a time. FFmpeg packs the RTP; this relays it into the TCP connection."""
+    """Serves one client at a time. FFmpeg packs the RTP; this relays it into the TCP connection, or
+    by UDP, where it refuses the other with 461.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, *, by_udp: bool = False) -> None:
+        self._by_udp = by_udp
+        self._client_port = 0
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.url = f"rtsp://127.0.0.1:{self._listener.getsockname()[1]}/live"
         self.sent: dict[int, int] = {}
@@ -68,6 +73,16 @@ class RtspCamera:
                     SDP,
                     f"Content-Type: application/sdp\r\nContent-Length: {len(SDP)}\r\n",
                 )
+            elif method == "SETUP" and self._by_udp:
+                port = re.search(r"client_port=(\d+)", headers["Transport"])
+                if port is None:
+                    refused = (
+                        f"RTSP/1.0 461 Unsupported Transport\r\nCSeq: {headers['CSeq']}\r\n\r\n"
+                    )
+                    client.sendall(refused.encode())
+                    continue
+                self._client_port = int(port[1])
+                extra = f"Transport: {headers['Transport']};server_port=6970-6971\r\nSession: 1\r\n"
             elif method == "SETUP":
                 extra = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n"
             elif method in ("PLAY", "OPTIONS"):
@@ -109,10 +124,12 @@ class RtspCamera:
         picture.time_base = Fraction(1, 90_000)
         output.mux(stream.encode(picture))  # type: ignore[attr-defined]
 
-    @staticmethod
-    def _forward(relay: socket.socket, client: socket.socket) -> None:
+    def _forward(self, relay: socket.socket, client: socket.socket) -> None:
         end = time.monotonic() + 1 / RATE_HZ
         while time.monotonic() < end:
             with contextlib.suppress(TimeoutError):
                 packet = relay.recv(65536)
-                client.sendall(b"$\0" + len(packet).to_bytes(2, "big") + packet)
+                if self._by_udp:
+                    relay.sendto(packet, ("127.0.0.1", self._client_port))
+                else:
+                    client.sendall(b"$\0" + len(packet).to_bytes(2, "big") + packet)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 from collections.abc import Iterator
 
 import pytest
@@ -16,6 +17,7 @@ from companion.sources.datagrams import (
     VideoDatagrams,
     parse_sender,
 )
+from companion.sources.rtp import RtpPictures, kind_of
 
 S = 1_000_000_000
 TS = (b"\x47" + bytes(187)) * 7
@@ -149,12 +151,12 @@ def test_the_sender_is_kept_over_a_reconnection_and_old_packets_are_not(sockets:
     camera.send(TS)
     assert feed.read(65536) == TS
     feed.prove()
-    camera.send(b"old")
+    camera.send(TS[188:])
     stranger.send(TS)
     feed.begin(30.0)
     stranger.send(TS)
-    camera.send(b"new")
-    assert feed.read(65536) == b"new"
+    camera.send(TS[376:])
+    assert feed.read(65536) == TS[376:]
 
 
 def test_a_read_returns_at_most_what_is_asked_and_loses_nothing(sockets: Sockets) -> None:
@@ -190,3 +192,92 @@ def test_a_multicast_group_is_joined_on_the_interface() -> None:
         sender.sendto(TS, ("239.255.42.42", receiver.getsockname()[1]))
         receiver.settimeout(30.0)
         assert receiver.recv(2000) == TS
+
+
+# What FFmpeg, GStreamer and cameras send, by its first bytes.
+RTP = bytes.fromhex("80600001 00015f90 12345678".replace(" ", ""))
+KINDS = [
+    (TS, "mpegts"),
+    (RTP.replace(b"\x60", b"\x21") + TS, "rtp mpegts"),
+    (RTP + bytes.fromhex("6742c01e"), "rtp h264"),  # parameters
+    (RTP + bytes.fromhex("7800096742c01e"), "rtp h264"),  # several units
+    (RTP + bytes.fromhex("7c85b800"), "rtp h264"),  # a part of a key frame
+    (RTP + bytes.fromhex("5c01aabb"), "rtp h264"),  # from the middle of a picture
+    (RTP + bytes.fromhex("40010c01"), "rtp hevc"),
+    (RTP + bytes.fromhex("62019300"), "rtp hevc"),
+    (bytes.fromhex("90e00001 00015f90 12345678 bede0001 00000000 6742c01e"), "rtp h264"),
+    (bytes.fromhex("000000016742c01e"), "h264"),
+    (bytes.fromhex("00000109f0"), "h264"),
+    (bytes.fromhex("0000000140010c01"), "hevc"),
+]
+
+
+@pytest.mark.parametrize(("data", "kind"), KINDS)
+def test_what_a_feed_is_of_is_seen_by_a_datagram(data: bytes, kind: str) -> None:
+    assert kind_of(data) == kind
+    assert SenderLock(None, S).admits(CAMERA, data, 0)
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (bytes.fromhex("fd09000001010000000000000000000403"), "MAVLink"),
+        (RTP.replace(b"\x60", b"\x1a") + bytes(40), "RTP of payload type 26, JPEG"),
+        (b"GET / HTTP/1.1\r\n", "begin with 47 45 54 20"),
+    ],
+)
+def test_what_comes_and_is_not_read_is_named(sockets: Sockets, data: bytes, told: str) -> None:
+    """Never "nothing came" while something comes."""
+    sockets.feed.begin(0.05)
+    sockets.sender("127.0.0.1").send(data)
+    with pytest.raises(SilentSenderError, match=f"from 127.0.0.1 come .*{told}"):
+        sockets.feed.format()
+
+
+def test_video_of_another_than_the_chosen_sender_is_named() -> None:
+    made = Sockets()
+    feed = VideoDatagrams(made.address, SenderLock("127.0.0.9", S))
+    feed.begin(0.05)
+    made.sender("127.0.0.1").send(TS)
+    with pytest.raises(SilentSenderError, match=r"video comes from 127\.0\.0\.1, which is not"):
+        feed.format()
+    feed.release()
+    made.close()
+
+
+def rtp(sequence: int, time: int, payload: bytes, *, last: bool) -> bytes:
+    return struct.pack(">BBHII", 0x80, 0x60 | last << 7, sequence & 0xFFFF, time, 7) + payload
+
+
+def pictures(ivf: bytes) -> list[tuple[int, bytes]]:
+    """(time, Annex B) of each, after IVF's header."""
+    assert ivf[:12] == b"DKIF\0\0 \0H264"
+    found, at = [], 32
+    while at < len(ivf):
+        size, time = struct.unpack_from("<Iq", ivf, at)
+        found.append((time, ivf[at + 12 : at + 12 + size]))
+        at += 12 + size
+    return found
+
+
+def test_rtp_packets_become_pictures_with_their_times() -> None:
+    """Units alone, several in one packet, one in three; times that wrap; a packet that is lost."""
+    made = RtpPictures("h264")
+    start, first = b"\0\0\0\1", (1 << 32) - 1500
+    packets = [
+        rtp(65534, first, b"\x78\0\2\x67\x42\0\3\x68\xce\x3c", last=False),
+        rtp(65535, first, b"\x7c\x85AA", last=False),
+        rtp(0, first, b"\x7c\x05BB", last=False),
+        rtp(1, first, b"\x7c\x45CC", last=True),
+        rtp(2, 1500, b"\x41dd", last=True),
+        rtp(3, 4500, b"\x5c\x81EE", last=False),
+        rtp(5, 4500, b"\x5c\x41FF", last=True),  # 4 is lost
+        rtp(6, 7500, b"\x41gg", last=False),  # without a mark: the next picture's time ends it
+        rtp(7, 10500, b"\x41hh", last=True),
+    ]
+    found = pictures(b"".join(map(made.take, packets)))
+    assert found == [
+        (0, start + b"\x67\x42" + start + b"\x68\xce\x3c" + start + b"\x65AABBCC"),
+        (3000, start + b"\x41dd"), (9000, start + b"\x41gg"), (12000, start + b"\x41hh"),
+    ]  # fmt: skip
+    assert made.lost == 1

@@ -6,7 +6,9 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import av
@@ -62,6 +64,51 @@ def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
     # By its own stamps, not by the first connection's clock.
     errors = [time_ns - second.exposed[number] for number, time_ns in of_second()]
     assert np.abs(errors).max() < 0.5e6
+
+
+@pytest.mark.parametrize("form", ["rtp", "h264", "sdp"])
+def test_rtp_and_raw_video_are_received_as_transport_streams_are(
+    form: str, url: str, tmp_path: Path
+) -> None:
+    """QGroundControl's "UDP h.264", PX4's Gazebo, OpenHD and WFB-ng send RTP."""
+    port, source = url.rpartition(":")[2], url
+    target = f"{url}?pkt_size=1400" if form == "h264" else f"rtp://127.0.0.1:{port}"
+    if form == "sdp":
+        source = str(tmp_path / "feed.sdp")
+        Path(source).write_text(
+            f"v=0\nc=IN IP4 127.0.0.1\nm=video {port} RTP/AVP 96\na=rtpmap:96 H264/90000\n"
+        )
+    with (
+        Watch(source) as watch,
+        av.open(target, "w", format="h264" if form == "h264" else "rtp") as out,
+    ):
+        stream = out.add_stream("libx264", rate=20)
+        stream.width, stream.height, stream.pix_fmt = CAMERA.width, CAMERA.height, "yuv420p"
+        stream.options = {"preset": "ultrafast", "tune": "zerolatency", "g": "10",
+                          "x264-params": "repeat-headers=1"}  # fmt: skip
+        for number in range(600):
+            picture = av.VideoFrame.from_ndarray(counter_image(number), format="rgb24")
+            picture.pts, picture.time_base = number, Fraction(1, 20)
+            out.mux(stream.encode(picture))
+            if len(watch.frames) >= 8:
+                break
+            time.sleep(0.05)
+    assert watch.error is None
+    assert len(watch.frames) >= 8
+    numbers = [read_counter(f.image) for f, _ in watch.frames]
+    assert numbers == sorted(numbers)
+    if form != "h264":  # RTP's times, not those of arrival
+        times = np.array([f.exposure_time_ns for f, _ in watch.frames]) / 5e7 - numbers
+        assert np.ptp(times) < 1.0
+
+
+def test_a_stream_that_is_not_read_is_never_told_as_silence(url: str) -> None:
+    with Watch(url) as watch, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        mavlink = bytes.fromhex("fd09000001010000000000000000000403")
+        watch.wait_until(lambda: StreamState.STALLED in watch.states)  # nothing came yet
+        while not any("MAVLink" in text for _, text in list(watch.told)):
+            sender.sendto(mavlink, ("127.0.0.1", int(url.rpartition(":")[2])))
+            time.sleep(0.02)
 
 
 def test_pictures_of_a_second_sender_are_not_mixed_in(url: str) -> None:

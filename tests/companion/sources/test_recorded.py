@@ -9,6 +9,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
 from pydantic import ValidationError
 
 from companion.errors import StreamDecodeError, StreamOpenError, StreamSizeError
@@ -66,6 +67,69 @@ def test_every_image_comes_once_in_order_in_rgb(kind: str, request: pytest.Fixtu
     assert source.counters.undecodable == 0  # B-frames that were held back are not lost
     assert source.counters.delivered == COUNT
     assert source.counters.dropped == 0
+
+
+@pytest.mark.parametrize(("settings", "rate"), [({}, 50), ({"rate_hz": 25}, 25)])
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_a_raw_stream_plays_at_its_own_rate_or_the_given_one(
+    tmp_path: Path, codec: str, settings: dict[str, float], rate: int
+) -> None:
+    """It has no presentation times; FFmpeg takes 25 pictures a second for granted."""
+    form = {"libx264": "h264", "mpeg4": "m4v"}[codec]
+    path = tmp_path / f"flight.{form}"
+    with av.open(str(path), "w", format=form) as container:
+        stream = container.add_stream(codec, rate=50)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for i in range(COUNT):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(_image(20 * i), format="rgb24")))
+        container.mux(stream.encode())
+    told = []
+    source = open_source(
+        path, CAMERA, SourceSettings(**settings), lambda _, text: told.append(text)
+    )
+    steps = np.diff([f.exposure_time_ns for f in source.frames()])
+    np.testing.assert_allclose(steps, 1e9 / rate, atol=1e3)
+    assert len(steps) == COUNT - 1
+    by = "camera.settings.rate_hz" if settings else "its headers"
+    assert f"no times in it: {rate} pictures a second" in told[0]
+    assert by in told[0]
+
+
+@pytest.mark.parametrize("cover_first", [True, False])
+def test_a_cover_picture_is_not_the_video(tmp_path: Path, video: Path, cover_first: bool) -> None:
+    """Skydio writes one, and it may be stream 0."""
+    path = tmp_path / "covered.mp4"
+    with av.open(str(video)) as source, av.open(str(path), "w") as container:
+        cover = container.add_stream("mjpeg") if cover_first else None
+        film = container.add_stream_from_template(source.streams.video[0])
+        cover = cover or container.add_stream("mjpeg")
+        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+        container.mux(cover.encode(picture) + cover.encode())
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = film
+                container.mux(packet)
+    frames = list(open_source(path, CAMERA).frames())
+    assert [frame.image.shape for frame in frames] == [(120, 160, 3)] * COUNT
+
+
+def test_a_cover_picture_alone_is_no_video(tmp_path: Path) -> None:
+    path = tmp_path / "sound.mp4"
+    with av.open(str(path), "w") as container:
+        cover = container.add_stream("mjpeg")
+        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+        container.mux(cover.encode(picture) + cover.encode())
+    with pytest.raises(StreamOpenError, match="has no video stream"):
+        list(open_source(path, CAMERA).frames())
+
+
+def test_what_a_mac_leaves_beside_images_is_none(folder: Path) -> None:
+    (folder / "._img0.png").write_bytes(bytes(4096))
+    assert len(list(open_source(folder, CAMERA).frames())) == COUNT
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])

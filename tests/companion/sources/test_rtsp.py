@@ -11,6 +11,18 @@ from companion.sources import SourceSettings, StreamState, open_source
 from tests.companion.sources.rtsp_camera import CAMERA, RATE_HZ, STEP, RtspCamera
 
 
+def test_a_camera_that_refuses_tcp_is_received_by_udp() -> None:
+    server = RtspCamera(by_udp=True)
+    source = open_source(server.url, CAMERA)
+    levels = [
+        STEP * round(float(f.image[140:].mean()) / STEP)
+        for f, _ in zip(source.frames(), "abc", strict=False)
+    ]
+    source.close()
+    server.close()
+    assert set(levels) <= set(server.sent)
+
+
 def test_an_rtsp_camera_is_received_and_taken_up_again_when_it_hangs_up(real_time: Any) -> None:
     with real_time():
         server = RtspCamera()

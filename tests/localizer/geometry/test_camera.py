@@ -13,6 +13,14 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 
 BROWN = (-0.21, 0.07, 0.0011, -0.0008, -0.012)
+RATIONAL = (2.5, 1.1, 0.0002, -0.0003, 0.05, 2.8, 1.8, 0.25)
+PRISM = (*RATIONAL, 0.004, -0.001, 0.003, 0.002)
+TILTED = (*PRISM, 0.03, -0.02)
+FISHEYE = (-0.012, 0.003, -0.002, 0.0004)
+LENSES = [
+    ("opencv", (0.0,) * 5), ("opencv", BROWN), ("opencv", RATIONAL), ("opencv", PRISM),
+    ("opencv", TILTED), ("fisheye", FISHEYE),
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -28,7 +36,8 @@ def distorted(camera):
 def opencv_project(points, camera):
     """OpenCV's projection; its pixel centres are at integers, ours half a pixel further."""
     K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    pixels, _ = cv2.projectPoints(
+    module = cv2.fisheye if camera.distortion_model == "fisheye" else cv2
+    pixels, _ = module.projectPoints(
         points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, np.array(camera.distortion)
     )
     return pixels.reshape(-1, 2) + 0.5
@@ -41,16 +50,16 @@ def cloud(n=200):
     )
 
 
-@pytest.mark.parametrize("distortion", [(0.0,) * 5, BROWN])
-def test_projection_is_opencvs_plus_half_a_pixel(camera, distortion):
-    camera = replace(camera, distortion=distortion)
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_projection_is_opencvs_plus_half_a_pixel(camera, model, distortion):
+    camera = replace(camera, distortion=distortion, distortion_model=model)
     pixels, _ = camera.project(cloud())
     np.testing.assert_allclose(pixels, opencv_project(cloud(), camera), atol=1e-8)
 
 
-@pytest.mark.parametrize("distortion", [(0.0,) * 5, BROWN])
-def test_rays_invert_the_projection(camera, distortion):
-    camera = replace(camera, distortion=distortion)
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_rays_invert_the_projection(camera, model, distortion):
+    camera = replace(camera, distortion=distortion, distortion_model=model)
     rng = np.random.default_rng(1)
     pixels = rng.uniform([0, 0], [640, 480], (300, 2))
     again, inside = camera.project(camera.rays(pixels) * 37.0)
@@ -105,8 +114,10 @@ def test_resizing_agrees_with_cv2_resize(camera):
     np.testing.assert_allclose(centre, expected, atol=1e-9)
 
 
-def test_undistortion_maps_put_every_ray_where_the_pinhole_sees_it(distorted):
+@pytest.mark.parametrize(("model", "distortion"), LENSES[1:])
+def test_undistortion_maps_put_every_ray_where_the_pinhole_sees_it(camera, model, distortion):
     """A smooth picture of the ray direction: after remapping each pixel shows its own ray."""
+    distorted = replace(camera, distortion=distortion, distortion_model=model)
     target = distorted.without_distortion().resized(320, 240)
     v, u = np.mgrid[0:480, 0:640] + 0.5
     seen = distorted.rays(np.stack([u, v], axis=-1))[..., :2].astype(np.float32)
@@ -119,18 +130,29 @@ def test_undistortion_maps_put_every_ray_where_the_pinhole_sees_it(distorted):
     np.testing.assert_allclose(remapped[inner], expected[inner], atol=1.0 / 32 / 600)
 
 
-def test_dictionary_and_json_round_trip(distorted, tmp_path):
+def test_what_a_polynomial_folds_back_into_the_picture_is_not_seen(camera):
+    """Brown's model brings a ray 65 degrees off the axis back to 30: no lens does."""
+    folding = replace(camera, distortion=(-0.2, 0.0, 0.0, 0.0, 0.0))
+    pixels, inside = folding.project([[2.0, 0.0, 1.0], [0.4, 0.0, 1.0]])
+    assert 0 < pixels[0, 0] < camera.width
+    np.testing.assert_array_equal(inside, [False, True])
+    wide = Camera(640, 480, 130.0, 130.0, 320.0, 240.0)
+    maps = folding.undistortion_maps(wide)
+    white = np.full((480, 640), 255, np.uint8)
+    shown = cv2.remap(white, maps[0], maps[1], cv2.INTER_LINEAR)
+    columns = np.flatnonzero(shown[240])
+    reach = (folding.rays([[0.0, 240.0], [640.0, 240.0]]) * 130)[:, 0] + 320
+    assert columns[0] + 0.5 == pytest.approx(reach[0], abs=20)
+    assert columns[-1] + 0.5 == pytest.approx(reach[1], abs=20)
+
+
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
+def test_dictionary_and_json_round_trip(camera, model, distortion, tmp_path):
+    distorted = replace(camera, distortion=distortion, distortion_model=model)
     assert Camera.from_dict(distorted.to_dict()) == distorted
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(distorted.to_dict()))
     assert Camera.from_json(path) == distorted
-
-
-def test_single_distortion_keys(camera):
-    data = {k: v for k, v in camera.to_dict().items() if k != "distortion"}
-    named = data | dict(zip(("k1", "k2", "p1", "p2", "k3"), BROWN, strict=True))
-    assert Camera.from_dict(named).distortion == BROWN
-    assert Camera.from_dict(data | {"distortion": [0.1, 0.2]}).distortion == (0.1, 0.2, 0, 0, 0)
 
 
 @pytest.mark.parametrize(

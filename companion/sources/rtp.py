@@ -1,0 +1,178 @@
+"""What the datagrams of a video feed carry, and RTP's video (RFC 3550, 6184, 7798) as one stream.
+
+FFmpeg reads RTP only from sockets of its own, which listen on every interface; here the datagrams
+of one sender are put together and handed to it in IVF, which keeps RTP's times and adds no delay.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import Literal
+
+Kind = Literal["mpegts", "rtp h264", "rtp hevc", "rtp mpegts", "h264", "hevc"]
+FORMATS: dict[Kind, str] = {
+    "mpegts": "mpegts", "rtp mpegts": "mpegts", "rtp h264": "ivf", "rtp hevc": "ivf",
+    "h264": "h264", "hevc": "hevc",
+}  # fmt: skip
+_PACKET, _SYNC = 188, 0x47  # an MPEG-TS packet's bytes, and the byte that it begins with
+_HEADER = 12  # bytes of RTP's
+_MPEG_TS_TYPE = 33  # payload type; from 96 on they are dynamic
+_START = b"\x00\x00\x00\x01"
+# NAL unit types, and those of RTP packets that hold several or a part of one.
+_H264_TYPES, _H264_MANY, _H264_PART = {1, 2, 5, 6, 7, 8, 9, 12, 24, 28}, 24, 28
+_HEVC_TYPES, _HEVC_MANY, _HEVC_PART = {0, 1, 2, *range(4, 10), *range(16, 22), *range(32, 41),
+                                       48, 49}, 48, 49  # fmt: skip
+_RATE_HZ = 90_000  # of RTP's video times
+_WRAP = 1 << 32
+
+
+def kind_of(data: bytes) -> Kind | None:
+    """What a datagram is of; None for no video that is read."""
+    if data[:1] == bytes([_SYNC]) and _is_transport(data):
+        return "mpegts"
+    payload = payload_of(data)
+    if payload:
+        if data[1] & 0x7F == _MPEG_TS_TYPE and payload[0] == _SYNC:
+            return "rtp mpegts"
+        codec = _codec(payload) if data[1] & 0x7F >= 96 else None
+        if codec is not None:
+            return "rtp h264" if codec == "h264" else "rtp hevc"
+    for start in (_START, _START[1:]):
+        if data.startswith(start):
+            return _codec(data[len(start) :])
+    return "mpegts" if _is_transport(data) else None
+
+
+def named(data: bytes) -> str:
+    """What a datagram is that is not read, for an operator."""
+    if data[:1] in (b"\xfd", b"\xfe") and len(data) >= 8:
+        return "MAVLink: is this the autopilot's port?"
+    if payload_of(data):
+        kind = {26: ", JPEG", 32: ", MPEG-2"}.get(data[1] & 0x7F, "")
+        return f"RTP of payload type {data[1] & 0x7F}{kind}: have it send H.264 or H.265"
+    return (
+        f"datagrams that begin with {data[:4].hex(' ')}: no MPEG-TS, no RTP and no H.264 or H.265"
+    )
+
+
+def _is_transport(data: bytes) -> bool:
+    """Whether MPEG-TS packets follow one another in it; a datagram may begin inside one."""
+    return len(data) >= _PACKET and any(
+        all(data[k] == _SYNC for k in range(i, len(data), _PACKET))
+        for i in range(min(_PACKET, len(data)))
+        if data[i] == _SYNC
+    )
+
+
+def payload_of(data: bytes) -> bytes:
+    """RTP's payload, b"" where it is no RTP packet, or RTCP."""
+    if len(data) <= _HEADER or data[0] >> 6 != 2 or 72 <= data[1] & 0x7F <= 76:
+        return b""
+    begin = _HEADER + 4 * (data[0] & 0x0F)
+    if data[0] & 0x10:  # an extension: 4 bytes, the last two its length in words
+        begin += 4 + 4 * int.from_bytes(data[begin + 2 : begin + 4], "big")
+    end = len(data) - (data[-1] if data[0] & 0x20 else 0)  # padding
+    return data[begin:end]
+
+
+def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
+    """By a NAL unit's header, or that of what RTP makes of it."""
+    if len(unit) < 2 or unit[0] & 0x80:
+        return None
+    if not unit[0] & 0x01 and unit[1] == 1 and unit[0] >> 1 in _HEVC_TYPES:
+        return "hevc"
+    return "h264" if unit[0] & 0x1F in _H264_TYPES else None
+
+
+@dataclass
+class RtpPictures:
+    """Puts RTP packets of H.264 or H.265 together: IVF, each picture with its time.
+
+    A picture that lacks a packet is left out: a decoder would show the hole for seconds. sets:
+    parameter sets that an SDP gives, put before the first picture.
+    """
+
+    codec: Literal["h264", "hevc"]
+    sets: bytes = b""
+    lost: int = 0
+    """Pictures that lacked a packet."""
+    _begun: bool = False
+    _units: list[bytes] = field(default_factory=list)
+    _whole: bool = True
+    _next: int | None = None  # sequence number
+    _time: int | None = None  # RTP's, of the picture under way
+    _since: int = 0  # RTP's times since the first picture
+    _told: int | None = None  # RTP's time of the picture before
+
+    def take(self, data: bytes) -> bytes:
+        """The bytes of IVF that a datagram completes, often none."""
+        payload = payload_of(data)
+        if not payload:
+            return b""
+        sequence, time = struct.unpack_from(">HI", data, 2)
+        done = b"" if self._time in (None, time) else self._picture()
+        if self._next not in (None, sequence):
+            self._whole = False
+        self._next, self._time = (sequence + 1) & 0xFFFF, time
+        self._add(payload)
+        if data[1] & 0x80:  # the picture's last packet
+            done += self._picture()
+        return done
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether a picture was begun."""
+        return self._time is not None
+
+    def _add(self, payload: bytes) -> None:
+        head = 1 if self.codec == "h264" else 2
+        kind = payload[0] & 0x1F if self.codec == "h264" else payload[0] >> 1 & 0x3F
+        if kind == (_H264_MANY if self.codec == "h264" else _HEVC_MANY):
+            at = head
+            while at + 2 <= len(payload):
+                size = int.from_bytes(payload[at : at + 2], "big")
+                self._units.append(_START + payload[at + 2 : at + 2 + size])
+                at += 2 + size
+        elif kind == (_H264_PART if self.codec == "h264" else _HEVC_PART):
+            self._add_part(payload, head)
+        else:
+            self._units.append(_START + payload)
+
+    def _add_part(self, payload: bytes, head: int) -> None:
+        """A fragment: its header says of which type of unit, and whether it is the first."""
+        if len(payload) <= head:
+            return
+        if payload[head] & 0x80:
+            if self.codec == "h264":
+                header = bytes([payload[0] & 0xE0 | payload[1] & 0x1F])
+            else:
+                header = bytes([payload[0] & 0x81 | (payload[2] & 0x3F) << 1, payload[1]])
+            self._units.append(_START + header)
+        elif not self._units:
+            self._whole = False
+        self._units.append(payload[head + 1 :])
+
+    def _picture(self) -> bytes:
+        units, whole, time = b"".join(self._units), self._whole, self._time
+        self._units, self._whole, self._time = [], True, None
+        if not units or not whole or time is None:
+            self.lost += bool(units)
+            return b""
+        if self._told is not None:
+            step = (time - self._told) % _WRAP
+            self._since += step - _WRAP if step > _WRAP // 2 else step
+        self._told = time
+        if not self._begun:
+            self._begun, units = True, self.sets + units
+            return _ivf_header(self.codec) + _ivf_frame(units, self._since)
+        return _ivf_frame(units, self._since)
+
+
+def _ivf_header(codec: str) -> bytes:
+    tag = b"H264" if codec == "h264" else b"HEVC"
+    return struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, tag, 16, 16, _RATE_HZ, 1, 0, 0)
+
+
+def _ivf_frame(data: bytes, time: int) -> bytes:
+    return struct.pack("<Iq", len(data), time) + data
