@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     )
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
+    from localizer.map.inspection.kind import map_kind
+    from localizer.map.kind import MapKind
     from localizer.tracking.engine import DualThreadEngine
     from localizer.tracking.opening import open_localizer
     from localizer.tracking.pipeline import Localizer
@@ -55,6 +57,8 @@ _HOMES = {
     "DualThreadEngine": "localizer.tracking.engine",
     "build_cache": "localizer.map.building.build",
     "BuildOptions": "localizer.map.building.options",
+    "MapKind": "localizer.map.kind",
+    "map_kind": "localizer.map.inspection.kind",
     "Camera": "localizer.geometry.camera",
     "Pose": "localizer.geometry.pose",
     "Geodetic": "localizer.geometry.geo",
@@ -93,6 +97,8 @@ __all__ = [  # noqa: RUF022
     "DualThreadEngine",
     "build_cache",
     "BuildOptions",
+    "MapKind",
+    "map_kind",
     "Camera",
     "Pose",
     "Geodetic",

@@ -18,6 +18,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+os.environ["NUMBA_NRT_STATS"] = "1"  # before numba is imported: a test counts allocations
+
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg

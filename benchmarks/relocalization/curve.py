@@ -32,8 +32,8 @@ from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import OverviewLevel
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
 from localizer.relocalization.search import SearchView, search
-from localizer.relocalization.topview import DOWN
 from localizer.relocalization.types import PlaceQuery
+from localizer.render.topview import DOWN
 from localizer.types import Frame
 
 _CAMERA = Camera.from_fov(480, 360, 65.0)

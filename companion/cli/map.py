@@ -69,6 +69,16 @@ def build(
     imagery_date: Annotated[
         str | None, typer.Option(help="of the source's pictures: 2024, 2024-06 or 2024-06-30")
     ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="that took the source's pictures; else as its tags say")
+    ] = None,
+    heights: Annotated[
+        Literal["surface", "terrain", "flat"] | None,
+        typer.Option(
+            help="what the heights hold: surface (buildings and trees), terrain or flat; else "
+            "measured"
+        ),
+    ] = None,
     skip_bad_tiles: Annotated[
         bool, typer.Option(help="leave out tiles that cannot be imported instead of failing")
     ] = False,
@@ -113,6 +123,8 @@ def build(
                     nodata=nodata,
                     attribution=attribution,
                     imagery_date=imagery_date,
+                    sensor=sensor,
+                    heights=heights,
                     skip_bad_tiles=skip_bad_tiles,
                     overwrite=overwrite,
                     workers=workers,
@@ -157,16 +169,20 @@ def info(
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.footprint import as_geojson, as_kml
     from localizer.map.inspection.inspect import levels
+    from localizer.map.inspection.kind import map_kind
+    from localizer.map.kind import HEIGHTS_HOLD
 
     opened = TileCache.open(cache)
-    m = opened.manifest
+    m, kind = opened.manifest, map_kind(opened)
     box = geo_box(m.extent)
     egm96 = geoid_separation(m.origin.latitude_deg, m.origin.longitude_deg)
     size = opened.index.box_max[0] - opened.index.box_min[0]
     facts = {
         "source": m.source,
         "attribution": m.attribution or "not given",
-        "imagery of": str(m.build.get("imagery_date", "not known")),
+        "heights hold": HEIGHTS_HOLD[kind.heights],
+        "imagery": f"resolves {kind.effective_resolution_m:.3f} m, of "
+        f"{kind.imagery_date or 'a date not known'}, by {kind.sensor or 'a sensor not known'}",
         "origin": f"{m.origin.latitude_deg:.7f}, {m.origin.longitude_deg:.7f}, "
         f"{m.origin.height_m:.2f} m (ellipsoidal)",
         "latitude": f"{box.south:.6f} to {box.north:.6f}",

@@ -14,8 +14,8 @@ import cv2
 from localizer.geometry.antimeridian import beside
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.topview import render_top_view
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import render_top_view
 
 _SIDE_PX = 256
 _KEPT = 500

@@ -17,8 +17,8 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.topview import render_top_view
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import render_top_view
 from localizer.types import Image
 
 _SIDE_PX = 1000

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 
 from companion.config import CompanionConfig
 from companion.geometry import Mount
@@ -14,7 +15,9 @@ from companion.planning.judge import LegVerdict, MissionLimits, VisionGap, stret
 from companion.planning.mission import PlannedMission
 from companion.planning.survey import Progress, surveyor
 from companion.planning.way import Aim, FlightLeg, MapHeights, legs_of, length_m
+from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.kind import map_kind
 from localizer.odometry.config import OdometryConfig
 
 DEFAULT_PITCH_DEG = -75.0
@@ -100,6 +103,7 @@ def make_plan(
     speed_m_s = mission.speed_m_s or question.speed_m_s
     bridged = stretches(_as_flown(legs, verdicts), speed_m_s, odometry)
     notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
+    notes += _kind_notes(cache, deployment, [s.position for s in samples], ground)
     unknown = tuple(n.text for n in mission.not_judged if not (aim.fixed and n.gimbal_only))
     length = length_m(legs)
     return MissionForecast(question, length, speed_m_s, verdicts, bridged, options, notes, unknown)
@@ -144,3 +148,15 @@ def _notes(
     if deployment.localizer.odometry is None:
         notes.append("Odometry is off in this deployment: nothing bridges a stretch.")
     return tuple(notes)
+
+
+def _kind_notes(
+    cache: TileCache, deployment: CompanionConfig, places: Sequence[Array], ground: MapHeights
+) -> tuple[str, ...]:
+    """What the map's kind is worth at the height that is flown (the median over the map)."""
+    kind = map_kind(cache)
+    below = [(p[2], ground.height_m(float(p[0]), float(p[1]))) for p in places]
+    heights = [float(z) - ground_m for z, ground_m in below if ground_m is not None]
+    half_view_deg = deployment.camera.model.camera().horizontal_fov_deg / 2
+    advice = kind.advice(half_view_deg, median(heights)) if heights else ""
+    return (f"Map: {kind.line()}.", *([f"{advice[0].upper()}{advice[1:]}."] if advice else []))

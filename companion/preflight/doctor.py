@@ -21,6 +21,7 @@ from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geometry.geo import LocalFrame
 from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.kind import map_kind
 from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding, examine
@@ -85,7 +86,18 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[DoctorFi
         f"{_extent_km(m.extent, cache.frame):.2f} km from corner to corner "
         f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}"
     )
-    return cache, [DoctorFinding("map", found, "a tile cache", "", True, True)]
+    return cache, [
+        DoctorFinding("map", found, "a tile cache", "", True, True),
+        _check_kind(cache, config),
+    ]
+
+
+def _check_kind(cache: TileCache, config: CompanionConfig) -> DoctorFinding:
+    """What accuracy the map allows; a map without buildings is flown, with attitude and care."""
+    kind = map_kind(cache)
+    half_view_deg = config.camera.model.camera().horizontal_fov_deg / 2
+    why = kind.advice(half_view_deg)
+    return DoctorFinding("map's kind", kind.line(), "buildings in the heights", why, not why, False)
 
 
 def _check_mission(config: CompanionConfig, cache: TileCache) -> DoctorFinding:

@@ -18,6 +18,7 @@ from companion.writing import writing
 from localizer.errors import LocalizerError
 from localizer.geometry.antimeridian import geo_box
 from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.kind import map_kind
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 _OLD_MAP_DAYS, _OLD_SHADOW_DAYS = 730, 7
@@ -95,7 +96,8 @@ def _calibration(config: CompanionConfig, today: date) -> SheetRow:
 
 def _map(config: CompanionConfig, today: date) -> tuple[SheetRow, ...]:
     try:
-        m = TileCache.open(config.map).manifest
+        cache = TileCache.open(config.map)
+        m, kind = cache.manifest, map_kind(cache)
     except LocalizerError as error:
         return (SheetRow("map", str(error), False),)
     box = geo_box(m.extent)
@@ -104,7 +106,7 @@ def _map(config: CompanionConfig, today: date) -> tuple[SheetRow, ...]:
         f"{box.south:.5f} to {box.north:.5f}, {box.west:.5f} to "
         f"{box.east:.5f}; {m.gsd_m:.2f} m a texel; {pinned}"
     )
-    stated = str(m.build.get("imagery_date") or "")
+    stated = m.imagery_date or ""
     try:
         taken = date.fromisoformat(stated)
     except ValueError:
@@ -112,7 +114,10 @@ def _map(config: CompanionConfig, today: date) -> tuple[SheetRow, ...]:
     else:
         dated = SheetRow("map's imagery", f"{stated} ({_age(taken, today)})",
                     (today - taken).days <= _OLD_MAP_DAYS)  # fmt: skip
-    return SheetRow("map covers", where), dated
+    half_view_deg = config.camera.model.camera().horizontal_fov_deg / 2
+    advice = kind.advice(half_view_deg)
+    text = f"{kind.line()}; {advice}" if advice else kind.line()
+    return SheetRow("map covers", where), SheetRow("map's kind", text, not advice), dated
 
 
 def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:

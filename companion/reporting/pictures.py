@@ -19,9 +19,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.topview import render_top_view
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import render_top_view
 from localizer.tracking.pipeline import Undistorter
 from localizer.types import Frame, Image
 

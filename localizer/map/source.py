@@ -77,7 +77,8 @@ class SourceTree:
     centre: (3,) ECEF metres; geoid_separation_m, attribution, vertical_datum: as far as the source
     tells; files: everything it is made of, so that a change of the source can be seen; options:
     what else decided the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
-    where that only follows from the format; warnings: doubts that did not stop the import.
+    where that only follows from the format; warnings: doubts that did not stop the import;
+    imagery_date, sensor: of its images, as far as the source tells.
     """
 
     root: SourceNode
@@ -89,6 +90,8 @@ class SourceTree:
     options: str = ""
     vertical_crs: str = ""
     warnings: tuple[str, ...] = ()
+    imagery_date: str | None = None
+    sensor: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

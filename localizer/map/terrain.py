@@ -23,7 +23,13 @@ from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.map.importers.height_crs import stated_heights
-from localizer.map.importers.raster_file import HeightBand, height_band, offline, open_raster
+from localizer.map.importers.raster_file import (
+    HeightBand,
+    applied,
+    height_band,
+    offline,
+    open_raster,
+)
 from localizer.map.importers.rules import DEFAULT_RULES, HIGHEST_M, LOWEST_M
 from localizer.types import Float32
 
@@ -94,8 +100,8 @@ def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
     flat = np.stack([east, north, -fallen], axis=-1)
     latitude, longitude, _ = np.moveaxis(frame.geodetic_from_enu(flat), -1, 0)
     x, y = there.transform(longitude, latitude)
-    u, v = ~raster.transform * (np.asarray(x), np.asarray(y))
-    heights = _heights(raster, path, band, np.asarray(u), np.asarray(v))
+    u, v = applied(~raster.transform, np.asarray(x), np.asarray(y))
+    heights = _heights(raster, path, band, u, v)
     known = np.isfinite(heights)
     if not known.any():
         raise MapSourceError(f"{path}: no height is known within {_REACH_M / 1e3:.0f} km")
@@ -167,7 +173,7 @@ def _box(raster: DatasetReader, there: Transformer, frame: LocalFrame) -> tuple[
     """West and south, east and north (2,) of the raster in the map's frame, as far as it counts."""
     side = np.linspace(0.0, 1.0, _OUTLINE)
     u, v = (g.ravel() for g in np.meshgrid(side * raster.width, side * raster.height))
-    x, y = raster.transform * (u, v)
+    x, y = applied(raster.transform, u, v)
     longitude, latitude = there.transform(x, y, direction="INVERSE")
     places = frame.enu_from_geodetic(latitude, longitude, np.zeros_like(u))
     return (

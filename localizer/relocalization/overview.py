@@ -29,8 +29,8 @@ from localizer.features.extractor import FeatureExtractor, model_key
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.kept_overviews import drop_old, mark_used
-from localizer.relocalization.topview import render_top_view
 from localizer.render.base import MapRenderer
+from localizer.render.topview import render_top_view
 from localizer.types import FeatureLevel, Float32, Image
 
 logger = logging.getLogger(__name__)

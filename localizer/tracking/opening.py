@@ -14,6 +14,7 @@ from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load
 from localizer.geometry.camera import Camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.inspection.kind import map_kind
 from localizer.map.terrain import open_terrain
 from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
@@ -91,8 +92,8 @@ def build_localizer(
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(
         stack.renderer, extractor, optimizer, camera, config, sensors,
-        map_frame=stack.cache.frame, terrain=terrain, on_close=on_close,
-        is_loading=lambda: not stack.streamer.idle,
+        map_frame=stack.cache.frame, map_kind=map_kind(stack.cache), terrain=terrain,
+        on_close=on_close, is_loading=lambda: not stack.streamer.idle,
     )  # fmt: skip
 
 

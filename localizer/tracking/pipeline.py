@@ -27,6 +27,7 @@ from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
+from localizer.map.kind import MapKind
 from localizer.odometry import TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
@@ -158,9 +159,9 @@ class Localizer:
     angular rate of the motion model, their roll and pitch constrain the registration while it
     tracks (`tracking.bias`), and with the displacement they confirm or refute a place that was
     searched.
-    map_frame: the map's. terrain: the ground's shape where the map has none. on_close: releases
-    what was opened for this localizer alone. is_loading: whether tiles that were asked for are
-    still on their way.
+    map_frame, map_kind: the map's. terrain: the ground's shape where the map has none. on_close:
+    releases what was opened for this localizer alone. is_loading: whether tiles that were asked for
+    are still on their way.
     """
 
     def __init__(
@@ -173,12 +174,15 @@ class Localizer:
         sensors: AuxiliarySensors | None = None,
         *,
         map_frame: LocalFrame | None = None,
+        map_kind: MapKind | None = None,
         terrain: TerrainModel | None = None,
         on_close: Callable[[], None] = lambda: None,
         is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
         self._is_loading = is_loading
         self._map_frame, self._on_close = map_frame, on_close
+        self.map_kind = map_kind
+        """What the map can show; None where the localizer was made without it."""
         self._renderer = renderer
         self._extractor = extractor
         self._optimizer = optimizer

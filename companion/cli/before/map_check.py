@@ -35,22 +35,22 @@ def check_command(
         int, typer.Option(min=64, max=2048, help="working width, without a deployment")
     ] = 320,
 ) -> None:
-    """Coverage, holes, texel size, date, seams, picture on surface: exit code 1 if one is bad."""
+    """Heights, coverage, holes, texels, detail, date, seams, shift: exit code 1 if one is bad."""
     from companion.config import load_config
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.check import Use, check_map
     from localizer.map.inspection.inspect import write_picture
     from localizer.tracking.pipeline import working_camera
 
-    pixel_rad = 2 * math.tan(math.radians(fov) / 2) / width
+    pixel_rad, half_view_deg = 2 * math.tan(math.radians(fov) / 2) / width, fov / 2
     if config is not None:
         deployment = load_config(config)
         camera = working_camera(deployment.camera.model.camera(), deployment.localizer.width)
-        pixel_rad = 1 / camera.fx
+        pixel_rad, half_view_deg = 1 / camera.fx, camera.horizontal_fov_deg / 2
     opened = TileCache.open(cache)
     made_folder(out, "--out")
     with shown_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
-        made = check_map(opened, Use(height, pixel_rad))
+        made = check_map(opened, Use(height, pixel_rad, half_view_deg))
     for name, rgb in made.pictures.items():
         write_picture(out / f"{name}.png", rgb)
     table = Table(box=SIMPLE_HEAD)

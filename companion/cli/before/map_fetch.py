@@ -307,6 +307,7 @@ def _built(
         vertical_datum=heights.vertical_datum,
         attribution=f"{'; '.join(whose)} (licences: {'; '.join(licences)})",
         imagery_date=imagery.date,
+        sensor=imagery.title,
         overwrite=overwrite,
         workers=workers,
         apart=True,

@@ -17,10 +17,12 @@ from localizer.map.building.heights import extent_warnings, heights_of
 from localizer.map.building.isolation import call_apart
 from localizer.map.building.options import BuildOptions
 from localizer.map.building.sources import SourceOptions, find_source, read_source
-from localizer.map.building.staging import TileRecord, publish, staging
+from localizer.map.building.staging import TileRecord, complete, publish, staging
 from localizer.map.building.workers import ImportJob, ImportWorkers, Progress, import_all, tiles_of
 from localizer.map.cache.cache import Manifest
 from localizer.map.importers.georeference import Georeference
+from localizer.map.inspection.kind import measure_kind
+from localizer.map.kind import IMAGERY_DATE
 from localizer.map.source import FlatTree, SourceNode, SourceTree
 
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
@@ -74,7 +76,7 @@ def build_tree(
     """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
     options = options or BuildOptions()
     rules = options.rules
-    dated = _dated(options.imagery_date)
+    date = _date(options.imagery_date) or tree.imagery_date
     _require_on_earth(tree)
     separation, datum, doubts = heights_of(
         tree, options.geoid_separation_m, options.vertical_datum, name, rules
@@ -111,22 +113,27 @@ def build_tree(
                 "attribution": (
                     tree.attribution if options.attribution is None else options.attribution
                 ),
-                "build": parameters | dated,
+                "build": parameters,
                 "skipped": skipped,
                 "warnings": (*tree.warnings, *doubts),
             }
         )
-        return publish(staged, Path(out), index, manifest)
+        cache = complete(staged, index, manifest)
+        kind = measure_kind(
+            cache,
+            heights=options.heights,
+            imagery_date=date,
+            sensor=options.sensor or tree.sensor,
+        )
+        return publish(staged, Path(out), cache.manifest.model_copy(update={"kind": kind}))
 
 
-def _dated(imagery_date: str | None) -> dict[str, str]:
-    if imagery_date is None:
-        return {}
-    if not re.fullmatch(r"\d{4}(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?", imagery_date):
+def _date(imagery_date: str | None) -> str | None:
+    if imagery_date is not None and not re.fullmatch(IMAGERY_DATE, imagery_date):
         raise MapSourceError(
             f"imagery date {imagery_date!r}: give a year, a month or a day, as 2024-06-30"
         )
-    return {"imagery_date": imagery_date}
+    return imagery_date
 
 
 def _failures(root: SourceNode, records: dict[int, TileRecord]) -> dict[str, str]:

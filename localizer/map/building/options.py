@@ -8,6 +8,7 @@ from pathlib import Path
 from localizer.geometry.geo import Geodetic
 from localizer.map.importers.georeference import Georeference, UpAxis
 from localizer.map.importers.rules import ImportRules
+from localizer.map.kind import Heights
 from localizer.map.source import VerticalDatum
 
 
@@ -21,7 +22,8 @@ class BuildOptions:
 
     georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. height_unit, nodata:
     of a DSM, see `read_rasters`. origin: of the world frame, else the source's centre. attribution:
-    whose data it is; imagery_date: of its pictures, as 2024, 2024-06 or 2024-06-30.
+    whose data it is; imagery_date: of its pictures, as 2024, 2024-06 or 2024-06-30; sensor: that
+    took them; heights: what they hold, else measured (`MapKind`).
 
     skip_bad_tiles: leave out tiles that cannot be imported (their parents are shown there) instead
     of failing. overwrite: replace a cache of another source or of other options. rules: what a
@@ -42,6 +44,8 @@ class BuildOptions:
     origin: Geodetic | None = None
     attribution: str | None = None
     imagery_date: str | None = None
+    sensor: str | None = None
+    heights: Heights | None = None
     skip_bad_tiles: bool = False
     overwrite: bool = False
     workers: int | None = None

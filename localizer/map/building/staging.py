@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from localizer.errors import MapCacheError
 from localizer.geometry.pose import Array
-from localizer.map.cache.cache import INDEX_NAME, MANIFEST_NAME, Manifest, TileIndex, encode_tile
+from localizer.map.cache.cache import (
+    INDEX_NAME,
+    MANIFEST_NAME,
+    Manifest,
+    TileCache,
+    TileIndex,
+    encode_tile,
+)
 from localizer.map.cache.hold import replacing
 from localizer.map.cache.tile import build_mips, texel_coverage
 from localizer.map.source import SourceMesh
@@ -134,14 +141,21 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
         yield Staging(folder)
 
 
-def publish(staged: Staging, out: Path, index: TileIndex, manifest: Manifest) -> Manifest:
-    """Write index and manifest and rename the folder to `out`; nothing is half done after it.
-    MapCacheError while someone reads what is there: the next try publishes what is staged.
+def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache:
+    """Write index and manifest: the staging folder opens as a cache, and is not published yet."""
+    digest = index.save(staged.folder / INDEX_NAME)
+    final = manifest.model_copy(update={"index_sha256": digest})
+    _write(staged.folder / MANIFEST_NAME, final.model_dump_json(indent=1).encode())
+    return TileCache(staged.folder, final, index)
+
+
+def publish(staged: Staging, out: Path, manifest: Manifest) -> Manifest:
+    """Write the manifest of a `complete` cache and rename the folder to `out`; nothing is half done
+    after it. MapCacheError while someone reads what is there: the next try publishes what is
+    staged.
     """
     folder = staged.folder
-    digest = index.save(folder / INDEX_NAME)
-    final = manifest.model_copy(update={"index_sha256": digest})
-    _write(folder / MANIFEST_NAME, final.model_dump_json(indent=1).encode())
+    _write(folder / MANIFEST_NAME, manifest.model_dump_json(indent=1).encode())
     # Renamed now and deleted after that, so that nobody who opens the cache finds it locked.
     with TemporaryDirectory(prefix=f"{out.name}.old-", dir=out.parent) as old, replacing(out):
         for name in ("records", "parts", "build.json", "lock"):
@@ -149,7 +163,7 @@ def publish(staged: Staging, out: Path, index: TileIndex, manifest: Manifest) ->
         if out.exists():
             out.rename(Path(old) / "replaced")
         folder.rename(out)
-    return final
+    return manifest
 
 
 def _is_empty(path: Path) -> bool:

@@ -20,6 +20,7 @@ from localizer.errors import GeoreferenceError, MapCacheError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import PackedTexture, TileMesh, mesh_fault
+from localizer.map.kind import MapKind
 from localizer.plain_files import plain_bytes
 from localizer.types import Float32, Image
 
@@ -41,7 +42,8 @@ class Manifest(BaseModel):
     gsd_m: texel size of the finest tiles; levels: depth of the tile tree; extent: outline of the
     map as (latitude_deg, longitude_deg) corners; skipped: source tiles that could not be imported,
     with the reason; warnings: doubts about the source that did not stop the import; index_sha256:
-    hash of the index, which holds the tiles' hashes.
+    hash of the index, which holds the tiles' hashes; kind: None in a cache of an older build, which
+    `localizer.map.inspection.kind.map_kind` measures.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -63,6 +65,13 @@ class Manifest(BaseModel):
     skipped: dict[str, str]
     warnings: tuple[str, ...] = ()
     index_sha256: str
+    kind: MapKind | None = None
+
+    @property
+    def imagery_date(self) -> str | None:
+        """Of the map's images; an older build kept it beside its other options."""
+        stated = self.build.get("imagery_date") if self.kind is None else self.kind.imagery_date
+        return str(stated) if stated else None
 
 
 @dataclass(frozen=True, eq=False)

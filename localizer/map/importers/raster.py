@@ -20,7 +20,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
-from rasterio._err import CPLE_BaseError
+from rasterio._err import CPLE_BaseError  # GDAL's own errors have no public name
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
 from rasterio.io import DatasetReader
@@ -50,6 +50,7 @@ from localizer.map.importers.raster_file import (
     open_raster,
     opened,
     require_sane,
+    stated_imagery,
 )
 from localizer.map.importers.rules import DEFAULT_RULES, HIGHEST_M, LOWEST_M, ImportRules
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
@@ -210,6 +211,7 @@ def _read_rasters(
         warnings += check_overlap(heights, band, colours, rules)
         bands = colour_bands(ortho, colours)
         warnings += check_colours(ortho, colours, bands)
+        date, sensor = stated_imagery(colours)
         grid = _grid(heights, colours)
         centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
         bounds = rasterio.warp.transform_bounds(_flat_crs(heights), grid.crs, *heights.bounds)
@@ -227,7 +229,17 @@ def _read_rasters(
     node = _Tree(rules, (left, bottom, right, top)).node(root)
     options = "" if band == METRES else str(band)
     return SourceTree(
-        node, centre, None, "", files, stated.datum, options, stated.crs, tuple(warnings)
+        node,
+        centre,
+        None,
+        "",
+        files,
+        stated.datum,
+        options,
+        stated.crs,
+        tuple(warnings),
+        date,
+        sensor,
     )
 
 

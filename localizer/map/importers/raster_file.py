@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,8 +30,11 @@ from localizer.map.importers.height_crs import (
     unit_of,
 )
 from localizer.map.importers.rules import ImportRules, require_plain_file
+from localizer.map.kind import IMAGERY_DATE
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "IMAGERY_DATE")
+_SENSOR_TAGS = ("SATELLITEID", "SENSOR", "SENSOR_ID", "PLATFORM")
 _MAX_SIDECAR_BYTES = 16 << 20
 # What sidecar files may name is not fetched: no address of the network is one of these.
 _NO_NETWORK = {
@@ -169,6 +173,19 @@ def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
         red, green, blue = (meaning.index(colour) + 1 for colour in wanted)
         return red, green, blue
     return 1, 2, 3
+
+
+def stated_imagery(data: DatasetReader) -> tuple[str | None, str | None]:
+    """Date (year, month or day) and sensor of an orthophoto, by its tags; None where none says it.
+
+    GDAL's IMAGERY tags, and what vendors write among the plain ones. TIFFTAG_DATETIME is when the
+    file was written, and not when its photos were taken.
+    """
+    stated = data.tags() | data.tags(ns="IMAGERY")
+    tags = {name.upper(): text.strip() for name, text in stated.items()}
+    dates = (re.match(IMAGERY_DATE, tags.get(name, "")) for name in _DATE_TAGS)
+    sensors = (tags.get(name) for name in _SENSOR_TAGS)
+    return next((d[0] for d in dates if d), None), next((s[:80] for s in sensors if s), None)
 
 
 def has_separate_mask(data: DatasetReader) -> bool:

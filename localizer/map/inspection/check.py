@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from localizer.errors import MapCacheError
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.alignment import ImageryOffset, alignment_of
+from localizer.map.inspection.kind import map_kind
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
 from localizer.map.inspection.usable import Usable, usable_part
+from localizer.map.kind import HEIGHTS_HOLD, MapKind
 from localizer.types import Image
 
 _LEAST_HOLE_M2 = 25.0
@@ -48,10 +50,13 @@ class MapFinding:
 
 @dataclass(frozen=True)
 class Use:
-    """What the map is for. height_m: above the ground; pixel_rad: angle of a working pixel."""
+    """What the map is for. height_m: above the ground; pixel_rad: angle of a working pixel;
+    half_view_deg: half of the camera's field of view.
+    """
 
     height_m: float
     pixel_rad: float
+    half_view_deg: float = 32.5
 
     @property
     def pixel_m(self) -> float:
@@ -99,13 +104,16 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
     blank = _blank(mosaic)
     seams = seams_of(cache, mosaic)
     shift = alignment_of(mosaic)
+    kind = map_kind(cache)
     findings = (
         _intact(cache),
+        _heights_finding(kind, use),
         _coverage(mosaic, gaps),
         _holes_finding(mosaic, holes),
         _blank_finding(mosaic, blank),
         _texels(cache, use),
-        _date(cache),
+        _detail(kind, use),
+        _date(kind),
         _seam_finding(seams),
         _shift(shift),
     )
@@ -234,11 +242,27 @@ def _texels(cache: TileCache, use: Use) -> MapFinding:
     )
 
 
-def _date(cache: TileCache) -> MapFinding:
-    date = cache.manifest.build.get("imagery_date")
-    if date:
+def _heights_finding(kind: MapKind, use: Use) -> MapFinding:
+    advice = kind.advice(use.half_view_deg, use.height_m)
+    grade = Grade.ADVICE if advice else Grade.GOOD
+    words = advice or "they tell a tilt from a shift"
+    return MapFinding("heights", HEIGHTS_HOLD[kind.heights], grade, words)
+
+
+def _detail(kind: MapKind, use: Use) -> MapFinding:
+    ratio = kind.effective_resolution_m / use.pixel_m
+    found = f"{kind.effective_resolution_m:.2f} m are resolved, {ratio:.1f} working pixels"
+    if ratio <= _COARSE:
+        return MapFinding("imagery detail", found, Grade.GOOD, "as fine as the video")
+    words = "blurred beside the video, whatever its texels: fly higher, or find sharper imagery"
+    return MapFinding("imagery detail", found, Grade.ADVICE, words)
+
+
+def _date(kind: MapKind) -> MapFinding:
+    if kind.imagery_date:
         words = "what was built or felled since costs accuracy"
-        return MapFinding("imagery of", str(date), Grade.GOOD, words)
+        found = ", ".join(part for part in (kind.imagery_date, kind.sensor) if part)
+        return MapFinding("imagery of", found, Grade.GOOD, words)
     words = "give `map build` --imagery-date; what was built or felled since costs accuracy"
     return MapFinding("imagery of", "not known", Grade.ADVICE, words)
 

@@ -9,8 +9,8 @@ import numpy as np
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.topview import render_top_view
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import render_top_view
 from localizer.types import Float32, Image
 
 _SQUARE_PX = 512

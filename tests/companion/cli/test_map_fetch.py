@@ -71,7 +71,8 @@ def test_one_command_makes_a_cache_whose_heights_are_right(server, sources, tmp_
 
     cache = TileCache.open(out)
     assert cache.manifest.attribution.startswith("the photographers; the surveyors (licences: CC0")
-    assert cache.manifest.build["imagery_date"] == "2024-06-01"
+    assert cache.manifest.imagery_date == "2024-06-01"
+    assert (cache.manifest.kind.heights, cache.manifest.kind.sensor) == ("terrain", "photos")
     surface = MapSurface(cache)
     wrong = []
     for east in LEFT + np.array([80.0, 133.0, 201.0, 262.5, 320.0]):

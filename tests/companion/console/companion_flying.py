@@ -24,8 +24,8 @@ from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.cache.surface import MapSurface
-from localizer.relocalization.topview import DOWN
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import DOWN
 from localizer.types import (
     Frame,
     PoseEstimate,

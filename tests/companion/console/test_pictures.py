@@ -14,8 +14,8 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.topview import DOWN
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import DOWN
 from tests.companion.console.companion_flying import CAMERA, HEIGHT_M
 
 OFF_M = (4.0, -3.0, 2.0)  # of the estimate to the reference's pose: more than any prediction is

@@ -43,7 +43,7 @@ def _findings(map_cache, source, model=MODEL, rate_hz=20.0, **settings):
 
 def test_a_good_deployment(map_cache, feed):
     findings = _findings(map_cache, feed)
-    assert set(findings) == {"map", "localizer", "camera", "power mode"}
+    assert set(findings) == {"map", "map's kind", "localizer", "camera", "power mode"}
     assert all(findings[name].ok for name in ("map", "localizer", "camera"))
     assert findings["localizer"].found.startswith("tiny (onnxruntime, ")
     assert "numba" in findings["localizer"].found

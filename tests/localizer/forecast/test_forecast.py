@@ -14,9 +14,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.tile import TileMesh
 from localizer.registration.jngo import JNGO
-from localizer.relocalization.topview import DOWN
 from localizer.render.base import StaticTiles
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import DOWN
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
 HALF_M = 150.0

@@ -17,9 +17,9 @@ from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import footprint, rectify, turned
 from localizer.relocalization.search import ground_of, headings, scales, shared_extractions
-from localizer.relocalization.topview import DOWN
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier, tilt_and_heading
+from localizer.render.topview import DOWN
 from localizer.types import FeatureLevel, Frame, RegistrationStatus
 
 CAMERA = Camera.from_fov(160, 120, 60.0)

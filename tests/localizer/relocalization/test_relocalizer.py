@@ -22,9 +22,9 @@ from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.overview import open_overview, overview_key
 from localizer.relocalization.patch import turned
 from localizer.relocalization.relocalizer import open_relocalizer
-from localizer.relocalization.topview import DOWN
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import DOWN
 from localizer.types import Frame
 
 CONFIG = LocalizerConfig(renderer="numba", threads=1)

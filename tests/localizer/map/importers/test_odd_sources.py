@@ -538,6 +538,7 @@ OTHERS = [
 ]
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # as it should be
 @pytest.mark.parametrize("case", [*RASTERS, *OTHERS], ids=str)
 def test_an_odd_source_is_refused_by_name_or_trusted(case, tmp_path, make):
     source = case.make(tmp_path) if case in RASTERS else case.make(tmp_path, make)
@@ -587,7 +588,7 @@ def test_outside_a_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
 
 def test_beside_a_turned_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
     """Three vertices at its corners were 400 m below the ground."""
-    turned = Affine.translation(LEFT, TOP) * Affine.rotation(10) * Affine.scale(1, -1)
+    turned = Affine.translation(LEFT, TOP) @ Affine.rotation(10) @ Affine.scale(1, -1)
     source = [
         write(tmp_path / "dsm.tif", ground(80), transform=turned),
         write(tmp_path / "ortho.tif", picture(80), transform=turned),
@@ -816,6 +817,7 @@ def test_colours_in_another_order_are_put_right(tmp_path, built):
     assert np.array_equal(other.load_tile(0).mips[0], honest)
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # as it should be
 def test_only_control_points_are_no_place(tmp_path):
     paths = rasters(tmp_path)
     with rasterio.open(paths[0], "r+") as data:
@@ -827,6 +829,7 @@ def test_only_control_points_are_no_place(tmp_path):
         build_cache(paths, tmp_path / "c", BuildOptions(workers=1, **ELLIPSOIDAL))
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # as it should be
 def test_no_name_makes_gdal_fetch_anything(tmp_path):
     asked = []
 

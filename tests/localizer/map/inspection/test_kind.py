@@ -1,0 +1,130 @@
+"""What kind of map it is: heights with or without buildings, and how fine its imagery is."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+from scipy.ndimage import gaussian_filter
+
+from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
+from localizer.map.cache.cache import MANIFEST_NAME, TileCache
+from localizer.map.inspection.kind import map_kind
+
+STEP_M, TEXEL_M, SIDE_M = 1.0, 0.25, 200.0
+LEFT, TOP = 500_100.0, 5_228_300.0
+
+
+def natural(blur_px: float) -> np.ndarray:
+    """Imagery whose power falls as that of natural ground, blurred, with a little noise."""
+    n = round(SIDE_M / TEXEL_M)
+    rng = np.random.default_rng(3)
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(n), np.fft.fftfreq(n)))
+    frequency[0, 0] = 1.0
+    field = np.fft.ifft2(np.fft.fft2(rng.normal(size=(n, n))) * frequency**-1.25).real
+    grey = (
+        gaussian_filter(127 + 40 * field / field.std(), blur_px)
+        if blur_px
+        else 127 + (40 * field / field.std())
+    )
+    return np.clip(grey + rng.normal(0, 0.3, grey.shape), 0, 255).astype(np.uint8)
+
+
+def hills() -> np.ndarray:
+    """Slopes of up to 30 degrees, without anything on them."""
+    s = np.arange(round(SIDE_M / STEP_M)) * STEP_M
+    return 400 + 18 * np.sin(s / 35)[None] + 8 * np.cos(s / 25)[:, None]
+
+
+def houses(heights: np.ndarray) -> np.ndarray:
+    """Four houses of 8 m: half a percent of the ground."""
+    built = heights.copy()
+    for row, column in ((30, 40), (90, 150), (140, 60), (160, 120)):
+        part = (slice(row, row + 8), slice(column, column + 10))
+        built[part] = heights[part].min() + 8.0
+    return built
+
+
+def write(path, data, step, **tags):
+    data = np.atleast_3d(data)
+    profile = {
+        "driver": "GTiff", "width": data.shape[1], "height": data.shape[0], "count": data.shape[2],
+        "dtype": data.dtype, "crs": "EPSG:32632", "transform": from_origin(LEFT, TOP, step, step),
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as out:
+        out.write(np.moveaxis(data, 2, 0))
+        out.update_tags(**tags)
+    return path
+
+
+def built(folder, surface, blur_px=0.0, tags=(), **options) -> TileCache:
+    sources = (
+        write(folder / "dsm.tif", surface.astype(np.float32), STEP_M),
+        write(folder / "ortho.tif", natural(blur_px), TEXEL_M, **dict(tags)),
+    )
+    how = BuildOptions(workers=1, vertical_datum="ellipsoidal", **options)
+    build_cache(sources, folder / "cache", how)
+    return TileCache.open(folder / "cache")
+
+
+@pytest.mark.parametrize(
+    ("heights", "expected"),
+    [(houses(hills()), "surface"), (hills(), "terrain"), (np.full((200, 200), 400.0), "flat")],
+    ids=["houses", "hills", "plane"],
+)
+def test_buildings_are_told_from_slopes_and_slopes_from_a_plane(tmp_path, heights, expected):
+    kind = built(tmp_path, heights).manifest.kind
+    assert kind.heights == expected
+    assert kind.has_buildings == (expected == "surface")
+    assert (kind.unknown_height_sigma_m < 1.0) == (expected == "surface")
+
+
+def test_blurred_imagery_resolves_what_its_blur_leaves(tmp_path):
+    """A Gaussian of s pixels keeps a tenth of the contrast at 0.342 / s cycles a pixel."""
+    for name, blur_px, expected_m in (("sharp", 0.0, 0.25), ("soft", 2.0, 0.25 * 2.0 / 0.684)):
+        folder = tmp_path / name
+        folder.mkdir()
+        kind = built(folder, hills(), blur_px).manifest.kind
+        assert kind.effective_resolution_m == pytest.approx(expected_m, rel=0.15)
+
+
+def test_the_source_and_its_owner_say_what_cannot_be_measured(tmp_path):
+    tags = {"ACQUISITIONDATETIME": "2023-07-14T09:12:55", "SATELLITEID": "PHR1B"}
+    kind = built(tmp_path, hills(), tags=tags.items(), heights="surface").manifest.kind
+    assert (kind.imagery_date, kind.sensor, kind.heights) == ("2023-07-14", "PHR1B", "surface")
+
+
+def test_a_cache_of_an_older_build_is_read_and_measured_when_asked(tmp_path):
+    cache = built(tmp_path, houses(hills()))
+    path = cache.path / MANIFEST_NAME
+    manifest = json.loads(path.read_text())
+    del manifest["kind"]
+    manifest["build"]["imagery_date"] = "2019-05"
+    path.write_text(json.dumps(manifest))
+    old = TileCache.open(cache.path)
+    assert old.manifest.kind is None
+    found = map_kind(old)
+    assert (found.heights, found.imagery_date) == ("surface", "2019-05")
+    assert found.effective_resolution_m == cache.manifest.kind.effective_resolution_m
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("name", "files", "heights", "least_m", "most_m"),
+    [
+        ("fengyuan", ("ground.tif", "ortho.tif"), "flat", 0.35, 0.55),
+        ("caliterra", ("dsm.tif", "ortho.tif"), "surface", 0.0625, 0.1),
+    ],
+)
+def test_real_maps_are_what_their_makers_say(
+    tmp_path, real_data, name, files, heights, least_m, most_m
+):
+    sources = [real_data(name) / file for file in files]
+    build_cache(sources, tmp_path / "map", BuildOptions(vertical_datum="ellipsoidal", workers=1))
+    kind = TileCache.open(tmp_path / "map").manifest.kind
+    assert kind.heights == heights
+    assert least_m <= kind.effective_resolution_m <= most_m
