@@ -55,7 +55,8 @@ def build(
         Path | None, typer.Option(help="georeference of a mesh: JSON, or ODM's offset file")
     ] = None,
     up_axis: Annotated[
-        Literal["y", "z"] | None, typer.Option(help="of a mesh: y (glTF's default) or z (OBJ's)")
+        Literal["y", "z"] | None,
+        typer.Option(help="of a mesh or tileset: y (glTF's default) or z (OBJ's)"),
     ] = None,
     height_unit: Annotated[
         str | None, typer.Option(help="of a DSM without a unit: m, ft or us-ft")

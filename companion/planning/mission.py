@@ -64,10 +64,12 @@ _Read = tuple[tuple[float, float] | None, _Items, MissionVehicle, float | None]
 
 
 def _plan(text: str) -> _Read:
-    mission = json.loads(text)["mission"]
+    document = json.loads(text)
+    mission = document["mission"]
     home = _home(mission["plannedHomePosition"])
     autopilot, kind = (_whole(mission.get(key)) for key in ("firmwareType", "vehicleType"))
-    vehicle = MissionVehicle(autopilot, kind)
+    rally = bool(document.get("rallyPoints", {}).get("points"))
+    vehicle = MissionVehicle(autopilot, kind, rally)
     entries = [found for entry in mission["items"] for found in _expanded(entry)]
     numbers = _numbers([_whole(entry.get("doJumpId")) for entry in entries])
     items = [_plan_item(*one) for one in zip(entries, numbers, strict=True)]

@@ -78,7 +78,8 @@ class SourceTree:
     tells; files: everything it is made of, so that a change of the source can be seen; options:
     what else decided the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
     where that only follows from the format; warnings: doubts that did not stop the import;
-    imagery_date, sensor: of its images, as far as the source tells.
+    imagery_date, sensor: of its images, as far as the source tells; up_axis: by which its meshes
+    were read, None where it has none.
     """
 
     root: SourceNode
@@ -92,6 +93,7 @@ class SourceTree:
     warnings: tuple[str, ...] = ()
     imagery_date: str | None = None
     sensor: str | None = None
+    up_axis: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,10 +52,13 @@ _WINGED = frozenset((1, *range(19, 26)))  # an aeroplane, VTOLs
 
 @dataclass(frozen=True)
 class MissionVehicle:
-    """What a mission is for, as far as its file says. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE."""
+    """What a mission is for, as far as its file says. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE;
+    has_rally_points: to the nearest of which it may return, instead of home.
+    """
 
     autopilot: int | None = None
     kind: int | None = None
+    has_rally_points: bool = False
 
     @property
     def is_px4(self) -> bool:

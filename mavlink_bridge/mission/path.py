@@ -304,6 +304,8 @@ class _Flight:
         if self._home is None:
             self._leave_out(item.named, "the mission has no home")
             return
+        if self._vehicle.has_rally_points:
+            self._leave_out(item.named, "it may return to a rally point")
         self._add("home", item, self._home)
 
 

@@ -67,12 +67,22 @@ def _covers(node: _Node) -> bool:
     return True
 
 
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """index, and manifest as far as the tiles tell; leaves: the finest tiles; volumes: the ECEF
+    corners (8, 3) that the source states of nodes, with their tiles.
+    """
+
+    index: TileIndex
+    manifest: Manifest
+    leaves: list[StoredTile]
+    volumes: list[tuple[Array, list[StoredTile]]]
+
+
 def assemble(
     tree: SourceTree, records: dict[int, TileRecord], staged: Staging, frame: LocalFrame
-) -> tuple[TileIndex, Manifest]:
-    """Put the imported tiles in their places in the staging folder; the index, and the manifest as
-    far as the tiles tell.
-    """
+) -> Assembled:
+    """Put the imported tiles in their places in the staging folder."""
     root = _graft(tree.root, records)
     nodes = [root]
     child_start = []
@@ -104,7 +114,12 @@ def assemble(
         size=np.array([t.size for t in tiles], np.int64),
         digest=np.array([list(bytes.fromhex(t.sha256)) for t in tiles], np.uint8),
     )
-    return index, _manifest(nodes, child_start, tiles, frame)
+    return Assembled(
+        index,
+        _manifest(nodes, child_start, tiles, frame),
+        [tile for node in nodes if not node.children for tile in node.tiles],
+        [(n.source.corners, n.tiles) for n in nodes if n.source.corners is not None and n.tiles],
+    )
 
 
 def _link(source: Path, target: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.assembly import assemble
+from localizer.map.building.content import require_in_volumes, require_upright
 from localizer.map.building.heights import extent_warnings, heights_of
 from localizer.map.building.isolation import call_apart
 from localizer.map.building.options import BuildOptions
@@ -100,7 +101,10 @@ def build_tree(
         skipped = _failures(tree.root, records)
         if skipped and not options.skip_bad_tiles:
             raise MapSourceError(_failure_text(name, skipped))
-        index, manifest = assemble(tree, records, staged, frame)
+        built = assemble(tree, records, staged, frame)
+        manifest = built.manifest
+        doubts += require_upright(built.leaves, tree.up_axis, name, rules)
+        doubts += require_in_volumes(built.volumes, frame, lift, name, rules)
         doubts += extent_warnings(
             manifest.extent, manifest.height_range_m, separation, name, rules
         )  # fmt: skip
@@ -117,7 +121,7 @@ def build_tree(
                 "warnings": (*tree.warnings, *doubts),
             }
         )
-        cache = complete(staged, index, manifest)
+        cache = complete(staged, built.index, manifest)
         kind = measure_kind(
             cache,
             heights=options.heights,

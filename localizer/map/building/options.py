@@ -20,7 +20,8 @@ class BuildOptions:
     vertical_datum: datum of the source's heights, needed if neither format nor CRS states it;
     "amsl" heights are lifted by the separation.
 
-    georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. height_unit, nodata:
+    georeference: of a mesh, see `read_georeference`. up_axis: of a mesh or a tileset,
+    see `mesh_tree` and `read_tileset`. height_unit, nodata:
     of a DSM, see `read_rasters`. origin: of the world frame; None: the source's centre.
     imagery_date: 2024, 2024-06 or 2024-06-30. sensor: of the imagery. heights: what they contain;
     None: measured (`MapKind`).

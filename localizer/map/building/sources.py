@@ -13,9 +13,9 @@ from localizer.map.building.levels import with_levels
 from localizer.map.building.quadtree import bounds, quadtree
 from localizer.map.importers.folder import MESHES, RASTERS, FoundSource, source_in
 from localizer.map.importers.georeference import Georeference, UpAxis, read_georeference
-from localizer.map.importers.mesh import MeshFile
+from localizer.map.importers.mesh import MeshFile, obj_materials
 from localizer.map.importers.raster import read_rasters
-from localizer.map.importers.referenced_files import colour_pictures, files_beside
+from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.importers.tiles3d import read_tileset
 from localizer.map.source import SourceTree
@@ -28,7 +28,7 @@ _IMPORTABLE = (
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a source is to be read, beyond what it says. up_axis: of a mesh; height_unit, nodata: of
+    """How a source is to be read, beyond what it says. up_axis: of meshes; height_unit, nodata: of
     a DSM, see `read_rasters`.
     """
 
@@ -68,7 +68,7 @@ def read_source(
     if sources[0].suffix.lower() in MESHES:
         return _read_mesh(sources[0], georeference, options)
     if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
-        return with_levels(read_tileset(sources[0], rules))
+        return with_levels(read_tileset(sources[0], rules, options.up_axis))
     raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
 
 
@@ -95,8 +95,8 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
     middle = [*(0.5 * (low + high))[:2], low[2]] if georeference.origin is None else [0.0, 0.0, 0.0]
     centre = georeference.ecef(np.array([middle]))[0]
     files = (path, *files_beside(path))
-    missing = colour_pictures(path)[1] if path.suffix.lower() == ".obj" else ()
-    warnings = [f"{path.name}: its texture {name!r} is not there" for name in missing]
+    doubts = obj_materials(path)[1] if path.suffix.lower() == ".obj" else ()
+    warnings = [f"{path.name}: {text}" for text in doubts]
     text = georeference.far_outside(np.array([low, high]))
     if text is not None:
         warnings.append(options.rules.doubt("area", f"{path}: {text}"))
@@ -113,5 +113,6 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
         "",
         files,
         options=f"{georeference} {axis}",
+        up_axis=axis,
         warnings=tuple(warnings),
     )

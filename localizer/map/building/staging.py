@@ -28,14 +28,16 @@ from localizer.map.cache.cache import (
     encode_tile,
 )
 from localizer.map.cache.hold import replacing
-from localizer.map.cache.tile import build_mips, texel_coverage
+from localizer.map.cache.tile import build_mips, texel_coverage, vector_area
 from localizer.map.source import SourceMesh
 from localizer.types import Image
 
 
 @dataclass(frozen=True)
 class StoredTile:
-    """A tile file that was written. box: ENU metres; center: the tile frame's origin in ENU."""
+    """A tile file that was written. box: ENU metres; center: the tile frame's origin in ENU; area:
+    see `vector_area`.
+    """
 
     sha256: str
     size: int
@@ -45,6 +47,7 @@ class StoredTile:
     center: tuple[float, float, float]
     box_min: tuple[float, float, float]
     box_max: tuple[float, float, float]
+    area: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -198,6 +201,7 @@ def stored_tile(mesh: SourceMesh) -> tuple[bytes, StoredTile]:
         _triple(center),
         _triple(low),
         _triple(high),
+        _triple(vector_area(world, faces)),
     )
 
 

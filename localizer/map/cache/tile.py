@@ -120,6 +120,22 @@ class TileMesh:
         )
 
 
+def vector_area(positions: Array, faces: NDArray[np.int32]) -> Array:
+    """Sum of a mesh's normals, each as long as its triangle's area (3,), m²: walls that face each
+    other cancel, so that what is left of a map's points up, whatever stands on it.
+    """
+    a, b, c = (positions[faces[:, k]].astype(np.float64) for k in range(3))
+    return np.asarray(0.5 * np.cross(b - a, c - a).sum(axis=0))
+
+
+def facing_fault(area: Array) -> str | None:
+    """What is wrong with a map whose `vector_area` (ENU) is this; None where most faces up."""
+    up, aside = float(area[2]), float(np.hypot(area[0], area[1]))
+    if up >= aside:
+        return None
+    return "stands on its edge" if abs(up) < aside else "faces down"
+
+
 def mesh_fault(
     positions: NDArray[np.floating[Any]],
     uvs: NDArray[np.floating[Any]],

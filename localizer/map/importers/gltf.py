@@ -6,6 +6,9 @@ this module cannot decode raises `MapSourceError` with the extension's name.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import DracoPy
@@ -20,14 +23,18 @@ from localizer.map.importers.gltf_data import (
     checked_count,
     item,
     normalised,
+    normalised_bounds,
     vector,
 )
+from localizer.map.importers.materials import appearance, cut_out
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.textures import (
+    decode_alpha,
     decode_image,
     merged_by_picture,
     palette_mesh,
     picture_size,
+    placed,
     srgb,
     tinted,
 )
@@ -55,11 +62,12 @@ _READABLE = {
     "EXT_instance_features",
 }
 _WRAP_REPEAT = 10497
+_SURFACES = (4, 5, 6)  # triangles, strips, fans; points and lines have none
 _OUTSIDE_UNIT_SQUARE = 0.01  # texture coordinates off by less are rounding, not repetition
 
 
 # What walking over JSON of the wrong shape raises; everything expected is checked by name.
-_MALFORMED = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
+MALFORMED = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
 
 
 def read_gltf(
@@ -72,7 +80,7 @@ def read_gltf(
     try:
         document = _Document(data, read_uri, rules or ImportRules())
         return document.meshes(), document.rtc_center()
-    except (*_MALFORMED, RecursionError) as error:
+    except (*MALFORMED, RecursionError) as error:
         raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
@@ -80,8 +88,31 @@ def gltf_weight(data: bytes, read_uri: Reader, rules: ImportRules | None = None)
     """Triangles and texels of a document, from its headers alone; see `read_gltf`."""
     try:
         return _Document(data, read_uri, rules or ImportRules()).weight()
-    except _MALFORMED as error:
+    except MALFORMED as error:
         raise MapSourceError(f"malformed glTF: {error!r}") from error
+
+
+def gltf_bounds(
+    data: bytes, read_uri: Reader, rules: ImportRules | None = None
+) -> tuple[Array, Array]:
+    """Corners (N, 3) of boxes that hold the document's surfaces, by its headers where they say it,
+    and its CESIUM_RTC centre (3,); see `read_gltf`.
+    """
+    try:
+        document = _Document(data, read_uri, rules or ImportRules())
+        return document.corners(), document.rtc_center()
+    except (*MALFORMED, RecursionError) as error:
+        raise MapSourceError(f"malformed glTF: {error!r}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A texture. alpha: (h, w) uint8, None where all is opaque; wraps: beyond its edges."""
+
+    image: Image
+    jpeg: bytes | None
+    alpha: NDArray[np.uint8] | None
+    wraps: bool
 
 
 class _Document:
@@ -93,7 +124,7 @@ class _Document:
         self._rules = rules
         self._walked: set[int] = set()
         self._vertices = 0
-        self._images: dict[int, tuple[Image, bytes | None]] = {}
+        self._images: dict[int, tuple[Image, bytes | None, NDArray[np.uint8] | None]] = {}
         unknown = sorted(set(self._json.get("extensionsRequired", [])) - _READABLE)
         if unknown:
             raise MapSourceError(f"needs the glTF extensions {', '.join(unknown)}, not supported")
@@ -103,15 +134,39 @@ class _Document:
         return vector(extension.get("center", (0, 0, 0)), 3, "CESIUM_RTC center")
 
     def meshes(self) -> list[SourceMesh]:
+        parts: list[SourceMesh] = []
+        for primitive, T in self._placed():
+            for part in self._primitive(primitive):
+                self._vertices += len(part.positions)
+                self._rules.require("vertices", self._vertices, "the glTF")
+                parts.append(placed(part, T))
+        return merged_by_picture(parts)
+
+    def corners(self) -> Array:
+        """(N, 3) of the boxes of all primitives; every vertex where an accessor tells no box."""
+        found = [np.empty((0, 3))]
+        for primitive, T in self._placed():
+            index = primitive["attributes"]["POSITION"]
+            accessor = item(self._json.get("accessors", []), index, "accessor")
+            if "min" in accessor and "max" in accessor:
+                low, high = (vector(accessor[name], 3, name) for name in ("min", "max"))
+                picks = np.array(list(itertools.product((0, 1), repeat=3)), bool)
+                points = normalised_bounds(np.where(picks, high, low), accessor)
+            else:
+                points = self._geometry(primitive)[0]["POSITION"].astype(np.float64)
+            found.append(points @ T[:3, :3].T + T[:3, 3])
+        return np.concatenate(found)
+
+    def _placed(self) -> Iterator[tuple[dict[str, Any], Array]]:
+        """The primitives of the document's scene, each with its transform (4, 4)."""
         scenes = self._json.get("scenes", [])
         if scenes:
             roots = item(scenes, self._json.get("scene", 0), "scene").get("nodes", [])
         else:
             roots = range(len(self._json.get("nodes", [])))
-        parts: list[SourceMesh] = []
+        self._walked.clear()
         for root in roots:
-            self._walk(root, np.eye(4), 0, parts)
-        return merged_by_picture(parts)
+            yield from self._walk(root, np.eye(4), 0)
 
     def weight(self) -> tuple[int, int]:
         """Triangles (as if each mesh were used once) and texels."""
@@ -126,7 +181,9 @@ class _Document:
         ]
         return corners // 3, sum(width * height for width, height in sizes)
 
-    def _walk(self, index: int, parent: Array, depth: int, parts: list[SourceMesh]) -> None:
+    def _walk(
+        self, index: int, parent: Array, depth: int
+    ) -> Iterator[tuple[dict[str, Any], Array]]:
         if depth > MAX_NODE_DEPTH:
             raise MapSourceError("nodes are nested too deeply or in a cycle")
         if index in self._walked:  # glTF 2.0, 3.5.2: strict trees; others grow without bound
@@ -142,19 +199,13 @@ class _Document:
         if "mesh" in node:
             mesh = item(self._json.get("meshes", []), node["mesh"], "mesh")
             for primitive in mesh.get("primitives", []):
-                part = self._primitive(primitive)
-                if part is not None:
-                    self._vertices += len(part.positions)
-                    self._rules.require("vertices", self._vertices, "the glTF")
-                    positions = part.positions @ T[:3, :3].T + T[:3, 3]
-                    parts.append(_with_positions(part, positions))
+                if primitive.get("mode", 4) in _SURFACES:
+                    yield primitive, T
         for child in node.get("children", []):
-            self._walk(child, T, depth + 1, parts)
+            yield from self._walk(child, T, depth + 1)
 
-    def _primitive(self, primitive: dict[str, Any]) -> SourceMesh | None:
+    def _primitive(self, primitive: dict[str, Any]) -> list[SourceMesh]:
         mode = primitive.get("mode", 4)
-        if mode not in (4, 5, 6):
-            return None  # points and lines have no surface
         attributes, faces = self._geometry(primitive)
         positions = attributes["POSITION"].astype(np.float64)
         if positions.shape[1] != 3:
@@ -169,12 +220,13 @@ class _Document:
         if len(triangles) and (triangles.max() >= len(positions) or triangles.min() < 0):
             raise MapSourceError("an index points beyond the vertices")
         if len(triangles) == 0:
-            return None
+            return []
         material = {}
         if "material" in primitive:
             material = item(self._json.get("materials", []), primitive["material"], "material")
         faces32 = triangles.astype(np.int32)
-        return self._textured(positions, faces32, attributes, material)
+        part = self._textured(positions, faces32, attributes, material)
+        return [] if part is None or not len(part.faces) else [part]
 
     def _geometry(
         self, primitive: dict[str, Any]
@@ -225,32 +277,36 @@ class _Document:
         faces: NDArray[np.int32],
         attributes: dict[str, NDArray[Any]],
         material: dict[str, Any],
-    ) -> SourceMesh:
-        pbr = material.get("pbrMetallicRoughness", {})
-        factor = vector(pbr.get("baseColorFactor", (1, 1, 1, 1)), 4, "baseColorFactor")[:3]
-        texture = pbr.get("baseColorTexture")
-        gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-        texture = texture or gloss.get("diffuseTexture") or material.get("emissiveTexture")
-        if texture is not None:
-            transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
-            name = f"TEXCOORD_{transform.get('texCoord', texture.get('texCoord', 0))}"
+    ) -> SourceMesh | None:
+        look = appearance(material)
+        if look.is_hidden:
+            return None
+        if look.texture is not None:
+            transform = look.texture.get("extensions", {}).get("KHR_texture_transform", {})
+            name = f"TEXCOORD_{transform.get('texCoord', look.texture.get('texCoord', 0))}"
             if name in attributes:
                 uvs = _transformed_uvs(attributes[name].astype(np.float64), transform)
-                image, jpeg, wraps = self._texture(texture.get("index", -1))
-                if not np.allclose(factor, 1.0, atol=1e-3):
-                    image, jpeg = tinted(image, factor), None
+                picture = self._texture(look.texture.get("index", -1))
+                image, jpeg = picture.image, picture.jpeg
+                if not np.allclose(look.factor, 1.0, atol=1e-3):
+                    image, jpeg = tinted(image, look.factor), None
                 low, high = uvs.min(initial=0.0), uvs.max(initial=1.0)
                 outside = low < -_OUTSIDE_UNIT_SQUARE or high > 1 + _OUTSIDE_UNIT_SQUARE
-                return SourceMesh(
-                    positions, uvs.astype(np.float32), faces, image, jpeg, wraps and outside
-                )
+                repeat, uvs32 = bool(picture.wraps and outside), uvs.astype(np.float32)
+                if look.cutoff is not None and picture.alpha is not None:
+                    opaque = picture.alpha * (look.opacity / 255) >= look.cutoff
+                    positions, uvs32, faces = cut_out(
+                        positions, uvs32, faces, opaque, repeat=repeat
+                    )
+                return SourceMesh(positions, uvs32, faces, image, jpeg, repeat)
         if "COLOR_0" in attributes:
-            linear = attributes["COLOR_0"][:, :3].astype(np.float64)[faces].mean(axis=1) * factor
+            colours = attributes["COLOR_0"][:, :3].astype(np.float64)[faces].mean(axis=1)
+            linear = colours * look.factor
         else:
-            linear = np.broadcast_to(factor, (len(faces), 3))
+            linear = np.broadcast_to(look.factor, (len(faces), 3))
         return palette_mesh(positions, faces, srgb(linear))
 
-    def _texture(self, index: int) -> tuple[Image, bytes | None, bool]:
+    def _texture(self, index: int) -> _Picture:
         texture = item(self._json.get("textures", []), index, "texture")
         extensions = texture.get("extensions", {})
         if "source" in texture or "EXT_texture_webp" in extensions:
@@ -266,14 +322,9 @@ class _Document:
             sampler = item(self._json.get("samplers", []), texture["sampler"], "sampler")
         wraps = sampler.get("wrapS", _WRAP_REPEAT) == _WRAP_REPEAT
         if source not in self._images:
-            self._images[source] = decode_image(self._data.picture(source), self._rules)
-        return (*self._images[source], wraps)
-
-
-def _with_positions(part: SourceMesh, positions: Array) -> SourceMesh:
-    return SourceMesh(
-        positions, part.uvs, part.faces, part.image, part.jpeg, part.repeat, part.palette
-    )
+            data = self._data.picture(source)
+            self._images[source] = (*decode_image(data, self._rules), decode_alpha(data))
+        return _Picture(*self._images[source], wraps)
 
 
 def _node_matrix(node: dict[str, Any]) -> Array:

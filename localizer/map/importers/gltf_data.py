@@ -142,6 +142,12 @@ def normalised(array: NDArray[Any], accessor: dict[str, Any]) -> NDArray[Any]:
     return np.maximum(array.astype(np.float64) / np.iinfo(array.dtype).max, -1.0)
 
 
+def normalised_bounds(bounds: Array, accessor: dict[str, Any]) -> Array:
+    """An accessor's min and max as its elements are read: they are stated before normalising."""
+    dtype = np.dtype(_COMPONENT_TYPES[accessor.get("componentType", 5126)])
+    return np.asarray(normalised(bounds.astype(dtype), accessor), np.float64)
+
+
 def vector(values: Any, length: int, what: str) -> Array:
     """Numbers of the JSON as (length,); `what` names them in the error."""
     try:

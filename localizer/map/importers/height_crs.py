@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from pyproj import CRS
@@ -24,6 +28,15 @@ UNITS = {
     "mm": 0.001, "millimetre": 0.001,
 }  # fmt: skip
 _EGM96 = "EGM96"
+_BIG_TIFF, _KEY_DIRECTORY, _MOST_ENTRIES = 43, 34735, 4096
+_VERTICAL_TYPE_KEY, _VERTICAL_DATUM_KEY, _VERTICAL_UNIT_KEY = 4096, 4098, 4099
+_KEYED_UNITS = {9001: 1.0, 9002: _FOOT, 9003: _US_FOOT}
+# GeoTIFF 1.0, 6.3.4.1: heights above an ellipsoid, and above a national sea level.
+_KEYED_ELLIPSOIDS = frozenset((*range(5001, 5034), 4979))
+_KEYED_GEOIDS = {
+    5101: "Newlyn", 5102: "NGVD29", 5103: "NAVD88", 5104: "Yellow Sea 1956",
+    5105: "Baltic Sea", 5106: "Caspian Sea",
+}  # fmt: skip
 _DATUM_M = 1.5  # ETRS89, GDA2020 and the like are taken for WGS84 to within a metre
 _FAR_DEG = 10.0  # beyond the neighbouring zones that projects on a border are drawn in
 
@@ -45,21 +58,31 @@ class StatedHeights:
 
 
 def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeights:
-    """Of a source's CRS and its band's unit tag; `GeoreferenceError` where they contradict."""
-    unit: float | None = None
-    datum: VerticalDatum | None = None
-    name = ""
+    """Of a source's CRS and its band's unit tag; `GeoreferenceError` where they contradict. where:
+    the source; of a GeoTIFF its keys are read, too, where the CRS says nothing of heights.
+    """
+    keys = geo_keys(where) if isinstance(where, Path) else {}
+    unit, datum, name = _keyed_heights(keys, where)
+    keyed = unit
     vertical = next((c for c in crs.sub_crs_list if c.is_vertical), None)
-    if vertical is not None:
+    if datum is not None and unit is not None:
+        # GDAL leaves GeoTIFF 1.0's own numbers out, or makes other units of them.
+        return StatedHeights(unit, datum, name)
+    if datum is None and vertical is not None:
         axis, name = vertical.axis_info[0], vertical.name
         if axis.direction != "up":
             raise GeoreferenceError(f"{where}: {name} counts depths, not heights; convert it")
         unit, datum = float(axis.unit_conversion_factor), "amsl"
         if "ellips" in name.lower():
             datum = "ellipsoidal"
-    elif len(crs.axis_info) == 3:
+    elif datum is None and len(crs.axis_info) == 3:
         axis, name = crs.axis_info[2], crs.name
         unit, datum = float(axis.unit_conversion_factor), "ellipsoidal"
+    if keyed is not None and unit is not None and abs(keyed / unit - 1) > 1e-4:
+        raise GeoreferenceError(
+            f"{where}: {name} has units of {unit:g} m, its VerticalUnitsGeoKey says {keyed:g} m; "
+            "correct one of them (gdal_edit -a_srs)"
+        )
     tagged = _unit(band_unit)
     if tagged is None and (band_unit or "").strip():
         raise GeoreferenceError(
@@ -72,6 +95,57 @@ def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeig
             "one of them"
         )
     return StatedHeights(tagged if unit is None else unit, datum, name)
+
+
+def _keyed_heights(
+    keys: Mapping[int, int], where: object
+) -> tuple[float | None, VerticalDatum | None, str]:
+    """Unit, datum and name by a GeoTIFF's vertical keys: of GeoTIFF 1.0's own numbers PROJ knows
+    nothing, so that GDAL leaves them out.
+    """
+    kind = keys.get(_VERTICAL_TYPE_KEY, keys.get(_VERTICAL_DATUM_KEY, 0))
+    unit_key = keys.get(_VERTICAL_UNIT_KEY)
+    unit = None if unit_key is None else _KEYED_UNITS.get(unit_key)
+    if unit_key is not None and unit is None:
+        raise GeoreferenceError(
+            f"{where}: its heights are in the unit {unit_key} (GeoTIFF's VerticalUnitsGeoKey), "
+            "which is none that is known; convert them to metres"
+        )
+    if kind in _KEYED_ELLIPSOIDS:
+        return unit, "ellipsoidal", f"GeoTIFF vertical key {kind}"
+    if kind in _KEYED_GEOIDS:
+        return unit, "amsl", _KEYED_GEOIDS[kind]
+    return unit, None, ""
+
+
+def geo_keys(path: Path) -> dict[int, int]:
+    """The numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty where it has none
+    that can be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return _geo_keys(file)
+    except (OSError, struct.error, ValueError):
+        return {}
+
+
+def _geo_keys(file: BinaryIO) -> dict[int, int]:
+    start = file.read(16)
+    order = "<" if start[:2] == b"II" else ">"
+    large = struct.unpack_from(order + "H", start, 2)[0] == _BIG_TIFF
+    (at,) = struct.unpack_from(order + ("Q" if large else "I"), start, 8 if large else 4)
+    count_form, entry_form = ("Q", "HHQQ") if large else ("H", "HHII")
+    file.seek(at)
+    (count,) = struct.unpack(order + count_form, file.read(struct.calcsize(order + count_form)))
+    size = struct.calcsize(order + entry_form)
+    for _ in range(min(count, _MOST_ENTRIES)):
+        tag, _, length, offset = struct.unpack(order + entry_form, file.read(size))
+        if tag == _KEY_DIRECTORY and length <= _MOST_ENTRIES:
+            file.seek(offset)
+            numbers = struct.unpack(f"{order}{length}H", file.read(2 * length))
+            rows = zip(*(numbers[4 + k :: 4] for k in range(4)), strict=False)
+            return {key: value for key, location, _, value in rows if location == 0}
+    return {}
 
 
 def horizontal_unit_m(crs: CRS) -> float:

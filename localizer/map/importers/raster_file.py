@@ -36,8 +36,10 @@ _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "IMAGERY_DATE")
 _SENSOR_TAGS = ("SATELLITEID", "SENSOR", "SENSOR_ID", "PLATFORM")
 _MAX_SIDECAR_BYTES = 16 << 20
-# What sidecar files may name is not fetched: no address of the network is one of these.
-_NO_NETWORK = {
+# What sidecar files may name is not fetched: no address of the network is one of these. Vertical
+# keys of GeoTIFF 1.0 are told only when they are asked for.
+_GDAL_OPTIONS = {
+    "GTIFF_REPORT_COMPD_CS": "YES",
     "CPL_VSIL_CURL_ALLOWED_FILENAME": "/vsicurl/none",
     "CPL_VSIL_CURL_USE_HEAD": "NO",
     "GDAL_HTTP_MAX_RETRY": "0",
@@ -48,8 +50,8 @@ _NO_NETWORK = {
 
 @contextmanager
 def offline() -> Iterator[None]:
-    """Around every use of GDAL: it does not go to the network."""
-    with rasterio.Env(**_NO_NETWORK):
+    """Around every use of GDAL: it does not go to the network, and tells what heights are above."""
+    with rasterio.Env(**_GDAL_OPTIONS):
         yield
 
 

@@ -1,27 +1,71 @@
 """The files that a mesh or a tile's content refers to: its source has changed when they have.
 
-They are found by the names in headers alone and never raise: what is wrong with them is told by the
-importer that reads them.
+`file_of` finds a file by its name as programs write it. What files refer to is found by the names
+in headers alone, and never raises: what is wrong is told by the importer that reads them.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 import mmap
 import re
 import struct
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 _LONGEST_JSON = 1 << 30
+_LONGEST_PACKED = 64 << 20  # of a compressed header
 _B3DM_HEADER = 28
-_LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
+_LIBRARY = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _PICTURE = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)",
                       re.MULTILINE | re.IGNORECASE)  # fmt: skip
 
-_COLOURS = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
+
+def file_of(folder: Path, name: str) -> Path:
+    """The file that a name means, beside `folder`: as it stands; else with backslashes for slashes
+    and in other letter case, as Windows has it; else, for an absolute name of another machine, the
+    file of that name here. What is not found is returned as it stands.
+    """
+    plain = folder / name
+    if "\0" in name or _exists(plain):
+        return plain
+    parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
+    ways = [parts]
+    if name[:1] in "/\\" or name[1:2] == ":":
+        ways = [parts[-1:]]
+    for way in ways:
+        path = folder
+        for part in way:
+            path = _entry(path, part)
+        if way and _exists(path):
+            return path
+    return plain
+
+
+def _entry(folder: Path, name: str) -> Path:
+    """An entry of a folder, in any letter case if there is none of that very name."""
+    path = folder / name
+    if name == ".." or _exists(path) or not folder.is_dir():
+        return path
+    return folder / _entries(folder, folder.stat().st_mtime_ns).get(name.casefold(), name)
+
+
+@lru_cache(maxsize=64)
+def _entries(folder: Path, _modified_ns: int) -> dict[str, str]:
+    """Names of a folder by how they read in any letter case; kept, as many files may be missing."""
+    names = sorted((entry.name for entry in folder.iterdir()), reverse=True)
+    return {name.casefold(): name for name in names}
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that is too long
+        return False
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
@@ -35,24 +79,6 @@ def files_beside(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(found))
 
 
-def colour_pictures(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """The colour textures that an OBJ's materials name: those that are there, by their name, and
-    the names of those that are not.
-    """
-    found: dict[str, Path] = {}
-    missing = []
-    for library in files_beside(path):
-        if library.suffix.lower() == ".mtl" and library.is_file():
-            for match in _COLOURS.finditer(library.read_bytes()):
-                name = match[1].decode("utf-8", "replace").strip()
-                file = next((p for p in _named(path.parent, match[1]) if p.is_file()), None)
-                if file is None:
-                    missing.append(name)
-                else:
-                    found[name] = file
-    return found, tuple(dict.fromkeys(missing))
-
-
 def _of_obj(path: Path) -> Iterator[Path]:
     """Its material libraries, and their pictures."""
     if path.stat().st_size == 0:  # which cannot be mapped
@@ -60,7 +86,7 @@ def _of_obj(path: Path) -> Iterator[Path]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         libraries = [match[1] for match in _LIBRARY.finditer(text)]
     for names in libraries:
-        for library in _named(path.parent, names):
+        for library in {*_named(path.parent, names), *_each(path.parent, names)}:
             yield library
             if library.is_file():
                 for match in _PICTURE.finditer(library.read_bytes()):
@@ -73,7 +99,13 @@ def _named(folder: Path, text: bytes) -> Iterator[Path]:
     """
     line = text.decode("utf-8", "replace").strip()
     for name in {line, line.split()[-1]} if line else ():
-        yield folder / name.replace("\\", "/")
+        yield file_of(folder, name)
+
+
+def _each(folder: Path, text: bytes) -> Iterator[Path]:
+    """The files of the line's words: a line may name several libraries."""
+    for name in text.decode("utf-8", "replace").split():
+        yield file_of(folder, name)
 
 
 def _of_gltf(path: Path) -> Iterator[Path]:
@@ -86,21 +118,24 @@ def _of_gltf(path: Path) -> Iterator[Path]:
             if isinstance(uri, str) and not uri.startswith("data:"):
                 name = unquote(urlsplit(uri).path)
                 if name and "\0" not in name:
-                    yield path.parent / name
+                    yield file_of(path.parent, name)
 
 
 def _gltf_json(path: Path) -> dict[str, Any]:
     """The JSON of a glTF, or that in the header of a GLB or a b3dm."""
-    with path.open("rb") as file:
+    with path.open("rb") as plain:
+        packed = plain.read(2) == b"\x1f\x8b"
+    longest = _LONGEST_PACKED if packed else _LONGEST_JSON
+    with gzip.open(path) if packed else path.open("rb") as file:
         start = file.read(_B3DM_HEADER)
         begin = 0
         if start[:4] == b"b3dm":
             begin = _B3DM_HEADER + sum(struct.unpack_from("<4I", start, 12))
             file.seek(begin)
             start = file.read(20)
-        length = _LONGEST_JSON
+        length = longest
         if start[:4] == b"glTF":
-            length = min(struct.unpack_from("<I", start, 12)[0], _LONGEST_JSON)
+            length = min(struct.unpack_from("<I", start, 12)[0], longest)
             begin += 20
         file.seek(begin)
         document = json.loads(file.read(length))

@@ -21,6 +21,8 @@ DOUBTS = {
     "overlap": "orthophoto and surface model hardly share ground",
     "scaled": "a transform that stretches",
     "slope": "a surface as steep as noise",
+    "upright": "a ground that does not face up",
+    "volume": "content beside the bounding volumes that its tileset states",
 }
 LOWEST_M, HIGHEST_M = -500.0, 9000.0  # of ground, buildings and mines' edges, in any datum
 

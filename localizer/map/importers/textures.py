@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -52,6 +53,15 @@ def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
     return rgb, data if kind == "JPEG" else None
 
 
+def decode_alpha(data: bytes) -> NDArray[np.uint8] | None:
+    """(h, w) of a picture that `decode_image` has read; None where all of it is opaque."""
+    with PillowImage.open(io.BytesIO(data)) as picture:
+        if not picture.has_transparency_data:
+            return None
+        alpha = np.asarray(picture.convert("RGBA").getchannel("A"), np.uint8)
+    return None if alpha.min() == 255 else alpha
+
+
 def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> SourceMesh:
     """A mesh of flat-coloured faces. colours: (F, 3) uint8; they become blocks of a texture."""
     unique, which = np.unique(colours.reshape(-1, 3), axis=0, return_inverse=True)
@@ -67,6 +77,16 @@ def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> 
     uvs = (centre / (columns, rows)).astype(np.float32).repeat(3, axis=0)
     apart = np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3)
     return SourceMesh(positions[faces.ravel()], uvs, apart, image, palette=True)
+
+
+def placed(mesh: SourceMesh, T: Array) -> SourceMesh:
+    """The mesh under a transform (4, 4). One that mirrors turns the order of the corners, too, so
+    that the same side stays the front (glTF 2.0, 3.7.4).
+    """
+    made = replace(mesh, positions=mesh.positions @ T[:3, :3].T + T[:3, 3])
+    if np.linalg.det(T[:3, :3]) < 0:
+        made = replace(made, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))
+    return made
 
 
 def merged_by_picture(parts: list[SourceMesh]) -> list[SourceMesh]:

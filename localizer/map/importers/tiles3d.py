@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass, replace
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -12,15 +13,21 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from localizer.errors import MapSourceError
-from localizer.geometry.geo import ecef_from_geodetic
+from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic, geodetic_from_ecef
 from localizer.geometry.pose import Array
-from localizer.map.importers.gltf import gltf_weight, read_gltf
-from localizer.map.importers.referenced_files import files_beside
+from localizer.map.importers.georeference import UpAxis
+from localizer.map.importers.gltf import gltf_bounds, gltf_weight, read_gltf
+from localizer.map.importers.referenced_files import file_of, files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
+from localizer.map.importers.textures import placed
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 
 _MAX_USES = 64  # of one tileset: each of a few that name each other multiplies their tiles
 _SCALE_SLACK = 0.01  # of a transform: a map's projection may be left in it
+_SAMPLED_TILES = 24  # whose headers tell where the content lies
+_BESIDE_M = 1000.0  # from the content: an origin so near is the source's own
+_GZIP = b"\x1f\x8b"
+_PACKED = {b"\x28\xb5\x2f\xfd": "compressed with zstd", b"PK\x03\x04": "a ZIP archive"}
 
 # glTF is y up, 3D Tiles z up: (x, y, z) -> (x, -z, y).
 _Z_UP = {
@@ -60,11 +67,21 @@ class ContentFile:
         """Meshes with positions in ECEF metres (float64)."""
         data, rtc = self._gltf()
         meshes, gltf_rtc = read_gltf(data, self._beside, self.rules)
-        # Tile transform, then RTC_CENTER (in z-up axes), then the turn of the glTF's up axis.
+        T = self._ecef_from_gltf(rtc + gltf_rtc)
+        return [placed(m, T) for m in meshes]
+
+    def corners(self) -> Array:
+        """(N, 3) ECEF corners of boxes that hold the content, by the file's headers."""
+        data, rtc = self._gltf()
+        corners, gltf_rtc = gltf_bounds(data, self._beside, self.rules)
+        T = self._ecef_from_gltf(rtc + gltf_rtc)
+        return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
+
+    def _ecef_from_gltf(self, centre: Array) -> Array:
+        """Tile transform, then RTC_CENTER (in z-up axes), then the turn of the glTF's up axis."""
         centred = np.eye(4)
-        centred[:3, 3] = rtc + gltf_rtc
-        T = self.ecef_from_tile @ centred @ _Z_UP[self.up_axis]
-        return [replace(m, positions=m.positions @ T[:3, :3].T + T[:3, 3]) for m in meshes]
+        centred[:3, 3] = centre
+        return np.asarray(self.ecef_from_tile @ centred @ _Z_UP[self.up_axis])
 
     def _gltf(self) -> tuple[bytes, Array]:
         """The glTF or GLB of the content, and the centre (3,) that it is relative to."""
@@ -73,6 +90,8 @@ class ContentFile:
             return _unwrap_b3dm(data)
         if data[:4] in (b"i3dm", b"pnts", b"cmpt"):
             raise MapSourceError(f"content of type {data[:4].decode()} is not supported")
+        if data.lstrip()[:1] == b"<":
+            raise MapSourceError("content is a web page, not a tile; download the tileset again")
         if data[:4] != b"glTF" and data.lstrip()[:1] != b"{":
             raise MapSourceError(f"content starts with {data[:4]!r}: neither b3dm nor glTF")
         return data, np.zeros(3)
@@ -81,17 +100,21 @@ class ContentFile:
         return read_file(inside(self.folder, self.path.parent, uri), self.rules)
 
 
-def read_tileset(path: Path, rules: ImportRules | None = None) -> SourceTree:
-    """Read `tileset.json` (or the folder that holds it) and every tileset it refers to."""
+def read_tileset(
+    path: Path, rules: ImportRules | None = None, up_axis: UpAxis | None = None
+) -> SourceTree:
+    """Read `tileset.json` (or the folder that holds it) and every tileset it refers to. up_axis: of
+    its glTF, whatever it says itself.
+    """
     try:
-        return _read_tileset(path, rules or ImportRules())
+        return _read_tileset(path, rules or ImportRules(), up_axis)
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise MapSourceError(f"{path}: malformed tileset: {error!r}") from error
 
 
-def _read_tileset(path: Path, rules: ImportRules) -> SourceTree:
+def _read_tileset(path: Path, rules: ImportRules, up_axis: UpAxis | None) -> SourceTree:
     path = (path / "tileset.json" if path.is_dir() else path).resolve()
-    reader = _Reader(path.parent, rules)
+    reader = _Reader(path.parent, rules, up_axis)
     document = reader.load(path)
     root_json = _object(document.get("root"), f"{path}: root")
     extras: dict[str, Any] = {}
@@ -105,11 +128,13 @@ def _read_tileset(path: Path, rules: ImportRules) -> SourceTree:
     root = reader.tileset(path, np.eye(4), 0, replaces=True)
     return SourceTree(
         root,
-        _centre(root_json, str(path)),
+        _centre_of_content(root, _stated_centre(root_json, str(path))),
         None if separation is None else float(separation),
         str(asset.get("copyright", extras.get("attribution", ""))),
         tuple(reader.files),
         "ellipsoidal",  # by the specification
+        options="" if up_axis is None else f"up {up_axis}",
+        up_axis="/".join(sorted(reader.up_axes)),
         warnings=tuple(dict.fromkeys(reader.warnings)),
     )
 
@@ -119,9 +144,26 @@ def read_file(path: Path, rules: ImportRules) -> bytes:
     require_plain_file(path)
     try:
         rules.require("file_bytes", path.stat().st_size, path)
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise MapSourceError(f"{path} cannot be read: {error.strerror or error}") from error
+    for start, kind in _PACKED.items():
+        if data.startswith(start):
+            raise MapSourceError(f"{path}: is {kind}; unpack it first")
+    return _gunzipped(data, path, rules) if data[:2] == _GZIP else data
+
+
+def _gunzipped(data: bytes, path: Path, rules: ImportRules) -> bytes:
+    """Content that a web server would send compressed, as some exporters write it."""
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        plain = unpacker.decompress(data, rules.file_bytes + 1)
+    except zlib.error as error:
+        raise MapSourceError(f"{path}: gzip data that cannot be unpacked: {error}") from error
+    rules.require("file_bytes", len(plain), path)
+    if not unpacker.eof:
+        raise MapSourceError(f"{path}: gzip data that is cut off")
+    return plain
 
 
 def inside(folder: Path, base: Path, uri: str) -> Path:
@@ -132,16 +174,18 @@ def inside(folder: Path, base: Path, uri: str) -> Path:
     name = unquote(parts.path)
     if not name or "\0" in name:
         raise MapSourceError(f"{uri!r} is not a file name")
-    path = (base / name).resolve()
+    path = file_of(base, name).resolve()
     if not path.is_relative_to(folder):
         raise MapSourceError(f"{uri!r} leaves the tileset's folder {folder}")
     return path
 
 
 class _Reader:
-    def __init__(self, folder: Path, rules: ImportRules) -> None:
+    def __init__(self, folder: Path, rules: ImportRules, up_axis: UpAxis | None) -> None:
         self.folder = folder
         self.rules = rules
+        self.up_axes: set[str] = set()  # of all its tilesets
+        self._given_axis = up_axis
         self.warnings: list[str] = []
         self._uses: dict[Path, int] = {}
         self._open: list[Path] = []  # tilesets being read, to find cycles
@@ -166,18 +210,39 @@ class _Reader:
                 "of tiles grows without bound that way"
             )
         document = self.load(path)
-        version = _object(document.get("asset", {}), f"{path}: asset").get("version")
-        if version not in ("1.0", "1.1"):
-            raise MapSourceError(f"{path}: 3D Tiles version {version!r}; 1.0 and 1.1 are read")
-        up_axis = str(document["asset"].get("gltfUpAxis", "Y")).upper()
+        asset = _object(document.get("asset", {}), f"{path}: asset")
+        self._require_version(asset.get("version"), path)
+        up_axis = str(self._given_axis or asset.get("gltfUpAxis", "Y")).upper()
         if up_axis not in _Z_UP:
             raise MapSourceError(f"{path}: gltfUpAxis {up_axis!r} is not X, Y or Z")
+        self.up_axes.add(up_axis.lower())
         self._open.append(path)
         self.files.append(path)
         root = _object(document.get("root"), f"{path}: root")
         node = self._node(root, parent, replaces, up_axis, path, depth)
         self._open.pop()
         return node
+
+    def _require_version(self, version: Any, path: Path) -> None:
+        """1.0 and 1.1; several exporters write 0.0 or nothing for 1.0."""
+        text = "" if version is None else str(version).strip()
+        if text in ("1.0", "1.1"):
+            return
+        if text and not text.startswith("0."):
+            raise MapSourceError(f"{path}: 3D Tiles version {version!r}; 1.0 and 1.1 are read")
+        said = f"version {version!r}" if text else "no version"
+        self.warnings.append(f"{path.name}: {said}, read as 1.0")
+
+    def _corners(self, volume: Any, T: Array, path: Path) -> Array | None:
+        """See `_corners`; a region in degrees is told, and read as meant."""
+        region: Any = volume.get("region") if isinstance(volume, dict) else None
+        if _is_in_degrees(region):
+            self.warnings.append(
+                f"{path.name}: a region counts in degrees ({region[0]:g}, {region[1]:g} ...), 3D "
+                "Tiles counts in radians; it is read as degrees"
+            )
+            volume = {"region": [*np.radians(region[:4]), *region[4:]]}
+        return _corners(volume, T)
 
     def _node(
         self, data: dict[str, Any], parent: Array, replaces: bool, up: str, path: Path, depth: int
@@ -205,7 +270,7 @@ class _Reader:
             children.append(self._node(child, T, refine == "REPLACE", up, path, depth + 1))
         error = _number(data.get("geometricError", 0.0), f"{path}: geometricError")
         scale = float(np.linalg.norm(T[:3, :3], axis=0).max())
-        corners = _corners(data.get("boundingVolume"), T)
+        corners = self._corners(data.get("boundingVolume"), T, path)
         return SourceNode(error * scale, refine == "REPLACE", tuple(tiles), children, corners)
 
     def _doubted(self, T: Array, path: Path) -> Array:
@@ -280,14 +345,57 @@ def _transform(data: dict[str, Any], where: str) -> Array:
     return columns
 
 
-def _centre(root: dict[str, Any], where: str) -> Array:
-    """Where the map is, (3,) ECEF: the root's transform if it goes there, else its volume."""
+def _is_in_degrees(region: Any) -> bool:
+    """Whether a region's angles cannot be radians and can be degrees."""
+    try:
+        west, south, east, north = (abs(float(value)) for value in region[:4])
+    except (TypeError, ValueError):
+        return False
+    beyond = max(south, north) > np.pi / 2 + 1e-6 or max(west, east) > 2 * np.pi
+    return bool(beyond and max(south, north) <= 90.0 and max(west, east) <= 360.0)
+
+
+def _centre_of_content(root: SourceNode, stated: Array) -> Array:
+    """Where the map is, (3,) ECEF: as stated if that is about its content, else the content's
+    middle at its lowest height. A volume may span a country of which one village is there.
+    """
+    tiles = [t for node in root.walk() if not node.children for t in node.tiles]
+    tiles = tiles or [t for node in root.walk() for t in node.tiles]
+    found = []
+    for tile in tiles[:: max(1, len(tiles) // _SAMPLED_TILES)]:
+        try:
+            found.append(tile.corners())  # type: ignore[attr-defined]
+        except MapSourceError:
+            continue  # told when it is imported
+    corners = np.concatenate(found) if found else np.empty((0, 3))
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    if not len(corners):
+        return stated
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    if not 6.2e6 < np.linalg.norm(middle) < 6.5e6:
+        return stated
+    lat, lon, _ = geodetic_from_ecef(middle)
+    lowest = float(geodetic_from_ecef(corners)[:, 2].min())
+    if 6.2e6 < np.linalg.norm(stated) < 6.5e6:
+        around = LocalFrame(Geodetic(float(lat), float(lon), lowest))
+        inside = around.ecef_from_enu.inverse.apply(corners)
+        reach = np.ptp(inside[:, :2], axis=0).max() / 2 + _BESIDE_M
+        east, north, up = around.ecef_from_enu.inverse.apply(stated)
+        if max(abs(east), abs(north)) <= reach and abs(up) <= _BESIDE_M:
+            return stated
+    return ecef_from_geodetic(lat, lon, lowest)
+
+
+def _stated_centre(root: dict[str, Any], where: str) -> Array:
+    """The root's transform if it leads to the Earth's surface, else the middle of its volume."""
     T = _transform(root, where)
     if np.linalg.norm(T[:3, 3]) > 1e6:
         return np.asarray(T[:3, 3])
     volume = _object(root.get("boundingVolume"), f"{where}: the root's boundingVolume")
     if "region" in volume:
         west, south, east, north, low, _ = _numbers(volume["region"], 6, where)
+        if _is_in_degrees(volume["region"]):
+            west, south, east, north = np.radians((west, south, east, north))
         if east < west:  # across the 180th meridian (3D Tiles 1.1, 3.5.2)
             east += 2 * np.pi
         lat, lon = np.degrees(0.5 * (south + north)), np.degrees(0.5 * (west + east))

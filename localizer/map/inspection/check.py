@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.errors import MapCacheError
+from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
+from localizer.map.cache.tile import facing_fault, vector_area
 from localizer.map.inspection.alignment import ImageryOffset, alignment_of
 from localizer.map.inspection.kind import map_kind
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
@@ -22,12 +24,14 @@ _LEAST_HOLE_M2 = 25.0
 _LEAST_BLANK_M2 = 100.0  # of one flat white or black: no picture was taken there
 _WHITE, _BLACK, _FLAT = 250, 5, 2  # grey values
 _MOST_HOLES, _MOST_BLANK = 0.02, 0.02  # of the area covered
+_MOST_FLAT = 0.5  # likewise, of one colour like its surroundings: a lake is, a map is not
 _COARSE, _TOO_COARSE = 2.0, 4.0  # texels over the working pixel on the ground
 _LEAST_COVERED = 0.5  # of the rectangle about the map
 _SEAM_M = 0.5  # median step of heights along a border of tiles
 _SEAM_GREY = 12.0  # likewise of grey values
 _LEAST_SEAM_PX = 20
 _SHIFT_M = 1.5
+_GROUND = "ground"
 
 
 class Grade(Enum):
@@ -101,16 +105,17 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
     """All questions, with a picture of each."""
     mosaic = mosaic_of(cache)
     gaps, holes = _holes(mosaic)
-    blank = _blank(mosaic)
+    blank = _blank(mosaic) | _without_texels(cache, mosaic, use)
     seams = seams_of(cache, mosaic)
     shift = alignment_of(mosaic)
     kind = map_kind(cache)
     findings = (
-        _intact(cache),
+        *_intact(cache),
         _heights_finding(kind, use),
         _coverage(mosaic, gaps),
         _holes_finding(mosaic, holes),
         _blank_finding(mosaic, blank),
+        *_source_finding(cache),
         _texels(cache, use),
         _detail(kind, use),
         _date(kind),
@@ -126,6 +131,8 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
     rows, columns = gaps.shape
     faulty = gaps | blank | (_texel_ratio(cache, mosaic, use) > _TOO_COARSE)
     usable = usable_part(mosaic, faulty, use.height_m, cache.frame)
+    if any(f.name == _GROUND and f.grade is Grade.BAD for f in findings):
+        usable = None
     return MapCheck(findings, pictures, (columns * mosaic.gsd_m, rows * mosaic.gsd_m), usable)
 
 
@@ -183,18 +190,58 @@ def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
     return np.asarray(large[labels])
 
 
-def _intact(cache: TileCache) -> MapFinding:
-    """The pictures are drawn from one level; a flight needs all."""
-    damaged = []
-    for tile in cache.tile_ids:
+def _without_texels(cache: TileCache, mosaic: Mosaic, use: Use) -> NDArray[np.bool_]:
+    """Surface of flat colours, which has no picture, (h, w)."""
+    return np.asarray(~np.isnan(mosaic.height) & (_texel_ratio(cache, mosaic, use) == 0.0))
+
+
+def _flat_share(mosaic: Mosaic) -> float:
+    """Of the surface: its largest part of one colour."""
+    around = np.ones((3, 3), np.uint8)
+    spread = cv2.dilate(mosaic.rgb, around).astype(np.int16) - cv2.erode(mosaic.rgb, around)
+    known = ~np.isnan(mosaic.height)
+    flat = ((spread.max(axis=2) <= _FLAT) & known).astype(np.uint8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
+    return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0) / max(known.sum(), 1))
+
+
+def _intact(cache: TileCache) -> list[MapFinding]:
+    """Whether all tiles can be read, of which the pictures need one level; and which way is up."""
+    damaged: list[str] = []
+    area: Array = np.zeros(3)
+    index = cache.index
+    leaves = {
+        tile
+        for node in np.flatnonzero(index.child_count == 0)
+        for tile in range(index.tile_start[node], index.tile_start[node] + index.tile_count[node])
+    }
+    for number, tile in enumerate(cache.tile_ids):
         try:
-            cache.load_geometry(tile)
+            mesh = cache.load_geometry(tile)
         except MapCacheError as error:
             damaged.append(str(error))
+            continue
+        if number in leaves:
+            local = vector_area(mesh.positions.astype(np.float64), mesh.faces)
+            area += mesh.world_from_tile.rotation @ local
+    fault = facing_fault(area)
     found = f"{len(damaged)} of {len(cache.tile_ids)} tiles"
-    if not damaged:
-        return MapFinding("damaged", found, Grade.GOOD, "each as its hash says")
-    return MapFinding("damaged", found, Grade.BAD, f"build it again: {damaged[0]}")
+    words = f"build it again: {damaged[0]}" if damaged else "each as its hash says"
+    return [
+        MapFinding("damaged", found, Grade.BAD if damaged else Grade.GOOD, words),
+        MapFinding(_GROUND, "faces up", Grade.GOOD, "as it should be")
+        if fault is None
+        else MapFinding(_GROUND, fault, Grade.BAD, "build it again with another --up-axis"),
+    ]
+
+
+def _source_finding(cache: TileCache) -> list[MapFinding]:
+    """What the build doubted and did not stop for."""
+    warnings = cache.manifest.warnings
+    if not warnings:
+        return []
+    more = f"; and {len(warnings) - 1} more (`map info`)" if len(warnings) > 1 else ""
+    return [MapFinding("build warnings", str(len(warnings)), Grade.ADVICE, warnings[0] + more)]
 
 
 def _coverage(mosaic: Mosaic, gaps: NDArray[np.bool_]) -> MapFinding:
@@ -224,13 +271,21 @@ def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> MapFinding:
     share = float(blank.sum() / max((~np.isnan(mosaic.height)).sum(), 1))
     found = f"{100 * share:.2f} % of the area"
     if share > _MOST_BLANK:
-        words = "surface without a picture (plain white or black): the source lacks imagery there"
+        words = (
+            "surface without a picture (plain white or black, or a colour without a texture): the "
+            "source lacks imagery there"
+        )
         return MapFinding("without picture", found, Grade.BAD, words)
+    if (flat := _flat_share(mosaic)) > _MOST_FLAT:
+        words = "plain colours: the picture shows nothing to match"
+        return MapFinding("without picture", f"{100 * flat:.0f} % of the area", Grade.BAD, words)
     return MapFinding("without picture", found, Grade.GOOD, "as it should be")
 
 
 def _texels(cache: TileCache, use: Use) -> MapFinding:
     gsd = _leaf_gsd(cache)
+    if not len(gsd) and not cache.manifest.gsd_m:
+        return MapFinding("texel size", "none", Grade.BAD, "no tile has a picture")
     typical = float(np.median(gsd)) if len(gsd) else cache.manifest.gsd_m
     ratio = typical / use.pixel_m
     found = f"{typical:.2f} m (median), a working pixel {use.pixel_m:.2f} m at {use.height_m:.0f} m"

@@ -126,6 +126,15 @@ def test_jumps_go_by_the_ids_of_a_plan_or_by_places_where_these_say_nothing(tmp_
         assert [p.name for p in mission.path] == ["home", "1", "2", "1", "2"]
 
 
+def test_rally_points_of_the_file_make_the_return_uncertain(tmp_path):
+    path = tmp_path / "a.plan"
+    items = [waypoint(47.201, 60), item(20, 0, 0, 0, 0, 0, 0, 0, frame=2)]
+    document = {"mission": {"plannedHomePosition": list(HOME), "items": items}}
+    for points in ([], [[47.21, 8.2, 60]]):
+        path.write_text(json.dumps(document | {"rallyPoints": {"points": points, "version": 2}}))
+        assert bool(read_mission(path).not_judged) == bool(points)
+
+
 def test_coordinates_apart_from_the_parameters_are_read(tmp_path):
     old = {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, 0],
            "coordinate": [47.201, 8.2, 60]}  # fmt: skip

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -281,6 +282,8 @@ def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
     assert (first.begin_m, first.length_m) == pytest.approx((0, 40), abs=0.1)
     assert first.seconds == pytest.approx(8, abs=0.1)
     assert second.length_m == pytest.approx(20, abs=0.1)
+    said = [replace(v, leg=replace(v.leg, speed_m_s=10.0)) for v in verdict((0, 1, 3))]
+    assert stretches(said, 5.0, odometry)[0].seconds == pytest.approx(4, abs=0.1)
     assert 0 < second.drift_m < first.drift_m
     strict = OdometryConfig(longest_sigma_m=0.1)
     assert not stretches(verdict((0, 1)), 5.0, strict)[0].can_bridge

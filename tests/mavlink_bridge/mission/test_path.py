@@ -223,6 +223,13 @@ def test_without_home_it_begins_over_its_take_off_and_no_return_is_made_up():
     assert names(flown(TAKEOFF, to(A, 80), home=None)) == ["1"]
 
 
+def test_a_return_may_end_at_a_rally_point():
+    rows = (TAKEOFF, to(A, 80), (20, *[0] * 7))
+    mission = flown(*rows, vehicle=MissionVehicle(3, 2, has_rally_points=True))
+    assert names(mission) == names(flown(*rows)) == ["home", "1", "home"]
+    assert "MAV_CMD_NAV_RETURN_TO_LAUNCH (item 3): it may return to a rally point" in told(mission)
+
+
 def test_px4_flies_to_the_take_offs_place_and_ardupilot_does_not():
     away = (22, 0, 0, 0, NAN, *C, 80)
     assert names(flown(away, to(A, 80), vehicle=PX4_VTOL)) == ["home", "take-off", "1"]

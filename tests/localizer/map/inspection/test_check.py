@@ -1,5 +1,6 @@
 """A map is examined before it is flown over: each fault is found, and a sound map has none."""
 
+import json
 import re
 import shutil
 
@@ -10,9 +11,11 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from localizer.errors import MapSourceError
+from localizer.geometry.geo import LocalFrame
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
+from localizer.map.importers.rules import ImportRules
 from localizer.map.inspection.alignment import alignment_of
 from localizer.map.inspection.check import Grade, Use, check_map, seams_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
@@ -151,3 +154,52 @@ def test_the_largest_rectangle_is_found_among_others():
     assert largest_rectangle(good) == (1, 6, 4, 7)
     assert largest_rectangle(~good | good) == (0, 6, 0, 8)
     assert largest_rectangle(np.zeros((3, 3), bool)) is None
+
+
+def built_from(folder, make, *, up="y", trusted=(), image=None, materials=None):
+    """A map of one tile, which may stand on its edge, of one colour or without a picture."""
+    positions, uvs, faces = make.patch(-100, -100, 200, 16)
+    turned = make.y_up(positions) if up == "y" else positions
+    extra = {} if materials is None else {"materials": materials}
+    folder.mkdir()
+    (folder / "t.glb").write_bytes(make.glb(turned, uvs, faces, image or make.picture(3), **extra))
+    source = folder / "tileset.json"
+    source.write_text(
+        json.dumps(
+            {
+                "asset": {"version": "1.0"},
+                "geometricError": 10,
+                "root": {
+                    "boundingVolume": {"sphere": [0, 0, 0, 200]},
+                    "geometricError": 0,
+                    "content": {"uri": "t.glb"},
+                    "transform": LocalFrame(make.origin).ecef_from_enu.matrix.T.ravel().tolist(),
+                },
+            }
+        )
+    )
+    rules = ImportRules(trusted=frozenset(trusted))
+    build.build_cache(source, folder / "c", BuildOptions(workers=1, rules=rules))
+    found = check_map(TileCache.open(folder / "c"), FINE)
+    return {f.name: f for f in found.findings} | {"usable": found.usable}
+
+
+def test_a_map_on_its_edge_will_not_do(tmp_path, make):
+    """One that was built before builds looked, or in spite of them."""
+    made = built_from(tmp_path / "a", make, up="z", trusted=["upright", "volume"])
+    assert (made["ground"].grade, made["ground"].found) == (Grade.BAD, "stands on its edge")
+    assert "stands on its edge" in made["build warnings"].words
+    assert made["usable"] is None
+    assert built_from(tmp_path / "b", make)["ground"].grade is Grade.GOOD
+
+
+def test_a_map_of_colours_has_no_picture(tmp_path, make):
+    green = [{"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.5, 0.1, 1]}}]
+    made = built_from(tmp_path / "a", make, materials=green)
+    del made["usable"]
+    assert {n for n, f in made.items() if f.grade is Grade.BAD} == {"without picture", "texel size"}
+    assert made["without picture"].found.startswith("100.00 %")
+    plain = cv2.imencode(".png", np.full((64, 64, 3), (40, 120, 60), np.uint8))[1].tobytes()
+    made = built_from(tmp_path / "b", make, image=plain)
+    assert made["without picture"].grade is Grade.BAD
+    assert built_from(tmp_path / "c", make)["without picture"].grade is Grade.GOOD

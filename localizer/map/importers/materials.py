@@ -1,0 +1,232 @@
+"""What a material shows, as the common viewers draw it: its colour, its picture, and its holes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array
+from localizer.map.importers.gltf_data import vector
+from localizer.map.importers.referenced_files import file_of
+from localizer.types import Float32
+
+_BLACK = 1 / 255  # linear light; a base so dark shows nothing of its own
+_LEAST_TEXELS = 4.0  # side of a triangle's part that is not cut further
+_MOST_CUTS = 10  # halvings of a triangle
+_MOST_FACES = 40_000  # more are not made of one mesh, beyond four times its own
+# MTL: statements of a picture, the better ones last; options, with how many values they have.
+_PICTURES = {"map_ke": 1, "map_ka": 2, "map_kd": 3}
+_OPTIONS = {
+    "-o": 3, "-s": 3, "-t": 3, "-mm": 2, "-blendu": 1, "-blendv": 1, "-boost": 1, "-texres": 1,
+    "-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1,
+}  # fmt: skip
+_CENTRE = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6.0  # barycentric samples
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """A glTF material. factor: (3,) linear, of the picture or alone; texture: its textureInfo;
+    opacity: times the picture's alpha; cutoff: below it nothing is there, None where all is opaque.
+    """
+
+    factor: Array
+    texture: dict[str, Any] | None
+    opacity: float = 1.0
+    cutoff: float | None = None
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether nothing is there, whatever the picture."""
+        return self.cutoff is not None and self.opacity < self.cutoff
+
+
+def appearance(material: dict[str, Any]) -> Appearance:
+    """Of a glTF material.
+
+    Specular-glossiness goes before the metallic fallback, where it has a picture or the other has
+    none. Emission stands for a base that is black or has no picture: so unlit photographs were
+    written before KHR_materials_unlit.
+    """
+    extensions = material.get("extensions", {})
+    pbr = material.get("pbrMetallicRoughness", {})
+    texture, rgba = pbr.get("baseColorTexture"), pbr.get("baseColorFactor", (1, 1, 1, 1))
+    gloss = extensions.get("KHR_materials_pbrSpecularGlossiness")
+    if gloss is not None and (texture is None or "diffuseTexture" in gloss):
+        texture, rgba = gloss.get("diffuseTexture"), gloss.get("diffuseFactor", (1, 1, 1, 1))
+    colour = vector(rgba, 4, "a material's colour factor")
+    factor, opacity = colour[:3], float(colour[3])
+    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    emission = vector(material.get("emissiveFactor", (0, 0, 0)), 3, "emissiveFactor")
+    emission = np.clip(emission * float(strength), 0.0, 1.0)
+    light, is_dark = material.get("emissiveTexture"), bool(factor.max() <= _BLACK)
+    if light is not None and (texture is None or is_dark):
+        texture, factor = light, emission if emission.any() else np.ones(3)
+    elif is_dark and emission.any():
+        texture, factor = None, emission
+    mode = material.get("alphaMode", "OPAQUE")
+    cutoff = {"MASK": float(material.get("alphaCutoff", 0.5)), "BLEND": 0.5}.get(mode)
+    return Appearance(factor, texture, opacity, cutoff)
+
+
+def cut_out(
+    positions: Array,
+    uvs: Float32,
+    faces: NDArray[np.int32],
+    opaque: NDArray[np.bool_],
+    *,
+    repeat: bool,
+) -> tuple[Array, Float32, NDArray[np.int32]]:
+    """A mesh without what its picture says is not there. opaque: (h, w) of texels; repeat: whether
+    the picture goes on beyond its edges. Triangles across a border are cut, to within some texels.
+    """
+    h, w = opaque.shape
+    table = np.zeros((h + 1, w + 1), np.int64)
+    table[1:, 1:] = opaque.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+    kept: list[NDArray[np.int32]] = []
+    most = 4 * len(faces) + _MOST_FACES
+    for _ in range(_MOST_CUTS):
+        corners = uvs[faces].astype(np.float64) * (w, h)
+        if repeat:
+            corners -= np.floor(corners.min(axis=1, keepdims=True) / (w, h)) * (w, h)
+        low = np.floor(corners.min(axis=1)).astype(np.int64).clip(0, (w - 1, h - 1))
+        high = np.ceil(corners.max(axis=1)).astype(np.int64).clip(low + 1, (w, h))
+        (x0, y0), (x1, y1) = low.T, high.T
+        there = table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]
+        whole, none = there == (x1 - x0) * (y1 - y0), there == 0
+        kept.append(faces[whole])
+        small = (high - low).max(axis=1) <= _LEAST_TEXELS
+        mixed = ~whole & ~none
+        count = sum(map(len, kept)) + 4 * int((mixed & ~small).sum())
+        done = mixed & small if count <= most else mixed
+        kept.append(faces[done][_mostly(corners[done], opaque)])
+        faces = faces[mixed & ~done]
+        if not len(faces):
+            break
+        positions, uvs, faces = _halved(positions, uvs, faces)
+    else:
+        kept.append(faces[_mostly(uvs[faces].astype(np.float64) * (w, h), opaque)])
+    return positions, uvs, np.concatenate(kept).astype(np.int32)
+
+
+def _mostly(corners: Array, opaque: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which triangles (F, 3, 2), texels, are opaque at half of their samples or more."""
+    h, w = opaque.shape
+    x, y = np.moveaxis(np.einsum("sk,fkc->fsc", _CENTRE, corners), -1, 0).astype(np.int64)
+    return np.asarray(opaque[y % h, x % w].mean(axis=1) >= 0.5)
+
+
+def _halved(
+    positions: Array, uvs: Float32, faces: NDArray[np.int32]
+) -> tuple[Array, Float32, NDArray[np.int32]]:
+    """Each triangle as four, with vertices of their own."""
+    count = len(faces)
+    pairs = ((0, 1), (1, 2), (2, 0))
+    middles = [0.5 * (positions[faces[:, a]] + positions[faces[:, b]]) for a, b in pairs]
+    uv_middles = [0.5 * (uvs[faces[:, a]] + uvs[faces[:, b]]) for a, b in pairs]
+    ab, bc, ca = (len(positions) + k * count + np.arange(count) for k in range(3))
+    a, b, c = faces.T
+    made = np.concatenate(
+        [np.stack(f, axis=1) for f in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    )
+    return (
+        np.concatenate([positions, *middles]),
+        np.concatenate([uvs, *uv_middles]).astype(np.float32),
+        made.astype(np.int32),
+    )
+
+
+@dataclass(frozen=True)
+class MtlMaterial:
+    """A material of an OBJ's library. colour: (3,) from 0 to 1; picture, mask: its files, the mask
+    of opacity; missing: names of pictures that are not there; scale, offset: of its texture
+    coordinates; clamped: the picture does not go on beyond its edges.
+    """
+
+    name: str
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    picture: Path | None = None
+    mask: Path | None = None
+    missing: tuple[str, ...] = ()
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamped: bool = False
+
+
+def read_mtl(library: Path, obj_folder: Path) -> list[MtlMaterial]:
+    """The materials of a library, in its order. A picture of the ambient or emissive colour stands
+    for that of the diffuse one where that has none.
+    """
+    made: list[MtlMaterial] = []
+    rank = 0
+    for line in library.read_bytes().decode("utf-8-sig", "replace").splitlines():
+        key, _, rest = line.strip().partition(" ")
+        key, rest = key.strip().lower(), rest.strip()
+        if key == "newmtl":
+            made.append(MtlMaterial(rest))
+            rank = 0
+        elif not made or not rest:
+            continue
+        elif key == "kd" and (colour := _floats(rest.split()[:3])) and len(colour) == 3:
+            made[-1] = replace(made[-1], colour=(colour[0], colour[1], colour[2]))
+        elif key in _PICTURES and _PICTURES[key] > rank:
+            made[-1], rank = _with_picture(made[-1], rest, library, obj_folder), _PICTURES[key]
+        elif key == "map_d":
+            made[-1] = replace(made[-1], mask=_picture(rest, library, obj_folder)[0])
+    return made
+
+
+def _with_picture(material: MtlMaterial, text: str, library: Path, obj_folder: Path) -> MtlMaterial:
+    options, _ = _options(text)
+    picture, name = _picture(text, library, obj_folder)
+    return replace(
+        material,
+        picture=picture,
+        missing=(name,) if picture is None else (),
+        scale=_pair(options.get("-s", []), 1.0),
+        offset=_pair(options.get("-o", []), 0.0),
+        clamped=options.get("-clamp") == ["on"],
+    )
+
+
+def _picture(text: str, library: Path, obj_folder: Path) -> tuple[Path | None, str]:
+    """The file of a texture statement, and its name: the whole text, or what follows its options,
+    or its last word.
+    """
+    _, name = _options(text)
+    for candidate in (text, name, text.rsplit(maxsplit=1)[-1]):
+        plain = candidate.strip("\"'")
+        for folder in (library.parent, obj_folder):
+            if (path := file_of(folder, plain)).is_file():
+                return path, plain
+    return None, name
+
+
+def _options(text: str) -> tuple[dict[str, list[str]], str]:
+    """Options of a texture statement, and what follows them."""
+    words, found = text.split(), dict[str, list[str]]()
+    while words and words[0].lower() in _OPTIONS:
+        name, most = words[0].lower(), _OPTIONS[words[0].lower()]
+        count = 1
+        if most > 1:  # as many as are numbers
+            count = next((k for k in range(most) if not _floats(words[1 + k : 2 + k])), most)
+        found[name] = words[1 : 1 + count]
+        words = words[1 + count :]
+    return found, " ".join(words)
+
+
+def _pair(words: list[str], default: float) -> tuple[float, float]:
+    """The first two numbers of an option, which may leave the later ones out."""
+    u, v, *_ = [*_floats(words), default, default]
+    return u, v
+
+
+def _floats(words: list[str]) -> list[float]:
+    """Of words; empty where one of them is no number."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return []
