@@ -38,6 +38,8 @@ class IntegrityMonitor:
     What cannot be judged is withheld: a position that nobody watches is believed unwarned. A fix
     that fails it costs itself; a thread that fails for a second, or takes no turn for two, costs
     all until it turns again. Then those who ask tell it: its own thread cannot.
+
+    Above 200 lines: it wires every check to its alert, and the checks share the debounced state.
     """
 
     def __init__(

@@ -14,13 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from localizer.geometry.pose import Array, Pose
+from localizer.integrity.patch_covariance import COMMON, LEAST_PATCHES, height_correlation
 from localizer.map.kind import MapKind
-from localizer.registration.patches import (
-    COMMON,
-    LEAST_PATCHES,
-    PatchDisplacements,
-    height_correlation,
-)
+from localizer.registration.agreement import PatchDisplacements
 from localizer.registration.priors import PoseConstraint, constraint_rows
 
 CANDIDATES_M = np.array([0.0, 0.3, 0.6, 1.2, 2.5, 5.0, 10.0])

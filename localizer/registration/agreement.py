@@ -22,7 +22,6 @@ from localizer.registration.cpu.reference import (
     project,
     projection_jacobian,
 )
-from localizer.registration.patches import PatchDisplacements
 from localizer.types import Float32
 
 _PART_PX = 16.0  # least side of a part, level px
@@ -31,6 +30,34 @@ _REACH = 6  # of the shifts compared, level px
 _NEAR = 1.5  # shift that is none, level px: 9 of 169 by chance
 _LEAST_ANCHORS = 4  # of a part, to have a vote
 _MEASURED = 5.5  # largest displacement that is one: beyond, the peak lies at the search's edge
+
+
+_RAYLEIGH = 1.1774  # median length of a vector of two independent errors, in their sigmas
+
+
+@dataclass(frozen=True)
+class PatchDisplacements:
+    """Shifts under which the P patches of an image match best at a registered pose.
+
+    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) level px by a pose
+    difference (position and left rotation vector, world axes, as `PosePrior`). rise: (P, 2) level
+    px by a metre that the patch's ground is higher than the map says. ground: (P, 2) east and north
+    of the patch, m.
+    """
+
+    shift: Array
+    motion: Array
+    rise: Array
+    ground: Array
+
+    @property
+    def scatter_px(self) -> float:
+        """Sigma of the shifts per axis, level px, by their median: what has changed since the
+        survey has a shift of its own, and the optimizer's loss leaves it out.
+        """
+        if len(self.shift) == 0:
+            return np.inf
+        return float(np.median(np.hypot(self.shift[:, 0], self.shift[:, 1]))) / _RAYLEIGH
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,10 @@ _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 
 
 class JNGO:
-    """The optimizer. Keeps its worker threads and scratch memory between frames."""
+    """The optimizer. Keeps its worker threads and scratch memory between frames.
+
+    Above 200 lines: search, sharpening and evidence share the problems of one frame.
+    """
 
     def __init__(
         self,

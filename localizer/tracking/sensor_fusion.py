@@ -17,8 +17,8 @@ import numpy as np
 
 from localizer.geometry.pose import Array, Pose
 from localizer.integrity.height_error import MapHeightError, height_likelihood
+from localizer.integrity.patch_covariance import patch_covariance
 from localizer.map.kind import MapKind
-from localizer.registration.patches import patch_covariance
 from localizer.registration.priors import PoseConstraint, combine, fused, height_constraint
 from localizer.registration.result import Registration
 from localizer.tracking.attitude_bias import (

@@ -7,7 +7,8 @@ import pytest
 
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.height_error import CANDIDATES_M, MapHeightError, height_likelihood
-from localizer.registration.patches import PatchDisplacements, patch_covariance
+from localizer.integrity.patch_covariance import patch_covariance
+from localizer.registration.agreement import PatchDisplacements
 from localizer.registration.priors import (
     attitude_constraint,
     combine,

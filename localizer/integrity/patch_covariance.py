@@ -13,43 +13,16 @@ measured from the displacements themselves, and heights that the map does not ha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from localizer.geometry.pose import Array
+from localizer.registration.agreement import PatchDisplacements
 
 LEAST_PATCHES = 8  # six numbers are fitted
-_RAYLEIGH = 1.1774  # median length of a vector of two independent errors, in their sigmas
 _LEAST_PX = 0.05  # of the scatter: a perfect fit is no perfect knowledge
 BLOCK_M = 20.0  # over which an unknown height is the same: a building, a row of trees
 COMMON = 2.0  # mean of the unknown heights over their spread: buildings stand on the ground
 _SINGULAR = 1e-9
-
-
-@dataclass(frozen=True)
-class PatchDisplacements:
-    """Shifts under which the P patches of an image match best at a registered pose.
-
-    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) level px by a pose
-    difference (position and left rotation vector, world axes, as `PosePrior`). rise: (P, 2) level
-    px by a metre that the patch's ground is higher than the map says. ground: (P, 2) east and north
-    of the patch, m.
-    """
-
-    shift: Array
-    motion: Array
-    rise: Array
-    ground: Array
-
-    @property
-    def scatter_px(self) -> float:
-        """Sigma of the shifts per axis, level px, by their median: what has changed since the
-        survey has a shift of its own, and the optimizer's loss leaves it out.
-        """
-        if len(self.shift) == 0:
-            return np.inf
-        return float(np.median(np.hypot(self.shift[:, 0], self.shift[:, 1]))) / _RAYLEIGH
 
 
 def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Array | None:
