@@ -34,7 +34,8 @@ class Registration:
     known (a registration on a GPU, or one that failed). lead: by how much the best other mode of
     the swarm is worse, as a share of the score, inf without another. focal_gain: how much better
     another focal length fits (`zoom.FocalTest`), -inf where that was not tested. mode_covariance:
-    (6, 6), what of the covariance stems from other modes (equation 14).
+    (6, 6), what of the covariance stems from other modes (equation 14). noise: (6, 6), what is new
+    in each frame, for a filter over frames; None: the covariance.
     """
 
     world_from_camera: Pose
@@ -48,6 +49,7 @@ class Registration:
     lead: float = np.inf
     focal_gain: float = -np.inf
     mode_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    noise: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,10 @@ class SensorFusion:
         covariance = patch_covariance(votes.displacements, self.height_error.sigma_m)
         if covariance is None:
             return replace(result, status=RegistrationStatus.NO_TEXTURE)
-        return replace(result, covariance=covariance + result.mode_covariance)
+        # The patches' displacements are the map's, alike from frame to frame. A motion filter that
+        # took them for noise of each frame would lag behind the camera.
+        whole = covariance + result.mode_covariance
+        return replace(result, covariance=whole, noise=result.covariance)
 
     def learn(
         self, result: Registration, place: Pose, unknown: Array, distance_m: float, time_ns: int

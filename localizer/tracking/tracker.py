@@ -215,7 +215,8 @@ class Tracker:
         carried: PropagatedPose, lost: bool,
     ) -> MotionState:  # fmt: skip
         if use_map and result is not None:
-            return motion.update(ahead, result.world_from_camera, result.covariance)
+            noise = result.covariance if result.noise is None else result.noise
+            return motion.update(ahead, result.world_from_camera, noise)
         if carried.world_from_camera is not None and carried.covariance is not None:
             return motion.update(ahead, carried.world_from_camera, carried.covariance)
         if result is not None and is_acceptable(self._config.integrity, result, 0.0):
