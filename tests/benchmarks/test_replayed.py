@@ -75,7 +75,7 @@ def test_an_honest_flight_is_quiet_and_its_level_is_what_its_sources_make(tmp_pa
 def test_a_jump_is_withheld_and_told_by_the_guardian_of_now(tmp_path: Path) -> None:
     found = replay(recorded(tmp_path / "embedded-jump-3", aside_m=12.0))
     assert 30 <= found.held <= 32
-    assert found.told == {"jump": 1}
+    assert found.told == {"position_jump": 1}
 
 
 def test_what_cannot_be_replayed_is_named_and_the_rest_is_written(
