@@ -105,7 +105,9 @@ def test_it_is_matched_at_any_zoom(
 ) -> None:
     with localizer_of(flight, small_assets) as localizer:
         estimates = flown(flight, localizer, factor)
-    assert max(flight.off_m(e) for e in estimates) < 0.15
+    # The first reference is of the lens before it zoomed: it shows too little for some.
+    assert sum(not e.accepted for e in estimates) <= 1
+    assert max(flight.off_m(e) for e in estimates if e.accepted) < 0.15
 
 
 def test_the_odometry_carries_on_while_the_lens_zooms(
