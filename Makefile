@@ -10,8 +10,9 @@ INSTALL = PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m p
 EXTRAS := cluster console dev docs fetch mcap pyrender
 
 CHECKED := tests/test_house.py tests/test_docs_commands.py tests/companion/test_config.py \
-	tests/localizer/geometry tests/localizer/integrity tests/localizer/tracking tests/companion/integrity_monitor \
-	tests/mavlink_bridge/injection tests/mavlink_bridge/vehicle
+	tests/localizer/geometry tests/localizer/integrity tests/companion/integrity_monitor \
+	tests/companion/calibration_watch tests/mavlink_bridge/injection tests/mavlink_bridge/link \
+	tests/mavlink_bridge/vehicle
 
 .PHONY: help demo check test newest setup lock clean
 

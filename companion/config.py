@@ -101,13 +101,13 @@ class FeedConfig(_Model):
     )
     model: CameraModel
     calibrated: date | None = Field(
-        None, description="when `companion calibrate` last changed model or mounting; null: never"
+        None, description="date of the last calibration of model or mounting; null: never"
     )
     lever_arm_m: tuple[Arm, Arm, Arm] = Field(
-        (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
+        (0.0, 0.0, 0.0), description="camera from the autopilot, body axes forward, right, down"
     )
     zoom: ZoomTable | None = Field(
-        None, description="focal length by the zoom that the camera reports; null: `model`'s always"
+        None, description="focal length by reported zoom; null: always that of `model`"
     )
     settings: SourceSettings = SourceSettings()
 
@@ -139,14 +139,14 @@ class DetectorConfig(_Model):
     """An object detector in the companion's own process."""
 
     model: Path = Field(description="ONNX file of a YOLO network")
-    labels: tuple[str, ...] = Field((), description="its classes' names; none: those in the file")
-    classes: tuple[str, ...] = Field((), description="names of what is reported; none: all")
-    threshold: float = Field(0.4, gt=0, lt=1, description="least score of a report")
+    labels: tuple[str, ...] = Field((), description="class names; default: those in the file")
+    classes: tuple[str, ...] = Field((), description="reported classes; default: all")
+    threshold: float = Field(0.4, gt=0, lt=1, description="smallest reported score")
     layout: Literal["v5", "v8", "end2end"] | None = Field(
-        None, description="of its output; null: by the output's shape"
+        None, description="output layout; null: by its shape"
     )
-    rate_hz: float = Field(2.0, ge=0.05, le=30, description="pictures a second, at most")
-    duty: float = Field(0.3, gt=0, le=1, description="share of one processor, at most")
+    rate_hz: float = Field(2.0, ge=0.05, le=30, description="largest frame rate")
+    duty: float = Field(0.3, gt=0, le=1, description="largest share of one core")
 
     @field_validator("labels")
     @classmethod
@@ -164,36 +164,35 @@ class DetectorConfig(_Model):
 class TargetConfig(_Model):
     """Target geo-localization."""
 
-    detections: str | None = Field(None, description="host:port where pixel detections arrive")
-    detector: DetectorConfig | None = Field(
-        None, description="a network that looks for things in flight; null: none"
-    )
+    detections: str | None = Field(None, description="host:port for pixel detections")
+    detector: DetectorConfig | None = Field(None, description="detection network; null: none")
     rate_hz: float = Field(5.0, ge=0.01, le=30, description="reports per second and target")
     pixel_sigma: float = Field(1.5, ge=0.01, le=1000, description="error of a detection, pixels")
     map_sigma_m: float = Field(
         0.3, ge=0.001, le=100, description="error of the map's surface, metres"
     )
     outline_sigma_m: float = Field(
-        0.5, ge=0.0, le=100, description="how far outlines of roofs and crowns are off, metres"
+        0.5, ge=0.0, le=100, description="error of roof and crown outlines, m"
     )
     bias_sigma_m: float = Field(
-        0.2, ge=0.0, le=100, description="error that all targets of a flight share, metres"
+        0.2, ge=0.0, le=100, description="common error of all targets of a flight, m"
     )
-    max_sigma_m: float = Field(
-        50.0, ge=0.1, le=10_000, description="what is known worse is not told, metres"
-    )
+    max_sigma_m: float = Field(50.0, ge=0.1, le=10_000, description="largest reported sigma, m")
     confirm_s: float = Field(
-        0.5, ge=0.0, le=60, description="detections must agree for so long before the first report"
+        0.5, ge=0.0, le=60, description="time that detections must agree before the first report"
     )
     operator_delay_ms: float = Field(
         250.0,
         ge=0,
         le=5000,
-        description="exposure to the operator's click, video downlink included",
+        description="exposure to the operator's click, with the video link",
     )
     operator_delay_sigma_ms: float = Field(100.0, ge=0, le=5000, description="its error, 1 sigma")
     timeout_s: float = Field(
-        300.0, ge=1, le=86400, description="a clicked target out of the picture for so long ends"
+        300.0,
+        ge=1,
+        le=86400,
+        description="time outside the image after which a clicked target ends",
     )
 
     @field_validator("detections")
@@ -213,23 +212,21 @@ class PriorConfig(_Model):
     position_sigma_m: float = Field(5.0, ge=0.01, le=1000)
     rotation_sigma_deg: float = Field(4.0, ge=0.01, le=180)
     recall_s: float = Field(
-        20.0, ge=0.0, le=120.0, description="a restart goes on from a place found so long ago"
+        20.0, ge=0.0, le=120.0, description="oldest confirmed position that a restart uses"
     )
     state_file: Path | None = Field(
-        None, description="where that place is kept; null: last-fix.json beside the record"
+        None, description="file for it; null: last-fix.json beside the record"
     )
 
 
 class RecordConfig(_Model):
     """What is kept of a flight."""
 
-    folder: Path = Field(description="estimates, targets, events, health and snapshots")
+    folder: Path = Field(description="folder of the record")
     snapshot_interval_s: float | None = Field(
-        10.0, ge=0.001, le=86400, description="a video frame is kept this often; null: never"
+        10.0, ge=0.001, le=86400, description="interval of kept frames; null: none"
     )
-    mcap: bool = Field(
-        False, description="write record.mcap in flight, too (extra `mcap`), for Foxglove and Rerun"
-    )
+    mcap: bool = Field(False, description="also write record.mcap (extra `mcap`)")
 
 
 class KlvConfig(_Model):
@@ -238,9 +235,9 @@ class KlvConfig(_Model):
     output: str = Field(
         pattern=r"^udp://[^\s/@?]+:[0-9]{1,5}(\?.*)?$", description="udp://HOST:PORT, MPEG-TS"
     )
-    mission: str = Field("", max_length=127, description="told in each packet; empty: none")
+    mission: str = Field("", max_length=127, description="mission name in each packet")
     hold_ms: float = Field(
-        200.0, ge=0, le=2000, description="a picture waits so long for its pose, at the most"
+        200.0, ge=0, le=2000, description="longest time that a frame waits for its pose"
     )
 
 
@@ -251,7 +248,7 @@ class CompanionConfig(_Model):
     map_sha256: str | None = Field(
         None,
         pattern=r"^[0-9a-fA-F]{64}$",
-        description="of the map's manifest, printed by `companion map verify`; null: any map",
+        description="hash of the map's manifest (`companion map verify`); null: any map",
     )
     camera: FeedConfig
     localizer: LocalizerConfig = LocalizerConfig()
@@ -261,10 +258,10 @@ class CompanionConfig(_Model):
     integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
     record: RecordConfig | None = None
     klv: KlvConfig | None = Field(
-        None, description="the camera's video on to a ground station, with metadata; null: not sent"
+        None, description="forward the video with KLV metadata; null: off"
     )
     console: ConsoleConfig | None = Field(
-        None, description="the operator's page (extra `console`); null: none"
+        None, description="operator's page (extra `console`); null: none"
     )
 
 

@@ -57,6 +57,10 @@ class RecordError(CompanionError):
     """A flight's record that is not one, or that lacks what a replay needs."""
 
 
+class FootageError(CompanionError):
+    """Recorded footage that cannot be read, or that lacks what its localization needs."""
+
+
 class DetectionError(CompanionError):
     """A datagram that is not a pixel detection."""
 

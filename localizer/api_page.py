@@ -19,10 +19,10 @@ import localizer
 _HEAD = """# API of `localizer`
 
 Made from the docstrings by `python -m localizer.api_page docs/reference/api.md`; do not edit.
-Everything here is imported as `from localizer import NAME` and stays; what is not here may change.
-Frames, heights and time are those of [architecture.md](../explanation/architecture.md), angles
-those of [angles.md](angles.md); [examples/](../../examples) shows it at work. One photo,
-`read_rgb` being `localizer.pictures`' ([localize_photo.py](../../examples/localize_photo.py)):
+Everything here is imported as `from localizer import NAME` and is stable; other names may change.
+Frames, heights and time: [architecture.md](../explanation/architecture.md). Angles:
+[angles.md](angles.md). Examples: [examples/](../../examples). One photo
+([localize_photo.py](../../examples/localize_photo.py); `read_rgb` is in `localizer.pictures`):
 
 ```python
 camera = Camera.from_json("camera.json")
@@ -35,7 +35,7 @@ with open_localizer(cache, camera) as localizer:
     print("accepted" if found.accepted else f"not localized: {found.status.value}")
 ```
 
-`accepted` says whether a pose may be used; `status` only why there is none.
+`accepted` tells whether a pose may be used. `status` tells why there is none.
 """
 
 

@@ -18,7 +18,7 @@ from localizer.tracking.motion import MotionConfig
 
 
 class LocalizerConfig(BaseModel):
-    """What the dual-thread engine needs to know."""
+    """Settings of the localizer and the dual-thread engine."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -29,11 +29,13 @@ class LocalizerConfig(BaseModel):
         2.0,
         ge=0,
         le=100,
-        description="a reference serves while its anchors move less, working px; 0: a frame each",
+        description="a reference is used while its anchors move less, working px; 0: one per frame",
     )
-    renderer: RendererName = Field("auto", description="auto: a GPU where there is one, else numba")
+    renderer: RendererName = Field(
+        "auto", description="auto: a GPU if there is one, otherwise numba"
+    )
     device: DeviceChoice = Field(
-        "auto", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"
+        "auto", description="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"
     )
     threads: int = Field(2, ge=1, le=256, description="CPU threads of rendering and optimization")
     feature_threads: int = Field(
@@ -45,18 +47,18 @@ class LocalizerConfig(BaseModel):
         0.0,
         ge=0,
         le=3600,
-        description="focal length is fitted beside the pose so often, s; 0: not",
+        description="interval of focal length fits, s; 0: none",
     )
     seed: int = Field(0, ge=0, lt=2**31, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
     calibration: CalibrationSigmas = CalibrationSigmas()
     attitude: AttitudePrior | None = Field(
         AttitudePrior(),
-        description="roll and pitch of autopilot and gimbal as a constraint; null: not used",
+        description="use roll and pitch of autopilot and gimbal; null: no",
     )
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()
     odometry: OdometryConfig | None = Field(
-        OdometryConfig(), description="carries on where the map does not match; null: it does not"
+        OdometryConfig(), description="propagates the pose where the map does not match; null: off"
     )
     relocalization: RelocalizationConfig = RelocalizationConfig()

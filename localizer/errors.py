@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class LocalizerError(Exception):
-    """Base of every error that the localizer raises on purpose."""
+    """Base of the localizer's errors."""
 
 
 class GeoreferenceError(LocalizerError):
@@ -12,7 +12,7 @@ class GeoreferenceError(LocalizerError):
 
 
 class CameraError(LocalizerError):
-    """A camera model that is not physical, or that contradicts the images it is used with."""
+    """A camera model that is not physical, or that contradicts its images."""
 
 
 class PoseFileError(LocalizerError):
@@ -20,7 +20,7 @@ class PoseFileError(LocalizerError):
 
 
 class MapError(LocalizerError):
-    """Base of everything that can be wrong with a map or its tile cache."""
+    """Base of the errors of a map or its tile cache."""
 
 
 class MapSourceError(MapError):
@@ -44,7 +44,7 @@ class MapLoadingError(OutsideMapError):
 
 
 class RenderError(LocalizerError):
-    """A renderer backend that is not available, or that is used by the wrong thread."""
+    """A renderer that is not available, or that is used by the wrong thread."""
 
 
 class ModelError(LocalizerError):

@@ -102,9 +102,9 @@ class ReferenceBundle:
 @dataclass(frozen=True)
 class PosePrior:
     """A predicted camera pose. covariance: (6, 6) over (position in world axes, m; rotation as a
-    left-multiplied small rotation vector in world axes, rad). velocity: (3,) in world axes, m/s,
-    if it is known. independent: whether it owes our own fixes nothing (GNSS is in it, an operator
-    gave it); under denial an autopilot's position is our own last fix, carried on.
+    left-multiplied small rotation vector in world axes, rad). velocity: (3,) in world axes, m/s;
+    None if unknown. independent: whether it does not derive from our own fixes. GNSS and an
+    operator are independent; without GNSS the autopilot's position is our last fix, propagated.
     """
 
     world_from_camera: Pose
@@ -121,13 +121,13 @@ class PosePrior:
         rotation_sigma_deg: float = 4.0,
         time_ns: int = 0,
     ) -> PosePrior:
-        """A pose known to so many metres and degrees, standard deviation per axis."""
+        """A pose with standard deviations per axis, metres and degrees."""
         sigma = np.repeat([position_sigma_m, np.radians(rotation_sigma_deg)], 3)
         return cls(world_from_camera, np.diag(sigma**2), time_ns)
 
 
 class RegistrationStatus(Enum):
-    """Why a registration did or did not give a pose."""
+    """Result of a registration."""
 
     OK = "ok"
     NO_OVERLAP = "no overlap: too few anchors project into the image"
@@ -160,14 +160,14 @@ class PoseEstimate:
     """The localizer's answer for one frame.
 
     covariance: (6, 6) as in `PosePrior`, so east, north, up (m) and rotation about them (rad).
-    quality: 0 to 1. status: whether the registration gave a pose; accepted: whether integrity lets
-    it be used, so OK and not accepted go together where integrity refuses it. stage_ms: latency of
-    each stage in milliseconds. last_fix_ns: exposure of the newest estimate that the map confirmed,
-    this one included; None before the first.
+    quality: 0 to 1. status: whether the registration gave a pose. accepted: whether integrity
+    allows its use; it can refuse a pose with status OK. stage_ms: latency of each stage,
+    milliseconds. last_fix_ns: exposure of the newest estimate that the map confirmed, this one
+    included; None before the first.
 
-    state: INITIALIZING for a single photo, which confirms nothing, however good it is. BRIDGING
-    estimates are carried on by odometry, with a covariance that grows. focal: where it was fitted
-    (`LocalizerConfig.focal_fit_s`) and could be told.
+    state: INITIALIZING for a single photo, which cannot be confirmed. BRIDGING estimates come from
+    odometry with a growing covariance. focal: the fitted focal length, if it was fitted
+    (`LocalizerConfig.focal_fit_s`) and observable.
     """
 
     world_from_camera: Pose

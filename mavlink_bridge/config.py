@@ -41,14 +41,16 @@ class YawGuardConfig(_Model):
         default=3.5,
         ge=0.1,
         le=45.0,
-        description="against the autopilot's yaw, or against its gyros since the fixes before",
+        description="against the autopilot's yaw, or its gyros since earlier fixes",
     )
-    gross_deg: float = Field(default=20.0, gt=0.0, le=90.0, description="never more than this")
+    gross_deg: float = Field(
+        default=20.0, gt=0.0, le=90.0, description="largest difference in any case"
+    )
     memory_s: float = Field(
-        default=60.0, ge=0.1, le=600.0, description="how long the gyros are trusted"
+        default=60.0, ge=0.1, le=600.0, description="time for which the gyros are used"
     )
     minimum_samples: int = Field(
-        default=5, ge=1, le=100, description="their majority blocks, all of them release"
+        default=5, ge=1, le=100, description="fixes compared: the majority blocks, all release"
     )
 
     @model_validator(mode="after")
@@ -71,37 +73,37 @@ class InjectionConfig(_Model):
     )
     sigma_floor_m: float = Field(default=0.1, ge=1e-6, le=100.0)
     max_sigma_m: float = Field(
-        default=10.0, gt=0.0, le=100.0, description="nothing is sent above it"
+        default=10.0, gt=0.0, le=100.0, description="largest sigma that is sent"
     )
     alert_limit_m: float = Field(
         default=10.0,
         gt=0.0,
         le=1000.0,
-        description="a fix whose protection level is beyond it is not injected",
+        description="largest protection level of an injected fix",
     )
     time_to_alert_s: float = Field(
-        default=3.0, ge=0.2, le=60.0, description="within which that is told and takes effect"
+        default=3.0, ge=0.2, le=60.0, description="time within which output stops"
     )
     max_extrapolation_s: float = Field(
         default=0.5,
         gt=0.0,
         le=10.0,
-        description="longest gap bridged by propagation; the EKF's own inertial one is better",
+        description="longest propagation over a gap",
     )
     overdue_intervals: float = Field(
         default=2.0,
         ge=1.0,
         le=1000.0,
-        description="nothing is sent once no fix came for so many of their usual intervals",
+        description="missing fix intervals after which nothing is sent",
     )
     acceleration_sigma_mps2: float = Field(default=2.0, ge=0.001, le=50.0)
     force: bool = Field(
         default=False,
-        description="inject and switch without a go of the shadow score; told as a warning",
+        description="inject and switch without a passed shadow check, with a warning",
     )
     map_shift: Literal["tell", "apply"] = Field(
         default="tell",
-        description="what is done about a map that lies beside GNSS; apply: fixes are shifted",
+        description="map offset against GNSS; apply: fixes are corrected by it",
     )
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
@@ -164,13 +166,16 @@ class CameraConfig(_Model):
     )
     mount: Literal["gimbal", "fixed"] = "gimbal"
     gimbal_component: int = Field(
-        default=0, ge=0, le=255, description="whose angles count where there are several; 0: any"
+        default=0, ge=0, le=255, description="component of the gimbal, if there are several; 0: any"
     )
     gimbal_device: int = Field(
-        default=0, ge=0, le=255, description="its gimbal_device_id; 0: the first that is heard"
+        default=0, ge=0, le=255, description="its gimbal_device_id; 0: the first"
     )
     zoom_rate_hz: float = Field(
-        default=0.0, ge=0.0, le=50.0, description="CAMERA_SETTINGS is asked for so often; 0: not"
+        default=0.0,
+        ge=0.0,
+        le=50.0,
+        description="rate at which CAMERA_SETTINGS is requested; 0: none",
     )
     mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_pitch_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
@@ -196,7 +201,7 @@ class TargetsConfig(_Model):
         default=3.0,
         ge=0.01,
         le=1000.0,
-        description="horizontal; of a confirmed target",
+        description="horizontal sigma of a confirmed target",
     )
     cot_endpoint: str = Field(default="", description="host:port of a Cursor-on-Target listener")
     cot_stale_s: float = Field(default=30.0, ge=0.1, le=86400.0)
@@ -209,7 +214,7 @@ class TargetsConfig(_Model):
         min_length=1,
         max_length=32,
         pattern=r"^[\w .-]+$",
-        description="of the aircraft; one for each that is on the same map",
+        description="callsign, unique on the map",
     )
 
     @field_validator("cot_endpoint")
@@ -227,7 +232,7 @@ class SigningConfig(_Model):
     link_id: int = Field(default=1, ge=0, le=255)
     state_file: Path | None = Field(
         default=None,
-        description="newest time stamps, kept over restarts; None: beside the key, FILE.LINK.seen",
+        description="file for the newest stamps; null: FILE.LINK.seen beside the key",
     )
 
     def state_path(self, link: str) -> Path:
@@ -249,31 +254,30 @@ class BridgeConfig(_Model):
     connection: str = "udpin:127.0.0.1:14551"
     ground_connection: str | None = None
     mode: Mode = "shadow"
-    system_id: int | None = Field(default=None, ge=1, le=255, description="None: the vehicle's own")
+    system_id: int | None = Field(default=None, ge=1, le=255, description="null: the vehicle's")
     sender: str | None = Field(
         default=None,
-        description="udpin: whose datagrams are heard, ADDRESS or ADDRESS:PORT; None: the first "
-        "autopilot's",
+        description="udpin: accepted sender, ADDRESS or ADDRESS:PORT; null: the first autopilot",
     )
     ground_systems: tuple[SystemId, ...] = Field(
         default=(255,),
         max_length=32,
-        description="system ids whose commands may gate injection and start tracking",
+        description="system ids that may enable injection and start tracking",
     )
     localizer_component: int = Field(default=197, ge=2, le=255)  # 1 is the autopilot
     companion_component: int = Field(default=191, ge=2, le=255)
     camera_component: int = Field(default=100, ge=2, le=255)
     look_at: bool = Field(
         default=False,
-        description="a ground station may turn the gimbal to a place or target by the camera",
+        description="a ground station may point the gimbal at a position or target",
     )
     named_values: bool = Field(
         default=False,
-        description="NAMED_VALUE_FLOAT VPS_* at 1 Hz, to plot and to watch",
+        description="NAMED_VALUE_FLOAT VPS_* at 1 Hz",
     )
     texts_as_autopilot: bool = Field(
         default=False,
-        description="warnings and errors come from the autopilot's component, for MAVProxy",
+        description="send warnings as the autopilot's component, for MAVProxy",
     )
     attitude_rate_hz: float = Field(default=50.0, ge=5.0, le=200.0)
     injection: InjectionConfig = InjectionConfig()
@@ -287,8 +291,7 @@ class BridgeConfig(_Model):
     tlog: Path | None = None
     state_file: Path | None = Field(
         default=None,
-        description="where mode rc remembers an open gate over a restart, for 10 minutes; beside "
-        "it every mode a no go of the shadow score",
+        description="file that keeps enabled injection and a failed shadow check over a restart",
     )
     link_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
 

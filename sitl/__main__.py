@@ -313,7 +313,9 @@ def _world_of(
     script: Scenario, seed: int, worlds: Path | None, ideal: bool, console: Console
 ) -> FlightAssets:
     with shown_progress(console) as progress:
-        return prepare(seed, worlds, progress, script.world_m, ideal, script.world)
+        return prepare(
+            seed, worlds, progress, script.world_m, ideal, script.world, script.satellite
+        )
 
 
 def _report(console: Console, record: DemoRecord, script: Scenario, seed: int) -> None:

@@ -14,6 +14,7 @@ from benchmarks.site.kept import DATA, Kept, load
 _CRITERIA = {
     "localizer median": "localizer median", "EKF horizontal p95": "EKF p95",
     "fixed targets p95": "targets p95", "fixes in their bound": "inside 95 % bound",
+    "fixes in their level": "inside level",
     "localizer R@3": "R@3",
 }  # fmt: skip
 

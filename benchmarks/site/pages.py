@@ -24,23 +24,23 @@ from companion.setup.reference import reference
 _CLI = """# Command line
 
 Made from the commands by `python -m benchmarks.site`; do not edit. `companion COMMAND --help`
-prints the same in a terminal.
+prints the same.
 
-| exit code | means |
+| exit code | meaning |
 |---|---|
 | 0 | done |
-| 1 | `doctor` found advice, `plan` a bad leg, `map verify` damage, `localize` nothing |
-| 1 | `replay`: the flights differ |
-| 2 | wrong usage, an error that is named in one line, or `doctor`: not fit to fly |
-| 130 | interrupted (`run` that was flying ends with 0) |
+| 1 | `doctor`: advice; `plan`: a failing leg; `map verify`: damage |
+| 1 | `localize`: nothing localized; `replay`: a difference |
+| 2 | wrong usage, a named error, or `doctor`: not fit to fly |
+| 130 | interrupted (a flying `run` ends with 0) |
 """
 
 _CONFIGURATION = """# Configuration
 
-Made from the schema by `python -m benchmarks.site`; do not edit. Every value is the true default;
-`companion init --reference` prints the same as one file. A deployment needs only what differs, and
-`companion init FILE` writes such a one. An unknown key, a value out of bounds or of the wrong kind
-is refused by name at the start. When to touch which:
+Made from the schema by `python -m benchmarks.site`; do not edit. `companion init --reference`
+prints the same. Every value is the default; values of required settings are examples. Intervals are
+allowed ranges. A deployment needs only what differs, and `companion init FILE` writes one. Unknown
+keys and values out of range are refused by name. When to change what:
 [configs/deployment.yaml](../../configs/deployment.yaml).
 """
 

@@ -56,17 +56,22 @@ class _Noise:
     place: Wander
 
 
-def solve(evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None) -> Solution:
-    """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value."""
+def solve(
+    evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None, sigmas: Array = u.SIGMAS
+) -> Solution:
+    """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value;
+    sigmas: (COUNT,) of the weak priors, how wrong the given numbers may be.
+    """
     guess = evidence.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
+    prior: Array = 1.0 / sigmas**2 * np.where(still, 1e12, 1.0)
     up = guess.rotations[:, 2]
     attitude = AttitudeWander(np.full(5, _FIRST["attitudes"]), _FIRST_MEMORY_S, up)
     place = Wander(np.full(3, _FIRST["places"]), np.full(3, _FIRST_MEMORY_S))
     noise = _Noise(1.0, np.ones(len(evidence.owner)), attitude, place)
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
-            H, g = _normal(evidence, guess, noise, still)
+            H, g = _normal(evidence, guess, noise, prior)
             factor = cho_factor(H, lower=True, check_finite=False)
             step = -cho_solve(factor, g, check_finite=False)
             frames = step[u.COUNT :].reshape(-1, 6)
@@ -75,21 +80,15 @@ def solve(evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None) 
                 break
         noise = _noise(evidence, guess, noise)
     noise = _as_told(evidence, guess, noise)
-    H, _ = _normal(evidence, guess, noise, still)
+    H, _ = _normal(evidence, guess, noise, prior)
     shared = np.eye(len(H), u.COUNT)
     gain: Array = cho_solve(cho_factor(H, lower=True), shared).T
     pictures = _pictures(evidence, guess, noise)
     alone, larger = pictures_part(gain, u.COUNT, pictures, evidence.grounds)
     P = gain[:, : u.COUNT] + alone * (np.outer(larger, larger) - 1.0)
     P = 0.5 * (P + P.T)
-    information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(_prior(still))
+    information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(prior)
     return Solution(guess, P, information, noise.pixel_sigma, noise.attitude, noise.place)
-
-
-def _prior(still: NDArray[np.bool_]) -> Array:
-    """(COUNT,) information of the weak priors; of what is fixed, certainty."""
-    prior: Array = 1.0 / u.SIGMAS**2 * np.where(still, 1e12, 1.0)
-    return prior
 
 
 def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise:
@@ -118,9 +117,11 @@ def _as_told(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> _Nois
 
 
 def _normal(
-    evidence: CalibrationProblem, guess: Guess, noise: _Noise, still: NDArray[np.bool_]
+    evidence: CalibrationProblem, guess: Guess, noise: _Noise, prior: Array
 ) -> tuple[Array, Array]:
-    """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,)."""
+    """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,). prior: (COUNT,)
+    information of the weak priors; of what is fixed, certainty.
+    """
     K = len(evidence.times_s)
     M = u.COUNT + 6 * K
     H, g = np.zeros((M, M)), np.zeros(M)
@@ -128,7 +129,6 @@ def _normal(
     _add_wander(evidence.attitudes, "attitudes", noise.attitude, evidence, guess, H, g)
     if evidence.placed.any():
         _add_wander(evidence.places, "places", noise.place, evidence, guess, H, g)
-    prior = _prior(still)
     H[range(u.COUNT), range(u.COUNT)] += prior
     g[: u.COUNT] += prior * guess.shared
     H[range(u.COUNT, M), range(u.COUNT, M)] += 1e-9

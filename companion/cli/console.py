@@ -34,7 +34,7 @@ def console_command(
         bool, typer.Option("--lifeline", hidden=True, help="end with standard input")
     ] = False,
 ) -> None:
-    """Serve the operator's page: what the flight sees, live, with or without a flight."""
+    """Serve the operator's page, with or without a flight."""
     settings = load_config(config)
     given = settings.console or ConsoleConfig()
     # The flight is met by the deployment's own address, whatever this page listens on.

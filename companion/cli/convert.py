@@ -56,20 +56,20 @@ def convert_command(
     of: Annotated[InputFormat, typer.Option("--from", help="format of the source")],
     to: Annotated[OutputFormat, typer.Option("--to", help="format of the result")],
     map_cache: Annotated[
-        Path | None, typer.Option("--map", help="tile cache whose ENU frame is meant")
+        Path | None, typer.Option("--map", help="tile cache with the ENU frame")
     ] = None,
     origin: Annotated[
         str | None, typer.Option(help="LAT,LON,HEIGHT of the ENU frame, instead of --map")
     ] = None,
     heights: Annotated[
-        HeightDatum | None, typer.Option(help="what the heights in photos' tags are above")
+        HeightDatum | None, typer.Option(help="datum of the heights in photo tags")
     ] = None,
     geoid_separation: Annotated[
-        float | None, typer.Option(help="geoid above the ellipsoid, m; else the map's")
+        float | None, typer.Option(help="geoid above the ellipsoid, m; default: the map's")
     ] = None,
     times: Annotated[
         Path | None,
-        typer.Option(help="timestamps.txt ('name nanoseconds'): of poses that have no time"),
+        typer.Option(help="timestamps.txt ('name nanoseconds') for poses without a time"),
     ] = None,
 ) -> None:
     """Convert camera poses: pose lines, TUM, COLMAP, photos' tags, autopilot angles, records."""

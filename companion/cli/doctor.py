@@ -26,17 +26,15 @@ from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 def doctor_command(
     config: Annotated[Path, typer.Argument(help="deployment YAML")],
-    fix: Annotated[
-        bool, typer.Option(help="write parameters that are wrong, after asking")
-    ] = False,
+    fix: Annotated[bool, typer.Option(help="write wrong parameters, after asking")] = False,
     yes: Annotated[bool, typer.Option(help="do not ask")] = False,
-    vehicle: Annotated[bool, typer.Option(help="examine the flight controller too")] = True,
+    vehicle: Annotated[bool, typer.Option(help="check the flight controller too")] = True,
     beside_flight: Annotated[
         bool,
-        typer.Option("--beside-flight", help="leave out vehicle and feed: a flight has them"),
+        typer.Option("--beside-flight", help="skip vehicle and feed, which a flight uses"),
     ] = False,
     page: Annotated[
-        Path | None, typer.Option(help="one page to sign: .html, and as .txt beside it")
+        Path | None, typer.Option(help="one page to sign, .html with .txt beside it")
     ] = None,
     plan: Annotated[
         Path | None, typer.Option(help="plan.json of `companion plan`, for the page's forecast")
@@ -102,11 +100,9 @@ def _mark(finding: DoctorFinding) -> str:
 
 
 def self_test_command(
-    out: Annotated[
-        Path | None, typer.Option(help="its figures, and of which versions, JSON")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="figures and versions, JSON")] = None,
 ) -> None:
-    """Localize over a made map: compiles what a flight needs, and shows that it works here."""
+    """Localize over a generated map: compiles the kernels and checks this computer."""
     from companion.preflight.self_test import self_test
 
     console, told = Console(), Console(stderr=True)

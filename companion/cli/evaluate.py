@@ -62,12 +62,11 @@ def evaluate_command(
     prior: Annotated[
         str,
         typer.Option(
-            help="first: one prior, for video; each: one per frame, for single photos; lost: one "
-            "100 to 500 m off, none: no place at all, found by search, and again after each loss"
+            help="first: one prior; each: one per frame; lost: one 100 to 500 m off; none: search"
         ),
     ] = "first",
     known_heading: Annotated[
-        bool, typer.Option("--known-heading", help="of lost and none: to 15 degrees, else unknown")
+        bool, typer.Option("--known-heading", help="for lost and none: heading known to 15 degrees")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
     noise_m: Annotated[float, typer.Option(min=0, max=1e6, help="prior noise up to, m")] = 10.0,
@@ -76,10 +75,11 @@ def evaluate_command(
     ] = 10.0,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     renderer: Annotated[
-        RendererName, typer.Option(help="auto: a GPU where there is one, else numba")
+        RendererName, typer.Option(help="auto: a GPU if there is one, otherwise numba")
     ] = "auto",
     device: Annotated[
-        DeviceChoice, typer.Option(help="of the optimizer; auto, cuda: a GPU that works, else CPU")
+        DeviceChoice,
+        typer.Option(help="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
     ] = "auto",
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,

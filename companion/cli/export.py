@@ -21,7 +21,7 @@ def export_command(
         bool, typer.Option("--mcap", help="MCAP for Foxglove, Lichtblick and Rerun")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="file to write; none: record.mcap in the record")
+        Path | None, typer.Option(help="file to write; default: record.mcap in the record")
     ] = None,
     tlog: Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")] = None,
 ) -> None:
@@ -45,7 +45,7 @@ def klv_command(
     video: Annotated[Path, typer.Argument(help="recording of the camera's stream")],
     record: Annotated[Path, typer.Option(help="folder that `companion run` recorded")],
     out: Annotated[
-        Path | None, typer.Option(help="file to write; none: beside the video, .klv.ts")
+        Path | None, typer.Option(help="file to write; default: .klv.ts beside the video")
     ] = None,
     map_cache: Annotated[
         Path | None, typer.Option("--map", help="instead of the record's map")
@@ -53,13 +53,12 @@ def klv_command(
     begin: Annotated[
         float | None,
         typer.Option(
-            help="seconds from the record's start to the video's first picture; none: the pictures "
-            "carry MISP time stamps"
+            help="seconds from the record's start to the first frame; default: MISP timestamps"
         ),
     ] = None,
-    mission: Annotated[str, typer.Option(help="told in each packet")] = "",
+    mission: Annotated[str, typer.Option(help="mission name in each packet")] = "",
 ) -> None:
-    """Write the video again as MPEG-TS with MISB ST 0601 metadata; nothing is encoded again."""
+    """Write the video as MPEG-TS with MISB ST 0601 metadata, without encoding it again."""
     from companion.reporting.klv_recording import describe_recording
 
     path = out or video.with_suffix(".klv.ts")

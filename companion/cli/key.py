@@ -19,10 +19,10 @@ def key_command(
     file: Annotated[Path, typer.Argument(help="key file to make, mode 0600")],
     install: Annotated[
         str | None,
-        typer.Option(help="connection of the disarmed flight controller that is given the key"),
+        typer.Option(help="connection of the disarmed flight controller"),
     ] = None,
 ) -> None:
-    """Make a signing key; --install gives it (or the one that FILE holds) to the autopilot."""
+    """Make a signing key; --install sends it (or the one in FILE) to the autopilot."""
     if install is not None:
         try:  # before a key is made that cannot be installed
             Endpoint.parse(install)

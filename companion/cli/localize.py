@@ -49,28 +49,29 @@ def localize_command(
         ),
     ] = None,
     priors: Annotated[
-        Path | None, typer.Option(help="pose file: about where each image named in it was taken")
+        Path | None, typer.Option(help="pose file: approximate pose of each named image")
     ] = None,
     prior_sigma_m: Annotated[
-        float, typer.Option(min=0.01, max=1000, help="how well the priors' place is known, m")
+        float, typer.Option(min=0.01, max=1000, help="sigma of the priors' position, m")
     ] = 5.0,
     prior_sigma_deg: Annotated[
-        float, typer.Option(min=0.01, max=180, help="and their attitude, degrees")
+        float, typer.Option(min=0.01, max=180, help="sigma of their attitude, degrees")
     ] = 4.0,
     out: Annotated[Path, typer.Option(help="folder of the results")] = Path("localized"),
     rate_hz: Annotated[
-        float, typer.Option(min=0.001, max=1000, help="of images without timestamps.txt")
+        float, typer.Option(min=0.001, max=1000, help="frame rate of images without timestamps.txt")
     ] = 30.0,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     renderer: Annotated[
-        RendererName, typer.Option(help="auto: a GPU where there is one, else numba")
+        RendererName, typer.Option(help="auto: a GPU if there is one, otherwise numba")
     ] = "auto",
     device: Annotated[
-        DeviceChoice, typer.Option(help="of the optimizer; auto, cuda: a GPU that works, else CPU")
+        DeviceChoice,
+        typer.Option(help="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
     ] = "auto",
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
 ) -> None:
-    """Localize images against a map; exit code 1 if not one of them was localized."""
+    """Localize images against a map. Exit code 1: none was localized."""
     if not images.exists():
         raise ConfigError(f"{images}: no such image or folder")
     paths = list_images(images) if images.is_dir() else [images]

@@ -45,13 +45,11 @@ def build(
     out: Annotated[Path, typer.Option(help="folder of the cache to make")],
     geoid_separation: Annotated[
         float | None,
-        typer.Option(help="geoid above the ellipsoid, metres; else the source's, else EGM96's"),
+        typer.Option(help="geoid above the ellipsoid, m; default: the source's, then EGM96"),
     ] = None,
     vertical_datum: Annotated[
         Literal["ellipsoidal", "amsl"] | None,
-        typer.Option(
-            help="what the source's heights are above: the WGS84 ellipsoid or the geoid (amsl)"
-        ),
+        typer.Option(help="datum of the source's heights: WGS84 ellipsoid or geoid (amsl)"),
     ] = None,
     georeference: Annotated[
         Path | None, typer.Option(help="georeference of a mesh: JSON, or ODM's offset file")
@@ -61,14 +59,12 @@ def build(
         typer.Option(help="of a mesh or tileset: y (glTF's default) or z (OBJ's)"),
     ] = None,
     height_unit: Annotated[
-        str | None, typer.Option(help="of a DSM that does not say it: m, ft or us-ft")
+        str | None, typer.Option(help="of a DSM without a unit: m, ft or us-ft")
     ] = None,
-    nodata: Annotated[
-        float | None, typer.Option(help="of a DSM that does not say it: what missing heights are")
-    ] = None,
-    attribution: Annotated[str | None, typer.Option(help="who made the source")] = None,
+    nodata: Annotated[float | None, typer.Option(help="of a DSM without a nodata tag")] = None,
+    attribution: Annotated[str | None, typer.Option(help="attribution of the source")] = None,
     imagery_date: Annotated[
-        str | None, typer.Option(help="of the source's pictures: 2024, 2024-06 or 2024-06-30")
+        str | None, typer.Option(help="date of the imagery: 2024, 2024-06 or 2024-06-30")
     ] = None,
     sensor: Annotated[
         str | None, typer.Option(help="that took the source's pictures; else as its tags say")
@@ -81,9 +77,9 @@ def build(
         ),
     ] = None,
     skip_bad_tiles: Annotated[
-        bool, typer.Option(help="leave out tiles that cannot be imported instead of failing")
+        bool, typer.Option(help="skip tiles that cannot be imported")
     ] = False,
-    overwrite: Annotated[bool, typer.Option(help="replace a cache that is there")] = False,
+    overwrite: Annotated[bool, typer.Option(help="replace an existing cache")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="processes; one per core")] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="address of a Dask scheduler that shares the file system")
@@ -92,19 +88,19 @@ def build(
         bool,
         typer.Option(
             "--overview",
-            help="compute now what finding a place without a prior needs, not on first use",
+            help="compute the overview for relocalization now, not on first use",
         ),
     ] = False,
     limit: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=NUMBER: what a source may ask for; the limit's error names it"),
+        typer.Option(help="NAME=NUMBER: raise a limit that an error names"),
     ] = None,
     trust: Annotated[
         list[str] | None,
-        typer.Option(help="a doubt that is set aside; the error that it stops with names it"),
+        typer.Option(help="accept a doubt that an error names"),
     ] = None,
 ) -> None:
-    """Import a source into a tile cache; goes on where an interrupted build stopped."""
+    """Import a source into a tile cache; continues an interrupted build."""
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
     from localizer.map.importers.rules import ImportRules
@@ -159,8 +155,8 @@ def _print_warnings(warnings: Iterable[str]) -> None:
 @app.command("info")
 def info(
     cache: CachePath,
-    geojson: Annotated[Path | None, typer.Option(help="write the map's outline there")] = None,
-    kml: Annotated[Path | None, typer.Option(help="write the map's outline there")] = None,
+    geojson: Annotated[Path | None, typer.Option(help="file for the map's outline")] = None,
+    kml: Annotated[Path | None, typer.Option(help="file for the map's outline")] = None,
 ) -> None:
     """Coverage, heights, texel size, levels and sizes."""
     outlines = [file for file in (geojson, kml) if file is not None]
@@ -217,7 +213,7 @@ def info(
 
 @app.command("verify")
 def verify(cache: CachePath) -> None:
-    """Check every tile's hash and look for holes in the surface; exit 1 when a tile is damaged.
+    """Check every tile's hash and list holes. Exit code 1: a tile is damaged.
 
     Holes may be in the source, as under a bridge's parapet or at a ragged edge: they are listed,
     and do not count as damage.
@@ -258,9 +254,11 @@ def render(
     fov: Annotated[
         float, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
     ] = 60.0,
-    out: Annotated[Path, typer.Option(help="PNG; the depth goes beside it")] = Path("view.png"),
+    out: Annotated[Path, typer.Option(help="PNG; the depth is written beside it")] = Path(
+        "view.png"
+    ),
 ) -> None:
-    """A picture of the map and of its depth from a pose."""
+    """Render the map and its depth from a pose."""
     if out.suffix.lower() != ".png":
         raise typer.BadParameter(f"--out {out}: give a name that ends in .png")
     depth = out.with_name(f"{out.stem}_depth{out.suffix}")
@@ -288,7 +286,7 @@ def export(
         int | None, typer.Option(min=0, help="depth of the tile tree; the finest")
     ] = None,
 ) -> None:
-    """The map's surface as one GLB (y up, metres about the cache's origin)."""
+    """Write the map's surface as one GLB (y up, metres about the cache's origin)."""
     _require_place(out)
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import export_glb

@@ -27,14 +27,14 @@ def replay_command(
         Path | None, typer.Option("--map", help="instead of the record's map")
     ] = None,
     tolerance_m: Annotated[
-        float, typer.Option(min=0, help="95 % of the positions must lie so near")
+        float, typer.Option(min=0, help="largest difference of 95 % of the positions")
     ] = 1.0,
     page: Annotated[
         str | None,
         typer.Option("--console", help="address:port: show the record in a browser instead"),
     ] = None,
 ) -> None:
-    """Localize a recorded flight again; exit code 0 if it agrees with the record, else 1."""
+    """Localize a recorded flight again. Exit code 0: it agrees with the record, 1: it differs."""
     if page is not None:
         show_record(record, map_cache, page)
         return

@@ -18,10 +18,10 @@ def report_command(
         Path, typer.Argument(help="record, or the folder of a demo or of `companion eval`")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="file to write; none: report.html in the folder")
+        Path | None, typer.Option(help="file to write; default: report.html in the folder")
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option(help="replace a file that is there (the folder's own report always is)")
+        bool, typer.Option(help="replace an existing file (the folder's own report always)")
     ] = False,
 ) -> None:
     """Write one self-contained HTML file and print its path."""

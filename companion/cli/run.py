@@ -34,7 +34,7 @@ def run_command(
         DeviceChoice | None, typer.Option(help="instead of the configuration's localizer.device")
     ] = None,
     supervised: Annotated[
-        bool, typer.Option(help="restart it when it dies, and tell the operator")
+        bool, typer.Option(help="restart the process if it dies, and report it")
     ] = False,
     standby: Annotated[bool, typer.Option(hidden=True)] = False,
     pulse: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,

@@ -9,7 +9,6 @@ one flight that are above different surfaces.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,17 +16,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from PIL import ExifTags, Image
 
 from companion.convert.angles import Angles, gimbal_of_pose, pose_of_gimbal
+from companion.errors import FootageError
+from companion.recorded.photo_tags import read_photo_tags, read_xmp
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
-from localizer.plain_files import files_of, plain_text
+from localizer.plain_files import files_of
 
 _PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
-_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
-_LARGEST_BYTES = 1 << 20  # of a photo's head, in which its tags stand
 _HOME_STEP_M = 15.0  # of absolute less relative height, which drift by metres
 _RTK = {16, 34, 50}  # RtkFlag: single, float, fixed
 _ANGLES = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
@@ -185,22 +183,14 @@ def _read_photo(path: Path, tags: dict[str, str], frame: LocalFrame, lift_m: flo
 
 def _xmp_tags(path: Path) -> dict[str, str]:
     """DJI's tags by name: as attributes or as elements, both occur."""
-    sidecar = next((p for p in map(path.with_suffix, (".xmp", ".XMP")) if p.is_file()), path)
     try:
-        if sidecar is not path or path.suffix.lower() == ".xmp":
-            text = plain_text(sidecar)
-        else:
-            with path.open("rb") as file:
-                head = file.read(_LARGEST_BYTES)
-            begin = head.find(_XMP_HEADER)
-            end = head.find(b"</x:xmpmeta>", begin)
-            if begin < 0 or end < 0:
-                raise PoseFileError(f"{path}: has no XMP tags, and there is no {path.stem}.xmp")
-            text = head[begin:end].decode("utf-8", errors="replace")
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
-    tags = dict(re.findall(r"""drone-dji:(\w+)\s*=\s*["']([^"']*)["']""", text))
-    return tags | dict(re.findall(r"<drone-dji:(\w+)>([^<]*)</", text))
+        tags = read_xmp(path)
+    except FootageError as error:
+        raise PoseFileError(str(error)) from error
+    if not tags:
+        sidecar = path.with_suffix(".xmp").name
+        raise PoseFileError(f"{path}: has no XMP tags, and there is no {sidecar}")
+    return tags
 
 
 def _xmp_position(tags: dict[str, str]) -> tuple[float, float, float] | None:
@@ -216,22 +206,9 @@ def _xmp_position(tags: dict[str, str]) -> tuple[float, float, float] | None:
 
 def _exif_position(path: Path) -> tuple[float, float, float]:
     try:
-        with Image.open(path) as image:
-            gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
-    except OSError as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
-    try:
-        lat = _degrees(gps[ExifTags.GPS.GPSLatitude], gps[ExifTags.GPS.GPSLatitudeRef] == "S")
-        lon = _degrees(gps[ExifTags.GPS.GPSLongitude], gps[ExifTags.GPS.GPSLongitudeRef] == "W")
-        height = float(gps[ExifTags.GPS.GPSAltitude])
-    except (KeyError, TypeError, ZeroDivisionError) as error:
-        raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP: {error}") from error
-    # 1 and b"\\x01" both occur; Pillow gives the byte as it stands. EXIF 3 has 3 for below the sea.
-    below = gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, 3, b"\x01", b"\x03")
-    return lat, lon, -height if below else height
-
-
-def _degrees(parts: Sequence[float], negative: bool) -> float:
-    degrees, minutes, seconds = (float(part) for part in parts)
-    value = degrees + minutes / 60 + seconds / 3600
-    return -value if negative else value
+        position = read_photo_tags(path).exif_position
+    except FootageError as error:
+        raise PoseFileError(str(error)) from error
+    if position is None:
+        raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP")
+    return position

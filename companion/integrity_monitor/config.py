@@ -18,16 +18,16 @@ class VideoCheckConfig(_Model):
         default=3e-4,
         gt=0.0,
         le=0.01,
-        description="a picture that moved by less than this share of its width stands still",
+        description="motion below which a frame is frozen, as a share of its width",
     )
     still_s: float = Field(
-        default=3.0, ge=0.2, le=60.0, description="a picture that stands still so long is frozen"
+        default=3.0, ge=0.2, le=60.0, description="time after which a frozen frame is reported"
     )
     repeat_memory_s: float = Field(
-        default=60.0, ge=5.0, le=600.0, description="how far back repeated pictures are looked for"
+        default=60.0, ge=5.0, le=600.0, description="time over which repetition is searched"
     )
     repeat_s: float = Field(
-        default=2.0, ge=0.5, le=30.0, description="pictures that repeat for so long are a loop"
+        default=2.0, ge=0.5, le=30.0, description="length of a repetition that is reported"
     )
 
 
@@ -38,7 +38,10 @@ class MotionCheckConfig(_Model):
     limit_3s_m: float = Field(default=1.0, gt=0.0, le=50.0)
     limit_10s_m: float = Field(default=0.8, gt=0.0, le=50.0)
     still_m: float = Field(
-        default=0.1, ge=0.0, le=5.0, description="a position within this is no proof of motion"
+        default=0.1,
+        ge=0.0,
+        le=5.0,
+        description="position changes below this do not count as motion",
     )
 
 
@@ -53,19 +56,18 @@ class ProtectionConfig(_Model):
     risk: float = Field(
         default=1e-3, gt=0.0, le=0.1, description="probability of an error beyond the level"
     )
-    map_m: float = Field(default=0.28, ge=0.0, le=100.0, description="the map, north and east")
-    map_height_m: float = Field(default=0.4, ge=0.0, le=100.0, description="the map's height")
+    map_m: float = Field(default=0.28, ge=0.0, le=100.0, description="map, north and east")
+    map_height_m: float = Field(default=0.4, ge=0.0, le=100.0, description="map height")
     calibration_share: float = Field(
         default=0.003, ge=0.0, le=0.5,
-        description="the camera's, of the height above ground, where nothing says how well it is "
-        "known: `camera.calibrated` null or long ago",
+        description="camera, share of the height, without a recent `camera.calibrated`",
     )  # fmt: skip
     calibrated_share: float = Field(
         default=0.001, ge=0.0, le=0.5,
-        description="the same beside what a calibration stated in `localizer.calibration`",
+        description="the same with a recent calibration",
     )  # fmt: skip
     time_bias_s: float = Field(
-        default=0.01, ge=0.0, le=1.0, description="the time stamps', times the speed"
+        default=0.01, ge=0.0, le=1.0, description="time error, times the speed"
     )
 
     def of_camera(self, *, calibrated: bool) -> ProtectionConfig:
@@ -83,24 +85,24 @@ class IntegrityMonitorConfig(_Model):
     protection: ProtectionConfig = ProtectionConfig()
     calibration: CalibrationLimits = CalibrationLimits()
     height_m: float = Field(
-        default=8.0, gt=0.0, le=200.0, description="vision's height against the barometer's, drift"
+        default=8.0, gt=0.0, le=200.0, description="largest height difference to the barometer"
     )
     jump_m: float = Field(
-        default=10.0, gt=0.0, le=1000.0, description="an announced jump beyond it is held"
+        default=10.0, gt=0.0, le=1000.0, description="announced jumps above this are held"
     )
     unreported_jump_m: float = Field(
-        default=3.0, gt=0.0, le=1000.0, description="a jump without a reset beyond it is held"
+        default=3.0, gt=0.0, le=1000.0, description="unannounced jumps above this are held"
     )
     jump_hold_s: float = Field(
-        default=5.0, ge=0.0, le=60.0, description="a jumped position must agree in motion so long"
+        default=5.0, ge=0.0, le=60.0, description="time that a jumped position must agree in motion"
     )
     tilt_deg: float = Field(
         default=0.9, ge=0.1, le=10.0,
-        description="gimbal's and autopilot's roll and pitch, mounting included, 1 sigma an axis",
+        description="roll and pitch of gimbal and autopilot with mounting, 1 sigma an axis",
     )  # fmt: skip
     gnss_accuracy_cap_m: float = Field(
-        default=3.0, gt=0.0, le=50.0, description="a receiver's own error is believed up to this"
+        default=3.0, gt=0.0, le=50.0, description="largest receiver error that is believed"
     )
     gnss_repeat_s: float = Field(
-        default=10.0, ge=1.0, le=600.0, description="GNSS apart from vision is told this often"
+        default=10.0, ge=1.0, le=600.0, description="interval of the GNSS report"
     )

@@ -1,4 +1,4 @@
-"""MISB ST 0601 UAS Datalink Local Set: numbers by tag to bytes (SMPTE ST 336 KLV).
+"""MISB ST 0601 UAS Datalink Local Set: numbers by tag to bytes and back (SMPTE ST 336 KLV).
 
 Tags and ranges as of edition 8, which all later ones keep. What lies outside its tag's range is
 left out: a receiver must not be told a limit for a value.
@@ -46,6 +46,17 @@ class _Mapped:
             return round(value / self.high * top).to_bytes(self.size, "big", signed=True)
         top = (1 << 8 * self.size) - 1
         return round((value - self.low) / (self.high - self.low) * top).to_bytes(self.size, "big")
+
+    def decode(self, data: bytes) -> float | None:
+        """None for another length and for the reserved "out of range" value."""
+        if len(data) != self.size:
+            return None
+        if self.low < 0 and self.low == -self.high:
+            top = (1 << (8 * self.size - 1)) - 1
+            number = int.from_bytes(data, "big", signed=True)
+            return None if number < -top else number / top * self.high
+        top = (1 << 8 * self.size) - 1
+        return self.low + int.from_bytes(data, "big") / top * (self.high - self.low)
 
 
 _ALTITUDE, _ANGLE, _ERROR = _Mapped(2, -900, 19000), _Mapped(4, 0, 360), _Mapped(2, 0, 4095)
@@ -95,6 +106,65 @@ def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
     length = len(body) + 4  # the checksum's own item
     packet = UNIVERSAL_LABEL + _length(length) + body + bytes((CHECKSUM, 2))
     return packet + checksum(packet).to_bytes(2, "big")
+
+
+def decode(packet: bytes) -> dict[int, float | str | int]:
+    """Values by tag, `TIME` in microseconds; unknown tags are left out.
+
+    ValueError for another label, a packet that is cut short, or a wrong checksum.
+    """
+    if packet[:16] != UNIVERSAL_LABEL:
+        raise ValueError("not a local set of ST 0601")
+    length, at = read_length(packet, 16)
+    end = at + length
+    if end > len(packet):
+        raise ValueError("the local set is cut short")
+    fields: dict[int, float | str | int] = {}
+    while at < end:
+        number, at = _read_tag(packet, at)
+        size, at = read_length(packet, at)
+        value = packet[at : at + size]
+        if number == CHECKSUM and checksum(packet[:at]) != int.from_bytes(value, "big"):
+            raise ValueError("the local set's checksum is wrong")
+        decoded = _decoded(number, value)
+        if decoded is not None:
+            fields[number] = decoded
+        at += size
+    return fields
+
+
+def read_length(data: bytes, at: int) -> tuple[int, int]:
+    """A BER length at a place, and where its value begins. ValueError where it is cut short."""
+    if at >= len(data):
+        raise ValueError("a length is missing")
+    first = data[at]
+    if first < 0x80:
+        return first, at + 1
+    size = first & 0x7F
+    if at + 1 + size > len(data):
+        raise ValueError("a length is cut short")
+    return int.from_bytes(data[at + 1 : at + 1 + size], "big"), at + 1 + size
+
+
+def _read_tag(data: bytes, at: int) -> tuple[int, int]:
+    """A BER-OID tag, and where its length begins."""
+    number = 0
+    while at < len(data):
+        number = number << 7 | data[at] & 0x7F
+        at += 1
+        if data[at - 1] < 0x80:
+            return number, at
+    raise ValueError("a tag is cut short")
+
+
+def _decoded(number: int, value: bytes) -> float | str | int | None:
+    if number == TIME:
+        return int.from_bytes(value, "big") if len(value) == 8 else None
+    if number in _TEXTS:
+        return value.decode("utf-8", "replace")
+    if number == LOCAL_SET_VERSION:
+        return int.from_bytes(value, "big")
+    return _MAPPED[number].decode(value) if number in _MAPPED else None
 
 
 def checksum(data: bytes) -> int:

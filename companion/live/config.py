@@ -16,16 +16,16 @@ class ConsoleConfig(BaseModel):
     listen: str = Field(
         "127.0.0.1:8080",
         pattern=r"^(\[[0-9a-fA-F:]+\]|[0-9.]+|localhost):\d{1,5}$",
-        description="address:port; another than loopback needs token_file",
+        description="address:port; other than loopback needs token_file",
     )
     control: bool = Field(
-        False, description="the page may set targets and hints, and change settings on the ground"
+        False, description="the page may set targets and hints and change settings"
     )
-    token_file: Path | None = Field(None, description="file of mode 0600; needed off loopback")
-    hosts: tuple[str, ...] = Field((), description="names by which browsers reach it, as host")
-    tls_certificate: Path | None = Field(None, description="PEM; with tls_key: https")
+    token_file: Path | None = Field(None, description="token file, mode 0600")
+    hosts: tuple[str, ...] = Field((), description="host names of the page")
+    tls_certificate: Path | None = Field(None, description="PEM certificate, with tls_key")
     tls_key: Path | None = None
-    frames_hz: float = Field(6.0, ge=0.2, le=15.0, description="pictures per second on the page")
+    frames_hz: float = Field(6.0, ge=0.2, le=15.0, description="frames per second on the page")
 
     @model_validator(mode="after")
     def _is_guarded(self) -> ConsoleConfig:

@@ -58,7 +58,7 @@ class MapMark:
 @dataclass(frozen=True)
 class MapSheet:
     """Top view with tracks. rgb: (n, n, 3), None where the map is not to be had; west to north: its
-    edges, m.
+    edges, m. key: what circles and crosses are.
     """
 
     rgb: Image | None
@@ -68,6 +68,7 @@ class MapSheet:
     north: float
     tracks: tuple[MapTrack, ...] = ()
     marks: tuple[MapMark, ...] = ()
+    key: str = "located targets are circles, crosses are true places or events"
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,8 @@ class Report:
     """All of it. first: what went wrong first, in words; abscissa: of the plots and the timeline.
 
     spans: named lanes of stretches (states, GNSS denied); notes: what the report could not show;
-    overlays_of: the frames of which the overlays show the worst.
+    overlays_of: the frames of which the overlays show the worst; verdict: the result in one
+    sentence; tables: further ones with their titles.
     """
 
     title: str
@@ -161,3 +163,5 @@ class Report:
     versions: dict[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
     overlays_of: str = "all frames"
+    verdict: str = ""
+    tables: tuple[tuple[str, ReportTable], ...] = ()

@@ -18,7 +18,7 @@ from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.transport import TransportWriter
 from companion.offline.tables import Columns, poses
 from companion.reporting.record import RecordTables, read_record
-from companion.sources.base import fitted_camera, video_stream
+from companion.sources.base import fitted_camera, has_times, video_stream
 from companion.sources.misp import parse_message
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler
@@ -78,6 +78,11 @@ def describe_recording(
             stream = video_stream(source, str(video))
         except (OSError, ValueError, IndexError) as error:
             raise StreamOpenError(f"{video}: not a video: {error}") from error
+        if not has_times(source):
+            raise StreamOpenError(
+                f"{video}: raw video without times; put it into a container at its frame rate: "
+                "ffmpeg -r RATE -i FILE -c copy FILE.mp4"
+            )
         camera = fitted_camera(stream.width, stream.height, tables.camera, str(video))
         begin_ns = None if begin_s is None else tables.start_ns + round(begin_s * 1e9)
         clock = _Clock(begin_ns, tables.utc_ns - tables.start_ns)

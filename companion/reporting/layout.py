@@ -72,9 +72,11 @@ def _sections(report: Report) -> list[str]:
     fine = " fine" if report.first.startswith(NOTHING) else ""
     return [
         f"<h1>{escape(report.title)}</h1><p class=sub>{escape(report.subtitle)}</p>",
+        f"<p class=verdict>{escape(report.verdict)}</p>" if report.verdict else "",
         f'<p class="first{fine}"><b>What went wrong first:</b> {escape(report.first)}</p>',
         "".join(f"<p class=note>{escape(note)}</p>" for note in report.notes),
         _verdicts(report),
+        *(_section(title, _table(table)) for title, table in report.tables),
         _section("Map", _map(report.sheet)) if report.sheet else "",
         _section("Timeline", _timeline(report)) if report.lanes or report.events else "",
         _section("Errors and figures", _plots(report)) if report.plots else "",
@@ -141,8 +143,8 @@ def _map(sheet: MapSheet) -> str:
         f'<span><i style="background:{t.colour}"></i>{escape(t.name)}</span>' for t in sheet.tracks
     )
     return (
-        f"<div class=legend>{legend}<span>located targets are circles, crosses are true places or "
-        f"events</span><span>scale {bar:g} m</span></div>"
+        f"<div class=legend>{legend}<span>{escape(sheet.key)}</span>"
+        f"<span>scale {bar:g} m</span></div>"
         f'<svg class=map viewBox="0 0 {width:.2f} {height:.2f}" role=img '
         f'aria-label="map with tracks">{"".join(parts)}'
         f'<path class=scale d="M{size * 0.03:.2f} {height - size * 0.03:.2f}h{bar:g}"/></svg>'

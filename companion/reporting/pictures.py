@@ -73,11 +73,15 @@ class MapPictures:
         gsd_m = 2 * half_m / _SHEET_PX
         return render_top_view(self.renderer, centre, _SHEET_PX, gsd_m, base_m).rgb
 
-    def overlays(self, frames: Sequence[ShownFrame], camera: Camera) -> tuple[Overlay, ...]:
-        """Each frame, freed of its distortion, and the map rendered at its pose."""
+    def overlays(
+        self, frames: Sequence[ShownFrame], camera: Camera, size: Camera | None = None
+    ) -> tuple[Overlay, ...]:
+        """Each frame, freed of its distortion, and the map rendered at its pose. size: of the
+        pictures that are shown, else the camera's own.
+        """
         if self.renderer is None:
             return ()
-        target = camera.without_distortion()
+        target = (size or camera).without_distortion()
         undistort = Undistorter(camera, target)
         sheets = []
         for number, shown in enumerate(frames, 1):

@@ -41,7 +41,12 @@ _ADVICE = {
         "the autopilot's position is off although vision may be right: late, refused or withheld",
         "events of injection, latency against bridge.injection.delay_ms, `companion doctor`",
     ),
-    "fixes in": Advice(
+    "fixes in their level": Advice(
+        "the protection level did not hold: a fix was further off than the worst it admitted",
+        "what kind of map it is (`companion map info`): without buildings in the heights the level "
+        "rests on the attitude",
+    ),
+    "fixes in their bound": Advice(
         "fixes are further off than their own 95 % bound says, more often than 5 in 100",
         "calibration and time stamps, which no single picture shows, and localizer.map_error_m",
     ),

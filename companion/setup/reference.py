@@ -32,14 +32,14 @@ _EXAMPLES: dict[str, Any] = {
 }
 _OTHER = "..."  # of a part that is off: its own page says more
 _WIDTH = 100
-_REQUIRED = "required, this is an example"
+_REQUIRED = "required"
 
 
 def reference() -> str:
     """The text of a deployment file that lists every setting."""
     head = (
         "# Every setting of a deployment with its default, from `companion init --reference`.\n"
-        "# A deployment file needs only what differs: `companion init` writes one.\n"
+        "# A deployment file needs only what differs. Values of required settings are examples.\n"
     )
     return head + "\n".join(_lines(CompanionConfig, None, 0)) + "\n"
 
@@ -78,20 +78,28 @@ def _part(field: FieldInfo) -> type[BaseModel] | None:
 
 def _words(field: FieldInfo, value: Any, indent: str) -> Iterator[str]:
     """The setting's meaning and bounds as comments."""
-    names = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
-    bounds = [
-        f"{names[key]} {getattr(part, key):g}"
-        for part in field.metadata
-        for key in names
-        if getattr(part, key, None) is not None
-    ]
     choices = [str(c) for c in get_args(field.annotation) if isinstance(c, str)]
-    parts = [field.description or "", " ".join(bounds), "one of " + ", ".join(choices)]
-    said = [p for p in parts[:2] if p] + ([parts[2]] if choices else [])
+    said = [p for p in (field.description, _bounds(field), ", ".join(choices)) if p]
     if value is PydanticUndefined and _part(field) is None:
         said.append(_REQUIRED)
     for line in textwrap.wrap("; ".join(said), _WIDTH - len(indent) - 2):
         yield f"{indent}# {line}"
+
+
+def _bounds(field: FieldInfo) -> str:
+    """As an interval: [0, 10], (0, 1] without 0, [1, inf)."""
+    found = {
+        key: getattr(part, key)
+        for part in field.metadata
+        for key in ("ge", "gt", "le", "lt")
+        if getattr(part, key, None) is not None
+    }
+    if not found:
+        return ""
+    low, high = found.get("ge", found.get("gt")), found.get("le", found.get("lt"))
+    begin = "(-inf" if low is None else f"{'[' if 'ge' in found else '('}{low:g}"
+    end = "inf)" if high is None else f"{high:g}{']' if 'le' in found else ')'}"
+    return f"{begin}, {end}"
 
 
 def _text(value: Any) -> str:

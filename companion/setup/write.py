@@ -12,10 +12,14 @@ from companion.errors import ConfigError
 from companion.setup.difference import differing
 
 
-def deployment_text(config: CompanionConfig, notes: Sequence[str]) -> str:
-    """The file's text. notes: what whoever flies it should know, as comments at its head."""
+def deployment_text(
+    config: CompanionConfig, notes: Sequence[str], by: str = "companion init"
+) -> str:
+    """The file's text. by: the command that writes it; notes: what whoever flies it should know,
+    as comments at its head.
+    """
     lines = [
-        "# Written by `companion init`: only what differs from the defaults. Every other setting:",
+        f"# Written by `{by}`: only what differs from the defaults. Every other setting:",
         "# `companion init --reference`. Check it with `companion doctor` before each flight.",
         *(f"# {note}" for note in notes),
     ]

@@ -14,7 +14,6 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from av.format import Flags
 from av.sidedata.sidedata import Type as SideDataType
 from av.video.frame import PictureType
 
@@ -34,6 +33,7 @@ from companion.sources.base import (
     StateCallback,
     StreamState,
     fitted_camera,
+    has_times,
     scaling_text,
     video_stream,
 )
@@ -104,7 +104,7 @@ class VideoDecoder:
         except StreamOpenError:
             self._container.close()
             raise
-        self.has_times = not self._container.format.flags & Flags.no_timestamps.value
+        self.has_times = has_times(self._container)
         self.late = 0  # pictures that packets before theirs held back (B-frames)
         context = self.stream.codec_context
         live = read_timeout_s is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -9,6 +10,7 @@ from fractions import Fraction
 from typing import Annotated, Protocol
 
 import av
+from av.format import Flags
 from av.stream import Disposition
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -19,6 +21,8 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange
 from localizer.types import Frame
+
+_log = logging.getLogger(__name__)
 
 # What is said of 16-bit grey pictures without a range.
 GREY_RANGE_ADVICE = (
@@ -82,26 +86,26 @@ class SourceSettings(BaseModel):
         default=0.0,
         ge=0,
         le=1000,
-        description="fixed glass-to-glass latency, taken off where the stream has no exact times",
+        description="constant glass-to-glass latency, for streams without exact times",
     )
     time_offset_ms: float = Field(
         default=0.0,
         ge=-1000,
         le=1000,
-        description="by which every picture's time is late, found by `calibrate flight`: taken off",
+        description="constant time offset of the frames, from `calibrate flight`; subtracted",
     )
     timing: Timing = Field(
         default="auto",
-        description="auto: MISP time stamps where the stream has them; pts: never use them",
+        description="auto: MISP timestamps if the stream has them; pts: never",
     )
     stall_timeout_s: float = Field(
         default=1.0,
         ge=0.1,
         le=60,
-        description="a live stream without a picture for so long is stalled",
+        description="time without a frame after which a live stream is stalled",
     )
     retry_max_s: float = Field(
-        default=4.0, ge=0.1, le=600, description="longest wait between two attempts to connect"
+        default=4.0, ge=0.1, le=600, description="longest wait between connection attempts"
     )
     rate_hz: float = Field(
         default=10.0,
@@ -111,16 +115,16 @@ class SourceSettings(BaseModel):
     )
     realtime: bool = Field(
         default=False,
-        description="play files and folders at their own pace instead of as fast as possible",
+        description="play files and folders in real time",
     )
     sender: str | None = Field(
         default=None,
-        description="UDP: whose video is taken, ADDRESS or ADDRESS:PORT; null: the first one's",
+        description="UDP: accepted sender, ADDRESS or ADDRESS:PORT; null: the first",
     )
 
     grey_range: tuple[Count, Count] | None = Field(
         default=None,
-        description="16-bit grey pictures: the counts that are black and white; null: refused",
+        description="16-bit grey: counts of black and white; null: refused",
     )
 
     @property
@@ -185,12 +189,23 @@ class PacketTaps:
 
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
     """The video among a container's streams, not a cover picture, wherever they stand; of several
-    FFmpeg's choice: the largest. `StreamOpenError` where there is none.
+    FFmpeg's choice, which is logged. `StreamOpenError` where there is none.
     """
     best = container.streams.best("video")
     if not isinstance(best, av.VideoStream) or best.disposition & Disposition.attached_pic:
         raise StreamOpenError(f"{where}: has no video stream; give a video")
+    films = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    if len(films) > 1:
+        _log.warning(
+            "%s: holds %d video streams; number %d of %dx%d is read",
+            where, len(films), best.index, best.width, best.height,
+        )  # fmt: skip
     return best
+
+
+def has_times(container: av.container.InputContainer) -> bool:
+    """Whether its format says when pictures were taken, unlike raw H.264."""
+    return not container.format.flags & Flags.no_timestamps.value
 
 
 class FrameSource(Protocol):

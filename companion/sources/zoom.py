@@ -37,17 +37,15 @@ class ZoomTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     points: tuple[tuple[Level, Factor], ...] = Field(
         min_length=2,
-        description="level of CAMERA_SETTINGS and focal length as a multiple of `model`'s",
+        description="CAMERA_SETTINGS level and focal length as a multiple of `model`'s",
     )
-    hold_s: float = Field(
-        2.0, ge=0.1, le=3600.0, description="a report that is no longer followed counts so long"
-    )
+    hold_s: float = Field(2.0, ge=0.1, le=3600.0, description="validity of a report, s")
 
     refine: float = Field(
         0.0,
         ge=0.0,
         le=0.02,
-        description="registration may correct the table by this share of the focal length; 0: not",
+        description="largest correction of the table by the registration, as a share; 0: none",
     )
 
     @field_validator("points")

@@ -105,7 +105,7 @@ class Camera:
         return self.distortion_model != "opencv" or any(k != 0.0 for k in self.distortion)
 
     def is_like(self, other: Camera) -> bool:
-        """Whether pictures of both can be taken for one another: focal lengths to 0.1 %, principal
+        """Whether images of both are interchangeable: focal lengths to 0.1 %, principal
         points to 0.01 px, size and distortion the same.
         """
         scales = self.fx / other.fx, self.fy / other.fy
@@ -166,7 +166,7 @@ class Camera:
             & (pixels[..., 1] <= self.height)
         )
         if self.is_distorted:
-            inside &= np.hypot(x, y) <= self._reach
+            inside &= x * x + y * y <= self._reach**2
         return pixels, inside
 
     def rays(self, pixels: ArrayLike) -> Array:

@@ -72,6 +72,8 @@ def read_numbers(path: Path) -> dict[str, Any]:
             data: Any = _of_colmap(colmap, len(lines))
         elif text.lstrip()[:1] in ("{", "["):
             data = json.loads(text)
+        elif text.lstrip().startswith("<"):
+            raise ValueError("it is XML; export OpenCV's YAML or COLMAP's cameras.txt")
         else:  # OpenCV's FileStorage is YAML but for its first line and its tags
             data = load_yaml(re.sub(r"^%YAML:1\.0|!!opencv-matrix", "", text))
     except FileNotFoundError as error:

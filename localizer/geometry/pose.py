@@ -121,7 +121,7 @@ class Pose:
 
     @classmethod
     def identity(cls) -> Pose:
-        """The transform that moves nothing."""
+        """The identity transform."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod

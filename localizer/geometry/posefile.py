@@ -33,7 +33,7 @@ class PoseRow:
 
 
 def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
-    """Every pose of a file, in its order; blank lines and lines that begin with # are skipped.
+    """All poses of a file, in order. Blank lines and lines that begin with # are skipped.
 
     A line is ``name lon lat alt roll pitch yaw``: degrees, metres above the ellipsoid.
     """
@@ -82,7 +82,7 @@ def pose_line(row: PoseRow) -> str:
 
 
 def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:
-    """The row's pose in the map's ENU frame (its own tangent plane is turned into the map's)."""
+    """The row's pose in the map's ENU frame."""
     p = row.position
     centre = frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
     roll, pitch, yaw = np.radians([row.roll_deg, row.pitch_deg, row.yaw_deg])
@@ -91,7 +91,7 @@ def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:
 
 
 def pose_row(name: str, pose: Pose, frame: LocalFrame) -> PoseRow:
-    """Inverse of `pose_of_row`, as `localizer` exports `world_from_camera`: the pose's row."""
+    """Inverse of `pose_of_row`."""
     position = frame.position(pose.translation)
     R = _map_from_local(position, frame).T @ pose.rotation @ _OPENCV_FROM_OPENGL
     # R = Rz(yaw) Ry(roll) Rx(pitch): the middle angle is roll, from R[2, 0] = -sin(roll).

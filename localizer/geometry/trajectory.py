@@ -27,9 +27,9 @@ COVARIANCE_COLUMNS = (
 
 @dataclass(frozen=True)
 class StampedPose:
-    """A camera's pose at a time. time_ns: of the exposure, None where only the order is known.
+    """A camera pose. time_ns: exposure time; None if only the order is known.
 
-    covariance: (6, 6) as in `PosePrior`, None where it is not known.
+    covariance: (6, 6) as in `PosePrior`; None if unknown.
     """
 
     name: str
@@ -58,7 +58,7 @@ def tum_line(pose: StampedPose) -> str:
 
 
 def read_tum(path: Path) -> tuple[StampedPose, ...]:
-    """Every pose of a TUM file, named by its time in ns; blank lines and comments are skipped."""
+    """All poses of a TUM file, named by their time in ns. Blank lines and comments are skipped."""
     try:
         lines = plain_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -92,7 +92,7 @@ def _parse_tum(line: str, where: str) -> StampedPose:
 
 
 def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
-    """Write the upper triangles as CSV (`COVARIANCE_COLUMNS`); poses without one are left out.
+    """Write the upper triangles as CSV (`COVARIANCE_COLUMNS`). Poses without one are skipped.
 
     Axes 0 to 2: position east, north, up (m); 3 to 5: rotation vector about them (rad).
     """

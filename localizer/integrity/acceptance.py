@@ -23,11 +23,9 @@ class IntegrityConfig(BaseModel):
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
     min_patch_inlier_ratio: float = Field(
-        0.4, ge=0, le=1, description="share of the image's parts that match best where they lie"
+        0.4, ge=0, le=1, description="share of the image patches that agree on the pose"
     )
-    min_patches: int = Field(
-        8, ge=0, le=1000, description="parts of the image that can say so, of 32 px"
-    )
+    min_patches: int = Field(8, ge=0, le=1000, description="patches (32 px) needed for that")
     max_sigma_m: float = Field(
         4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
     )
@@ -35,19 +33,19 @@ class IntegrityConfig(BaseModel):
         0.01,
         ge=0,
         le=1,
-        description="share by which another focal length may fit a place on trial better",
+        description="largest gain of another focal length for a tentative registration",
     )
     ambiguity_sigma_m: float = Field(
         6.0,
         ge=0,
         le=1e4,
-        description="sigma of the prior's place from which on the place has to stand out",
+        description="prior sigma above which the peak must stand out",
     )
     peak_to_sidelobe_min: float = Field(
         4.5,
         ge=0,
         le=100,
-        description="the image's match over its matches beside, in their sigmas, to stand out",
+        description="peak-to-sidelobe ratio, in sigmas, that stands out",
     )
     chi2_threshold: float = Field(
         40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof"
@@ -60,20 +58,21 @@ class IntegrityConfig(BaseModel):
     )
     lost_after: int = Field(10, ge=1, le=1000, description="rejections in a row until LOST")
     confirm_distance_m: float = Field(
-        5.0, ge=0.1, le=1000, description="way over which a place found without GNSS must hold"
+        5.0,
+        ge=0.1,
+        le=1000,
+        description="distance over which a position found without GNSS must hold",
     )
     confirm_still_s: float = Field(
-        3.0, ge=0.1, le=60, description="the same for a vehicle that does not move"
+        3.0, ge=0.1, le=60, description="time for a vehicle that does not move"
     )
     confirm_tilt_deg: float = Field(
-        6.0, ge=0.1, le=90, description="roll and pitch of a found place against the autopilot's"
+        6.0, ge=0.1, le=90, description="largest roll and pitch difference to the autopilot"
     )
     confirm_heading_deg: float = Field(
-        30.0, ge=0.1, le=180, description="heading of a found place against the autopilot's"
+        30.0, ge=0.1, le=180, description="largest heading difference to the autopilot"
     )
-    reference_age_s: float = Field(
-        2.0, ge=0.1, le=60, description="a reference view older than this is not registered to"
-    )
+    reference_age_s: float = Field(2.0, ge=0.1, le=60, description="oldest usable reference view")
 
 
 def is_acceptable(

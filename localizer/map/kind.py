@@ -15,8 +15,9 @@ IMAGERY_DATE = r"\d{4}(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?"  # a year, a
 # A surface model's own error where nothing has changed since. Caliterra's, against points that its
 # photos did not make: half of them within 0.1 m, 90 % within 0.33 m.
 _SURFACE_SIGMA_M = 0.3
-# Root mean square of what stands above the ground, over ground and roofs together. Measured with
-# `localizer.map.inspection.kind` on the surface models at hand.
+# Root mean square of what stands above the ground, over ground and roofs together: 1.5 m on a
+# construction site (caliterra), 3.8 m in quito, 5.4 m in a village among trees (portugal), 2.4 m at
+# the edge of a generated town and 6.1 m in its centre.
 _TOWN_SIGMA_M = 6.0
 # What a flat model lacks besides: relief within the ground that one image shows.
 _RELIEF_SIGMA_M = 2.0

@@ -19,7 +19,7 @@ class GrowthModel(BaseModel):
     registration: float = Field(
         1.0, ge=1, le=1e4, description="variance factor of each registration's covariance"
     )
-    scale: float = Field(ge=0, le=1, description="sigma of the way's length, as a share of it")
+    scale: float = Field(ge=0, le=1, description="scale sigma, as a share of the distance")
     horizontal: float = Field(ge=0, le=10, description="walk of east and north, m per root m")
     vertical: float = Field(ge=0, le=10, description="walk of the height, m per root m")
     tilt: float = Field(ge=0, le=1, description="walk of roll and pitch, rad per root m")
@@ -31,8 +31,7 @@ class GrowthModel(BaseModel):
         0.0,
         ge=0,
         le=10,
-        description="walk of east and north that nothing mends, m per root m, times the share that "
-        "does not match (1 - quality)",
+        description="uncorrected walk of east and north, m per root m, times (1 - quality)",
     )
 
 
@@ -53,37 +52,35 @@ class OdometryConfig(BaseModel):
         60.0, ge=1, le=1e4, description="squared Mahalanobis distance from the prediction, 6 dof"
     )
     new_below_overlap: float = Field(
-        0.7, ge=0, le=1, description="overlap below which the next keyframe begins"
+        0.7, ge=0, le=1, description="overlap below which a new keyframe starts"
     )
     new_below_quality: float = Field(
         0.6, ge=0, le=1, description="quality, as a share of the keyframe's first, likewise"
     )
     new_beyond_turn_deg: float = Field(
-        25.0, ge=1, le=180, description="turn since the keyframe, likewise"
+        25.0, ge=1, le=180, description="turn since the keyframe that starts a new one"
     )
     longest_gap_s: float = Field(
-        3.0, ge=0.1, le=60, description="without a usable frame until the thread is lost"
+        3.0, ge=0.1, le=60, description="time without a usable frame until it is lost"
     )
     longest_sigma_m: float = Field(
-        15.0, ge=0.1, le=1000, description="of a carried position, beyond which it ends"
+        15.0, ge=0.1, le=1000, description="largest sigma of a propagated position"
     )
     acceleration_sigma: float = Field(
-        2.0, ge=0.01, le=100, description="m/s² of the motion while nothing is seen"
+        2.0, ge=0.01, le=100, description="m/s², of the motion without usable frames"
     )
     turn_sigma_deg: float = Field(
-        0.2, ge=0.01, le=90, description="of the autopilot's tilt since the keyframe, per axis"
+        0.2, ge=0.01, le=90, description="autopilot's tilt since the keyframe, per axis"
     )
     heading_turn_sigma_deg: float = Field(
-        0.6, ge=0.01, le=90, description="of its heading since the keyframe"
+        0.6, ge=0.01, le=90, description="its heading since the keyframe"
     )
     rise_sigma_m: float = Field(
-        0.3, ge=0.01, le=100, description="of the barometer's rise since the keyframe"
+        0.3, ge=0.01, le=100, description="barometer's climb since the keyframe"
     )
-    terrain: Path | None = Field(
-        None, description="GeoTIFF of the ground's heights, for where the map has none"
-    )
+    terrain: Path | None = Field(None, description="GeoTIFF of ground heights outside the map")
     parallax_noise: float | None = Field(
-        0.02, ge=1e-4, le=10, description="sigma of a parallax's cost, as a share; null: not used"
+        0.02, ge=1e-4, le=10, description="sigma of a parallax cost, as a share; null: not used"
     )
     with_map: GrowthModel = Field(
         GrowthModel(
@@ -95,23 +92,23 @@ class OdometryConfig(BaseModel):
             heading=4e-4,
             unmatched=0.3,
         ),
-        description="growth with depth from the map's geometry",
+        description="growth with depth from the map",
     )
     with_ground: GrowthModel = Field(
         GrowthModel(
             registration=49.0, scale=0.005, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
         ),
-        description="growth with depth from a terrain model's height alone",
+        description="growth with depth from a terrain model",
     )
     with_range: GrowthModel = Field(
         GrowthModel(
             registration=49.0, scale=0.045, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
         ),
-        description="growth over ground whose height a rangefinder met",
+        description="growth with a rangefinder",
     )
     with_plane: GrowthModel = Field(
         GrowthModel(
             registration=49.0, scale=0.1, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
         ),
-        description="growth over ground that is taken as level; over hills of 40 m it errs so much",
+        description="growth over ground taken as level",
     )

@@ -35,7 +35,7 @@ class CalibrationSigmas(BaseModel):
     # Ground that changed since the survey errs alike over more than a survey's own bumps: three
     # flights over other visits were likeliest with 20 m (docs/results/errors.md).
     map_length_m: float = Field(
-        20.0, ge=0.01, le=1000, description="over which it is displaced alike"
+        20.0, ge=0.01, le=1000, description="correlation length of that displacement"
     )
 
     @classmethod

@@ -36,14 +36,12 @@ class JNGOConfig(BaseModel):
         default=2048,
         ge=0,
         le=65536,
-        description="poses drawn of a wide prior at 320 x 240, more in larger pictures; 0: none",
+        description="poses drawn from a wide prior at 320 x 240, more in larger images; 0: none",
     )
     preselected_from_m: float = Field(
-        default=2.0, ge=0, le=1e4, description="position sigma from which a prior is wide"
+        default=2.0, ge=0, le=1e4, description="smallest position sigma of a wide prior"
     )
-    preselected_to_m: float = Field(
-        default=50.0, ge=0, le=1e4, description="and up to which; one view shows no more of a map"
-    )
+    preselected_to_m: float = Field(default=50.0, ge=0, le=1e4, description="largest one")
     spread_sigmas: float = Field(
         default=2.2, ge=0.01, le=100, description="grid half-width in prior sigmas"
     )
@@ -64,7 +62,7 @@ class JNGOConfig(BaseModel):
     )
     sharpen_scales: tuple[_Scale, ...] = Field(
         default=(2.0, 1.0, 0.7),
-        description="for each of these Geman-McClure scales, in median residual norms",
+        description="Geman-McClure scales of these steps, in median residual norms",
     )
     detail_scales: tuple[_Scale, ...] = Field(
         default=(1.0, 0.7), description="likewise on the detail level"
@@ -122,7 +120,7 @@ class JNGOConfig(BaseModel):
         default=0.13,
         ge=0,
         le=1e4,
-        description="the map's displacement (sigma) times the length over which it is the same",
+        description="displacement of the map (sigma) times its correlation length",
     )
     max_sigma_m: float = Field(
         default=50.0, ge=0.01, le=1000, description="position sigma that counts as no texture"

@@ -13,38 +13,34 @@ class RelocalizationConfig(BaseModel):
     threads: int = Field(1, ge=1, le=64, description="CPU threads of a search")
     cache_mib: int = Field(128, ge=16, le=1 << 20, description="resident tiles, MiB")
     spectra_mib: int = Field(
-        256, ge=0, le=1 << 20, description="the map's transforms that are kept between searches"
+        256, ge=0, le=1 << 20, description="map transforms kept between searches"
     )
     # A patch of 130 m is blurred by two cells at its edge when it is turned by 3 degrees or scaled
     # by 5 %: with 10 degrees, 1.15 and 170 m the right place fell from first to behind 60th.
-    heading_step_deg: float = Field(6.0, ge=1, le=45, description="between headings tried")
-    heading_reach: float = Field(
-        2.0, ge=0.5, le=6, description="headings tried to either side, in sigmas"
-    )
+    heading_step_deg: float = Field(6.0, ge=1, le=45, description="step between headings")
+    heading_reach: float = Field(2.0, ge=0.5, le=6, description="range of headings, in sigmas")
     scale_step: float = Field(
-        1.1, ge=1.02, le=1.5, description="ratio of neighbouring heights above ground tried"
+        1.1, ge=1.02, le=1.5, description="ratio of neighbouring heights above ground"
     )
     extraction_ratio: float = Field(
-        1.35, ge=1.0, le=2.0, description="of heights that share one extraction of features"
+        1.35, ge=1.0, le=2.0, description="ratio of heights that share one feature extraction"
     )
     patch_m: float = Field(
-        130.0, ge=40, le=2000, description="largest side of the ground compared, at 0.5 m a pixel"
+        130.0, ge=40, le=2000, description="largest side of the compared ground, at 0.5 m a pixel"
     )
     candidates: int = Field(
-        96, ge=1, le=400, description="places that are rendered at half the size, at the most"
+        96, ge=1, le=400, description="largest number of candidates rendered at half size"
     )
-    finalists: int = Field(
-        4, ge=1, le=100, description="of these, the best are registered, to the end"
-    )
+    finalists: int = Field(4, ge=1, le=100, description="of these, the number that is registered")
     passes: int = Field(
-        3, ge=1, le=10, description="renderings of a place, each from the last pose"
+        3, ge=1, le=10, description="renderings of a candidate, each from the last pose"
     )
     min_quality: float = Field(0.2, ge=0, le=1, description="registration quality of an answer")
     min_patch_inlier_ratio: float = Field(
-        0.6, ge=0, le=1, description="share of the image's parts that agree on an answer"
+        0.6, ge=0, le=1, description="share of the patches that agree on an answer"
     )
     max_focal_gain: float = Field(
-        0.01, ge=0, le=1, description="share by which another focal length may fit better"
+        0.01, ge=0, le=1, description="largest gain of another focal length"
     )
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the anchors in view")
     max_sigma_m: float = Field(4.0, ge=0.01, le=100, description="position sigma of an answer")
@@ -54,9 +50,7 @@ class RelocalizationConfig(BaseModel):
     height_gate_m: float = Field(
         4.0, ge=0.1, le=1000, description="added to three sigmas of height"
     )
-    decisive_agreement: float = Field(
-        0.8, ge=0, le=1, description="agreement at which no other candidate is looked at"
-    )
+    decisive_agreement: float = Field(0.8, ge=0, le=1, description="agreement that ends the search")
     margin: float = Field(
-        0.05, ge=0, le=1, description="quality by which an answer leads each other credible place"
+        0.05, ge=0, le=1, description="quality lead over every other credible position"
     )

@@ -43,10 +43,10 @@ class AttitudePrior(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     tilt_sigma_deg: float = Field(
-        0.4, ge=0.05, le=90, description="least error of roll and pitch, beside a constant"
+        0.4, ge=0.05, le=90, description="smallest error of roll and pitch, without the bias"
     )
     alignment_sigma_deg: float = Field(
-        1.0, ge=0.05, le=90, description="their constant error, before it is learned in flight"
+        1.0, ge=0.05, le=90, description="their bias before it is estimated in flight"
     )
 
 

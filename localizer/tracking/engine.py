@@ -46,15 +46,14 @@ _FIX_STOP_S = 20.0  # for a frame that is at work to be done, on a slow computer
 
 
 class DualThreadEngine:
-    """Runs a `Localizer` on a render thread and a localization thread, features ahead of both.
+    """Runs a `Localizer` on a render, an extraction and a localization thread.
 
     Above 200 lines: each thread's turn is a few lines here, and they share one state.
 
     subscribers: called on the localization thread with every estimate; they must not block.
-    prior_provider: asked, with a time in ns, for a pose from outside when there is none or when
-    tracking is LOST. searcher: finds a place without a prior, on a thread of its own. One that
-    neither asks nor answers for two minutes hangs: that is told, all frames are tried again without
-    it, and nothing waits for it. clock: CLOCK_MONOTONIC, ns.
+    prior_provider: called with a time in ns for an external pose if there is none or tracking is
+    LOST. searcher: finds a position without a prior, on its own thread. If it is silent for two
+    minutes, the hang is reported and frames are tried without it. clock: CLOCK_MONOTONIC, ns.
     """
 
     def __init__(
@@ -98,7 +97,7 @@ class DualThreadEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Stop the threads and wait for them; one that hangs is left behind."""
+        """Stop the threads and wait for them with a time limit."""
         self._stop.set()
         self._ahead.close()
         self._render_times.close()
@@ -109,13 +108,13 @@ class DualThreadEngine:
                 _log.warning("the %s thread does not end, it is left behind", thread.name)
 
     def submit(self, frame: Frame) -> None:
-        """Offer a frame; an older one that was not yet taken is dropped. Never blocks."""
+        """Offer a frame. It replaces a waiting one. Never blocks."""
         self._ahead.put(frame)
         self._book.count(frames_in=1)
 
     @property
     def is_full(self) -> bool:
-        """Whether the newest frame has not been taken yet: the next one would displace it."""
+        """Whether a frame is waiting; the next one would replace it."""
         return self._ahead.is_full
 
     @property

@@ -42,14 +42,10 @@ class MotionConfig(BaseModel):
     acceleration_sigma: float = Field(3.0, ge=0.01, le=100, description="m/s²")
     angular_acceleration_sigma: float = Field(1.0, ge=0.001, le=100, description="rad/s²")
     turn_sigma: float = Field(
-        0.001, ge=1e-4, le=1, description="error of a turn measured between two frames, rad"
+        0.001, ge=1e-4, le=1, description="error of a measured turn between two frames, rad"
     )
-    turn_walk: float = Field(
-        0.004, ge=0, le=1, description="what it grows by with time, rad per root second"
-    )
-    turn_delay_s: float = Field(
-        0.01, ge=0, le=1, description="how late it may be: at a turn rate so much of an angle"
-    )
+    turn_walk: float = Field(0.004, ge=0, le=1, description="its growth, rad per root second")
+    turn_delay_s: float = Field(0.01, ge=0, le=1, description="its delay, times the turn rate")
     initial_velocity_sigma: float = Field(
         8.0, ge=0.01, le=100, description="m/s, of an unknown velocity"
     )

@@ -48,12 +48,12 @@ def open_localizer(
     config: LocalizerConfig | None = None,
     sensors: AuxiliarySensors | None = None,
 ) -> Localizer:
-    """A localizer for one camera over a tile cache on disk; close it, or use it in a ``with``.
+    """A localizer for one camera over a tile cache. Close it, or use it in a ``with``.
 
-    map_cache: folder that `build_cache` (``companion map build``) made. camera: of the frames as
-    they arrive, with its distortion. config: every setting has a default. sensors: see
-    `Localizer`. The first call on a machine compiles for a minute. Use it on the thread that opened
-    it: a GPU's renderer belongs to that one.
+    map_cache: folder made by `build_cache` (``companion map build``). camera: of the frames as they
+    arrive, with distortion. config: every setting has a default. sensors: see `Localizer`. The
+    first call on a machine compiles for a minute. Use it on the thread that opened it, because a
+    GPU's renderer belongs to that thread.
     """
     config = config or LocalizerConfig()
     stack = MapStack(Path(map_cache), config)

@@ -150,18 +150,16 @@ def reference_anchors(
 class Localizer:
     """The algorithm for one camera. `open_localizer` makes one; `set_prior`, then `track` frames.
 
-    Each half (`make_reference`, `localize`) may also run on its own thread, as in the engine.
+    `make_reference` and `localize` may run on two threads, as in the engine.
 
-    Above 200 lines and 15 public methods: it is the library's whole surface for one camera, and
-    the halves share what it holds; motion, judgement and bridging are `Tracker`'s.
+    Above 200 lines and 15 public methods: it is the library's whole interface for one camera.
+    Motion, acceptance and dead reckoning are `Tracker`'s.
 
-    sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
-    angular rate of the motion model, their roll and pitch constrain the registration while it
-    tracks (`tracking.bias`), and with the displacement they confirm or refute a place that was
-    searched.
-    map_frame, map_kind: the map's. terrain: the ground's shape where the map has none. on_close:
-    releases what was opened for this localizer alone. is_loading: whether tiles that were asked for
-    are still on their way.
+    sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
+    rate of the motion model. Their roll and pitch constrain the registration while tracking
+    (`tracking.attitude_bias`). With the displacement they confirm or refute a tentative track.
+    map_frame, map_kind: the map's. terrain: ground heights outside the map. on_close: releases
+    what was opened for this localizer. is_loading: whether requested tiles are still loading.
     """
 
     def __init__(
@@ -240,22 +238,22 @@ class Localizer:
 
     @property
     def tracker(self) -> TrackerState:
-        """The current motion state and standing."""
+        """The current motion state and track status."""
         return self._tracker.state
 
     @property
     def can_carry(self) -> bool:
-        """Whether `localize` has an answer where there is no reference (None for its anchors)."""
+        """Whether `localize` can answer without a reference (anchors None)."""
         return self._tracker.can_carry
 
     @property
     def keeps_features(self) -> bool:
-        """Whether `extract_query`'s features outlast its next call: a GPU's do not."""
+        """Whether `extract_query`'s features stay valid after its next call (not on a GPU)."""
         return not self._optimizer.on_gpu
 
     @property
     def reference_age_s(self) -> float:
-        """A reference view older than this says nothing of a frame."""
+        """Largest usable age of a reference view, seconds."""
         return self._config.integrity.reference_age_s
 
     @property
@@ -264,12 +262,12 @@ class Localizer:
         return self._renderer.name
 
     def set_prior(self, prior: PosePrior) -> None:
-        """Begin (again) from a pose known from outside, e.g. the autopilot's."""
+        """Start (again) from an external pose, for example the autopilot's."""
         self._tracker.set_prior(prior)
 
     def offer(self, prior: PosePrior) -> None:
-        """Take a pose that is known outside, as it deserves: before the first fix one that owes
-        our own fixes nothing begins the tracking; any other place is on trial (`propose`).
+        """Take an external pose. Before the first fix an independent one starts the tracking; any
+        other starts a tentative track (`propose`).
         """
         begins = self.tracker.track_status.state is TrackingState.INITIALIZING
         if prior.independent and begins:
@@ -278,9 +276,9 @@ class Localizer:
             self.propose(prior)
 
     def propose(self, prior: PosePrior) -> None:
-        """Try a place: it is given out only once it is confirmed (`localizer.integrity`).
+        """Start a tentative track; its pose is used once confirmed (`localizer.integrity`).
 
-        The state stays what it is: a guess does not end LOST.
+        The state does not change: a tentative track does not end LOST.
         """
         self._tracker.propose(prior)
 
@@ -293,11 +291,10 @@ class Localizer:
     ) -> PoseEstimate:
         """Localize one frame on this thread: predict, render the reference, extract, register.
 
-        passes: how often it is rendered and registered, each time from the last result; 3 for a
-        prior that is metres and degrees off, since the view from there shows another place. query:
-        gives the frame's features (`extract_query`), if they are computed beside the rendering.
-        Raises `OutsideMapError` without a prior (`set_prior`), or where the view from the
-        prediction does not meet the map.
+        passes: number of renderings and registrations, each from the last result; use 3 for a
+        prior that is metres and degrees off. query: returns the frame's features
+        (`extract_query`) if they are computed in parallel. Raises `OutsideMapError` without a
+        prior (`set_prior`), or if the predicted view does not meet the map.
         """
         stage_ms: dict[str, float] = {}
         features: FeaturePyramid | None = None
@@ -327,7 +324,7 @@ class Localizer:
     def reference_for(
         self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
     ) -> ReferenceBundle:
-        """The last reference as long as it serves (`reference_shift_px`), else a new one."""
+        """The last reference while it is usable (`reference_shift_px`), otherwise a new one."""
         track_status = self.tracker.track_status
         holds = track_status.state is TrackingState.TRACKING and track_status.rejected_in_row == 0
         steady = holds and not self._is_loading()
@@ -367,15 +364,15 @@ class Localizer:
         return ReferenceBundle(view, anchors, prior.time_ns)
 
     def prefetch(self, time_ns: int) -> None:
-        """Have the map loaded along the predicted trajectory after `time_ns`; returns at once."""
+        """Load the map along the predicted trajectory after `time_ns`; returns immediately."""
         times = [time_ns + round(s * 1e9) for s in _LOOK_AHEAD_S]
         ahead = [prior for t in times if (prior := self.predict(t)) is not None]
         self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
-        """Features of the frame (does not need the reference, so it may run beside it).
+        """Features of the frame. It needs no reference and may run in parallel.
 
-        They may be on the GPU, and are then valid until the next call.
+        On a GPU they are valid until the next call.
         """
         undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
         self.camera = camera
@@ -389,7 +386,7 @@ class Localizer:
     def localize(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None
     ) -> PoseEstimate:
-        """Register the frame against the anchors, judge the result and update the filter.
+        """Register the frame against the anchors, test the result and update the filter.
 
         anchors: None where no reference can be had: the odometry answers, if it can (`can_carry`).
         """

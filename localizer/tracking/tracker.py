@@ -68,7 +68,7 @@ class Tracker:
 
     @property
     def state(self) -> TrackerState:
-        """The current motion state and standing."""
+        """The current motion state and track status."""
         with self._lock:
             return self._state
 

@@ -101,13 +101,44 @@ def ekf_errors(
     return t[inside], np.hypot(d[0], d[1]), np.abs(d[2])
 
 
-def inside_bounds(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> float | None:
-    """Per cent of accepted estimates whose horizontal error is within their own 95 % ellipse, by
-    the east and north sigmas that were reported; None without any.
+@dataclass(frozen=True)
+class BoundFigures:
+    """How often a flight's fixes were as good as they said. inside_bound: per cent within their own
+    95 % ellipse; inside_level: per cent within their protection level; level_m: those levels.
     """
+
+    inside_bound: float | None
+    inside_level: float | None
+    level_m: Spread
+
+
+def bound_figures(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> BoundFigures:
+    """Of the accepted estimates in the span, by their horizontal errors; None without any. The
+    ellipse is that of the east and north sigmas that were reported.
+    """
+    rows, nearest = _matched(truth, estimates, span_ns)
+    if not len(rows):
+        return BoundFigures(None, None, Spread(None, None, None))
+    errors = [estimates[f"{a}_m"][rows] - truth[f"{a}_m"][nearest] for a in ("east", "north")]
+    scaled = [
+        e / estimates[f"sigma_{a}_m"][rows] for e, a in zip(errors, ("east", "north"), strict=True)
+    ]
+    within = 100.0 * float((scaled[0] ** 2 + scaled[1] ** 2 <= _CHI2_95).mean())
+    level = np.asarray(estimates["hpl_m"], float)[rows]
+    known = np.isfinite(level)
+    held = (np.hypot(*errors) <= level)[known]
+    inside_level = 100.0 * float(held.mean()) if len(held) else None
+    return BoundFigures(within, inside_level, Spread.of(level))
+
+
+def _matched(
+    truth: Columns, estimates: Columns, span_ns: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of accepted estimates in the span, and of the truth at their exposure."""
+    none = np.zeros(0, np.int64)
     stamps = np.asarray(truth["exposure_time_ns"])
     if not len(estimates) or not len(stamps):
-        return None
+        return none, none
     accepted = np.asarray(estimates["accepted"]) > 0
     times = np.asarray(estimates["exposure_time_ns"])
     rows = np.flatnonzero(accepted & (times >= span_ns[0]) & (times <= span_ns[1]))
@@ -115,14 +146,7 @@ def inside_bounds(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) 
     nearest = np.where(times[rows] - stamps[after - 1] < stamps[after] - times[rows],
                        after - 1, after)  # fmt: skip
     known = np.abs(stamps[nearest] - times[rows]) < _MATCH_NS
-    rows, nearest = rows[known], nearest[known]
-    if not len(rows):
-        return None
-    scaled = [
-        (estimates[f"{a}_m"][rows] - truth[f"{a}_m"][nearest]) / estimates[f"sigma_{a}_m"][rows]
-        for a in ("east", "north")
-    ]
-    return 100.0 * float((scaled[0] ** 2 + scaled[1] ** 2 <= _CHI2_95).mean())
+    return rows[known], nearest[known]
 
 
 def target_errors(

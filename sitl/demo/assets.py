@@ -18,6 +18,8 @@ from localizer.map.cache.cache import TileCache
 from localizer.synth.config import Character, WorldConfig, look_of
 from localizer.synth.visits.visit import Visit, surveyed_and_lived
 from localizer.synth.world import WorldInfo, build_visits
+from sitl.demo.satellite import build_satellite_map
+from sitl.demo.scenario import SatelliteMap
 
 # Raised when generated worlds change, so that old ones are not flown by mistake.
 _GENERATION, _IDEAL_GENERATION = 2, 1
@@ -59,10 +61,12 @@ def prepare(
     size_m: float = 1600.0,
     ideal: bool = False,
     character: Character = "mixed",
+    satellite: SatelliteMap | None = None,
 ) -> FlightAssets:
     """Build what is missing of a world, by the importer that users use; the rest is reused.
 
-    ideal: the map shares geometry and fine texture with what is flown over. progress: told what is
+    ideal: the map shares geometry and fine texture with what is flown over. satellite: the map is
+    such a mosaic of the survey instead. progress: told what is
     being done and the share of it all that is done, 0 to 1; never where nothing is missing.
     """
     generation = _IDEAL_GENERATION if ideal else _GENERATION
@@ -86,6 +90,14 @@ def prepare(
             _import(visit, partial(progress, f"importing the {visit.name} tileset"), number)
         done.touch()
     caches = (home / "survey-cache", home / "live-cache")
+    world = WorldInfo.load(survey)
+    if satellite is not None:
+        caches = (home / f"{satellite.name}-cache", caches[1])
+        if not caches[0].exists():
+            painting = "painting the satellite map"
+            build_satellite_map(
+                world, home / "survey-cache", satellite, caches[0], partial(progress, painting)
+            )
     for cache in caches:
         TileCache.open(cache)  # a damaged cache is named before the flight, not in it
-    return FlightAssets(WorldInfo.load(survey), *caches)
+    return FlightAssets(world, *caches)

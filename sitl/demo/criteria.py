@@ -35,13 +35,15 @@ class Criterion:
 @dataclass(frozen=True)
 class FlightFigures:
     """What is judged of a flight. ekf_m: horizontal, in the map's frame; fixed_m: 3-D errors of
-    targets that stand; inside: per cent of fixes within their own 95 % bound.
+    targets that stand; inside, inside_level: per cent of fixes within their own 95 % bound, and
+    within their protection level.
     """
 
     localizer: LocalizationMetrics
     ekf_m: Spread
     fixed_m: Spread
     inside: float | None
+    inside_level: float | None
 
 
 def judge(flight: FlightFigures) -> tuple[Criterion, ...]:
@@ -55,6 +57,7 @@ def judge(flight: FlightFigures) -> tuple[Criterion, ...]:
         Criterion("EKF horizontal p95", flight.ekf_m.p95, 0.6, "m"),
         Criterion("fixed targets p95", flight.fixed_m.p95, 3.0, "m"),
         Criterion("fixes in their bound", flight.inside, 95.0, "%", at_least=True),
+        Criterion("fixes in their level", flight.inside_level, 99.9, "%", at_least=True),
     )
 
 

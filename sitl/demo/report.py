@@ -32,6 +32,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.inspection.kind import map_kind
 from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Undistorter
@@ -40,9 +41,9 @@ from sitl.camera.detector import FixedPoint
 from sitl.demo.analysis import (
     FrameErrors,
     Spread,
+    bound_figures,
     ekf_errors,
     frame_errors,
-    inside_bounds,
     localization_summary,
     stage_latencies,
     target_errors,
@@ -71,9 +72,10 @@ class FlightReport:
     errors; completeness_sent: per cent of all frames that the camera sent in the span with an
     accepted estimate. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
     against where GNSS would have it; the map lies map_shift_m beside GNSS. inside_bound: per cent
-    of fixes within their own 95 % ellipse. targets: name to 3-D error, in the map's frame. warning:
-    of late estimates. won: the flight in one line; broken: why it was not flown to its end; slow:
-    what the computer did not keep up with.
+    of fixes within their own 95 % ellipse; inside_level: within their protection level, of which
+    protection_m are the horizontal ones. map_kind: what the map can show. targets: name to 3-D
+    error, in the map's frame. warning: of late estimates. won: the flight in one line; broken: why
+    it was not flown to its end; slow: what the computer did not keep up with.
     """
 
     won: str
@@ -91,6 +93,9 @@ class FlightReport:
     ekf_in_map_m: Spread
     map_shift_m: tuple[float, float, float]
     inside_bound: float | None
+    inside_level: float | None
+    protection_m: Spread
+    map_kind: str
     ekf_vertical_m: Spread
     home_error_m: float
     fixed_targets_m: Spread
@@ -149,8 +154,10 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
     config = load_config(folder / "companion.yaml")
     summary = localization_summary(errors)
     fixed_targets = Spread.of(np.concatenate([*fixed, np.empty(0)]))
-    inside = inside_bounds(truth, estimates, span)
-    judged = FlightFigures(summary, Spread.of(horizontal), fixed_targets, inside)
+    bounds = bound_figures(truth, estimates, span)
+    judged = FlightFigures(
+        summary, Spread.of(horizontal), fixed_targets, bounds.inside_bound, bounds.inside_level
+    )
     denied_s = (span[1] - span[0]) * 1e-9
     stages = stage_latencies(estimates, span) if estimates else {}
     latency = stages.get("latency", Spread(None, None, None))
@@ -171,7 +178,10 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
         ekf_horizontal_m=Spread.of(absolute),
         ekf_in_map_m=judged.ekf_m,
         map_shift_m=shift_m,
-        inside_bound=inside,
+        inside_bound=bounds.inside_bound,
+        inside_level=bounds.inside_level,
+        protection_m=bounds.level_m,
+        map_kind=map_kind(TileCache.open(config.map)).line(),
         ekf_vertical_m=Spread.of(vertical),
         home_error_m=record.home_error_m,
         fixed_targets_m=fixed_targets,
@@ -373,6 +383,9 @@ def print_report(report: FlightReport, folder: Path) -> None:
     add_spread(table, "localizer 3-D, m", report.localizer_m,
          f"R@1/3/5 {m.recall_1:.1f}/{m.recall_3:.1f}/{m.recall_5:.1f} %")  # fmt: skip
     add_spread(table, "localizer horizontal, m", report.localizer_horizontal_m, "")
+    add_spread(table, "protection level, m", report.protection_m,
+         f"{_figure(report.inside_level, 1)} % of fixes inside, "
+         f"{_figure(report.inside_bound, 1)} % inside their 95 % bound")  # fmt: skip
     add_spread(table, "localizer rotation, °", report.localizer_deg,
          f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
          )  # fmt: skip
@@ -392,6 +405,7 @@ def print_report(report: FlightReport, folder: Path) -> None:
     for name, spread in report.targets_m.items():
         add_spread(table, f"  {name}, m", spread, f"{report.target_fixes[name]} fixes")
     console.print(table)
+    console.print(f"map: {report.map_kind}", highlight=False)
     stages = Table(title=f"{m.fps:.1f} localized frames/s, {report.frames_dropped} of "
                          f"{report.frames_sent} frames dropped")  # fmt: skip
     stages.add_column("stage while GNSS was denied, ms")

@@ -111,6 +111,23 @@ class CameraSpec(_Model):
         )  # fmt: skip
 
 
+class SatelliteMap(_Model):
+    """A mosaic instead of the survey: seen from `azimuth_deg` (clockwise from north) at an angle
+    from nadir, over bare terrain.
+    """
+
+    off_nadir_deg: float = Field(12.0, ge=0, le=45)
+    azimuth_deg: float = Field(180.0, ge=0, lt=360)
+    texel_m: float = Field(0.25, ge=0.1, le=5)
+    blur_px: float = Field(1.3, ge=0, le=20, description="sigma of the mosaic's blur")
+
+    @property
+    def name(self) -> str:
+        """Of its cache's folder."""
+        numbers = (self.off_nadir_deg, self.azimuth_deg, self.texel_m, self.blur_px)
+        return "satellite-" + "-".join(f"{number:g}" for number in numbers)
+
+
 _LEGS = (
     ScenarioLeg(east_m=0, north_m=220, height_m=120, gimbal_pitch_deg=-75),
     ScenarioLeg(east_m=220, north_m=260, height_m=140, gimbal_pitch_deg=-60),
@@ -133,6 +150,9 @@ class Scenario(_Model):
     world: Character = "mixed"
     world_m: float = Field(
         1600.0, ge=400, le=8000, multiple_of=400, description="side of the world"
+    )
+    satellite: SatelliteMap | None = Field(
+        None, description="the map is a satellite's mosaic; none: a survey's surface"
     )
     camera: CameraSpec = CameraSpec()
     errors: ErrorSpec = ErrorSpec()

@@ -26,16 +26,14 @@ def flight_command(
     map_cache: Annotated[
         Path | None, typer.Option("--map", help="instead of the record's map")
     ] = None,
-    frames: Annotated[int, typer.Option(min=20, max=2000, help="pictures read at most")] = 200,
+    frames: Annotated[int, typer.Option(min=20, max=2000, help="largest number of frames")] = 200,
     config: Annotated[
         Path | None, typer.Option(help="deployment file that the record was flown with")
     ] = None,
-    write: Annotated[
-        bool, typer.Option(help="change that file; the old one is kept beside it")
-    ] = False,
+    write: Annotated[bool, typer.Option(help="change that file and keep the old one")] = False,
     report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
 ) -> None:
-    """Camera, boresight, lever arm, times and map shift from a shadow flight with pictures."""
+    """Estimate camera, boresight, lever arm, time offset and map offset from a shadow flight."""
     from companion.calibrate.flight import calibrate
     from companion.calibrate.proposal import (
         blind_spots,
@@ -133,12 +131,12 @@ def board_command(
     ] = None,
     paper: Annotated[Literal["a4", "a3", "letter"], typer.Option(help="of the board")] = "a4",
     seconds: Annotated[
-        float, typer.Option(min=1, max=3600, help="of a stream, at the most")
+        float, typer.Option(min=1, max=3600, help="longest time of a stream")
     ] = 180.0,
-    config: Annotated[Path | None, typer.Option(help="deployment file that is changed")] = None,
-    keep: Annotated[Path | None, typer.Option(help="folder for the views that were taken")] = None,
+    config: Annotated[Path | None, typer.Option(help="deployment file to change")] = None,
+    keep: Annotated[Path | None, typer.Option(help="folder for the used views")] = None,
 ) -> None:
-    """The camera's model from views of a printed board, with what is still missing told."""
+    """Calibrate a camera from views of a printed board; names the views that are missing."""
     from companion.calibrate.board import write_sheet
 
     console = Console()

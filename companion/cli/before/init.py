@@ -35,7 +35,10 @@ def init_command(
         Path | None, typer.Option(help="camera.json of the calibration; else --fov")
     ] = None,
     fov: Annotated[
-        float | None, typer.Option(min=1, max=170, help="horizontal, degrees: not calibrated")
+        float | None,
+        typer.Option(
+            min=1, max=170, help="horizontal field of view, degrees, without a calibration"
+        ),
     ] = None,
     mount: Annotated[
         Literal["gimbal", "fixed"] | None, typer.Option(help="fixed: screwed to the airframe")
@@ -45,14 +48,14 @@ def init_command(
     ] = -90.0,
     record: Annotated[Path, typer.Option(help="folder of the flights' records")] = Path("flights"),
     listen: Annotated[
-        bool, typer.Option(help="ask vehicle and stream; else only what is given is written")
+        bool, typer.Option(help="read vehicle and stream; otherwise write only what is given")
     ] = True,
-    overwrite: Annotated[bool, typer.Option(help="replace a file that is there")] = False,
+    overwrite: Annotated[bool, typer.Option(help="replace an existing file")] = False,
     reference: Annotated[
-        bool, typer.Option("--reference", help="print every setting with its default, no more")
+        bool, typer.Option("--reference", help="print every setting with its default and exit")
     ] = False,
 ) -> None:
-    """Ask for map, stream and vehicle, ask these themselves, and write a short deployment file."""
+    """Ask for map, stream and vehicle, read their settings, and write a short deployment file."""
     from companion.setup.reference import reference as all_settings
     from companion.setup.write import deployment_text, write_deployment
 

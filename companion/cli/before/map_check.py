@@ -21,21 +21,22 @@ _COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
 
 def check_command(
     cache: Annotated[Path, typer.Argument(help="folder of a tile cache")],
-    out: Annotated[Path, typer.Option(help="folder of the pictures")] = Path("map-check"),
+    out: Annotated[Path, typer.Option(help="folder of the images")] = Path("map-check"),
     height: Annotated[
-        float, typer.Option(min=5, max=5000, help="of the mission above the ground, m")
+        float, typer.Option(min=5, max=5000, help="mission height above the ground, m")
     ] = 120.0,
     config: Annotated[
         Path | None, typer.Option(help="deployment YAML: its camera and working width")
     ] = None,
     fov: Annotated[
-        float, typer.Option(min=1, max=170, help="horizontal, degrees, without a deployment")
+        float,
+        typer.Option(min=1, max=170, help="horizontal field of view without a deployment, degrees"),
     ] = 65.0,
     width: Annotated[
         int, typer.Option(min=64, max=2048, help="working width, without a deployment")
     ] = 320,
 ) -> None:
-    """Heights, coverage, holes, texels, detail, date, seams, shift: exit code 1 if one is bad."""
+    """Check heights, coverage, holes, texels, detail, seams and shift. Exit code 1: one is bad."""
     from companion.config import load_config
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.check import Use, check_map

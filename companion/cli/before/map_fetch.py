@@ -34,7 +34,7 @@ Sources = Annotated[
 ]
 
 HeightProperty = Annotated[
-    str | None, typer.Option(help="of a GeoJSON's features; none: height and its usual spellings")
+    str | None, typer.Option(help="GeoJSON property; default: height and its usual spellings")
 ]
 
 
@@ -56,24 +56,24 @@ def fetch_command(
         str | None, typer.Option(help="LATITUDE,LONGITUDE,RADIUS: degrees and metres")
     ] = None,
     mission: Annotated[
-        Path | None, typer.Option(help=".plan or .waypoints; with --margin about its places")
+        Path | None, typer.Option(help=".plan or .waypoints, with --margin around it")
     ] = None,
     margin: Annotated[
-        float, typer.Option(min=10, max=20_000, help="about a mission's places, m")
+        float, typer.Option(min=10, max=20_000, help="margin around a mission, m")
     ] = 400.0,
-    imagery: Annotated[str | None, typer.Option(help="source; none: the finest there")] = None,
+    imagery: Annotated[str | None, typer.Option(help="source; default: the finest")] = None,
     heights: Annotated[
-        str | None, typer.Option(help="source; none: the finest there, GLO-30 if no other")
+        str | None, typer.Option(help="source; default: the finest, GLO-30 if there is no other")
     ] = None,
     sources: Sources = None,
     resolution: Annotated[
-        float, typer.Option(min=0.02, max=100, help="of the imagery, m; not finer than its own")
+        float, typer.Option(min=0.02, max=100, help="imagery resolution, m; not finer than its own")
     ] = _FINEST_M,
     most_mb: Annotated[
-        float, typer.Option(min=0.1, max=100_000, help="that may come, of both together")
+        float, typer.Option(min=0.1, max=100_000, help="largest download, MB")
     ] = 2000.0,
     only_estimate: Annotated[
-        bool, typer.Option("--estimate", help="say what it would take, and end")
+        bool, typer.Option("--estimate", help="print the estimate and exit")
     ] = False,
     footprints: Annotated[
         Path | None,
@@ -81,15 +81,15 @@ def fetch_command(
     ] = None,
     height_property: HeightProperty = None,
     footprints_attribution: Annotated[
-        str | None, typer.Option(help="whose the footprints are, where their file does not say")
+        str | None, typer.Option(help="attribution of the footprints if their file has none")
     ] = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="keep the fetched GeoTIFFs beside the cache")
     ] = False,
-    overwrite: Annotated[bool, typer.Option(help="replace a cache that is there")] = False,
+    overwrite: Annotated[bool, typer.Option(help="replace an existing cache")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="processes of the import")] = None,
 ) -> None:
-    """Fetch orthophoto and heights, and make a verified cache; goes on where it was cut off."""
+    """Fetch orthophoto and heights and make a verified cache; continues an interrupted run."""
     from localizer.map.fetch.catalogue import choose, load_sources
 
     area = _area(rectangle, circle, mission, margin)
@@ -138,7 +138,7 @@ def raise_command(
     out: Annotated[Path, typer.Option(help="GeoTIFF of the surface to write")],
     height_property: HeightProperty = None,
 ) -> None:
-    """Raise buildings on a terrain by their footprints: a surface for `map build`."""
+    """Raise buildings on a terrain from footprints: a surface for `map build`."""
     from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
 
     with shown_work(Console(stderr=True), "raising buildings"):
@@ -148,9 +148,9 @@ def raise_command(
 
 def sources_command(
     sources: Sources = None,
-    keys: Annotated[bool, typer.Option("--keys", help="what a source's entry may say")] = False,
+    keys: Annotated[bool, typer.Option("--keys", help="keys of a source's entry")] = False,
 ) -> None:
-    """The map services that `map fetch` knows, their licences and whom to name."""
+    """List the map services of `map fetch`, licences and attributions."""
     from localizer.map.fetch.catalogue import CatalogueSource, load_sources
 
     console = Console()

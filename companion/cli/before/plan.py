@@ -25,7 +25,7 @@ def plan_command(
     ],
     config: Annotated[Path, typer.Option(help="deployment YAML: camera, mount, localizer")],
     map_cache: Annotated[
-        Path | None, typer.Option("--map", help="tile cache; else the deployment's")
+        Path | None, typer.Option("--map", help="tile cache; default: the deployment's")
     ] = None,
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("plan"),
     condition: Annotated[
@@ -33,22 +33,20 @@ def plan_command(
         typer.Option(help="day, season, dusk, night, fog, rain or snow; may be repeated (day)"),
     ] = None,
     sigma: Annotated[
-        float, typer.Option(min=0.05, max=100, help="position sigma that will do, m")
+        float, typer.Option(min=0.05, max=100, help="largest acceptable position sigma, m")
     ] = 1.0,
     spacing: Annotated[
-        float, typer.Option(min=2, max=1000, help="between the places looked at, m")
+        float, typer.Option(min=2, max=1000, help="distance between the forecast positions, m")
     ] = 25.0,
     speed: Annotated[
-        float, typer.Option(min=0.1, max=100, help="where the mission does not say, m/s")
+        float, typer.Option(min=0.1, max=100, help="speed if the mission has none, m/s")
     ] = 10.0,
     pitch: Annotated[
-        float, typer.Option(min=-90, max=0, help="of the gimbal where the mission does not say")
+        float, typer.Option(min=-90, max=0, help="gimbal pitch if the mission has none")
     ] = -75.0,
-    alternatives: Annotated[
-        bool, typer.Option(help="look for what would do instead on legs that will not do")
-    ] = True,
+    alternatives: Annotated[bool, typer.Option(help="search alternatives for failing legs")] = True,
 ) -> None:
-    """Forecast a mission over its map: exit code 1 if vision will not do, or not all was judged."""
+    """Forecast a mission over its map. Exit code 1: a leg fails, or not all was judged."""
     from companion.planning import page, pictures
     from companion.planning.judge import MissionLimits
     from companion.planning.mission import read_mission

@@ -38,11 +38,10 @@ def build_cache(
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
-    An interrupted build goes on where it stopped.
+    An interrupted build continues.
 
-    source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder that
-    holds one of these. progress: told the number of imported tiles and of all, at the start and
-    after each.
+    source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder with
+    one of these. progress: called with the number of imported tiles and of all tiles.
     """
     options = options or BuildOptions()
     given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]

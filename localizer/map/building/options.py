@@ -14,26 +14,23 @@ from localizer.map.source import VerticalDatum
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """How a source becomes a cache; None stands for what the source itself says.
+    """Options of an import. None: as the source states.
 
-    geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
-    above the geoid), else the source's own, else EGM96's. vertical_datum: what the source's heights
-    are; "amsl" ones are lifted by the separation; needed unless the source's format or CRS says it.
+    geoid_separation_m: geoid above the ellipsoid; None: the source's, otherwise EGM96's.
+    vertical_datum: datum of the source's heights, needed if neither format nor CRS states it;
+    "amsl" heights are lifted by the separation.
 
     georeference: of a mesh, see `read_georeference`. up_axis: of a mesh or a tileset's content,
-    whatever it says, see `mesh_tree` and `read_tileset`. height_unit, nodata: of a DSM, see
-    `read_rasters`. origin: of the world frame, else the source's centre. attribution: whose data it
-    is; imagery_date: of its pictures, as 2024, 2024-06 or 2024-06-30; sensor: that took them;
-    heights: what they hold, else measured (`MapKind`).
+    whatever the source states. height_unit, nodata: of a DSM, see `read_rasters`. origin: of the world frame; None: the source's centre.
+    imagery_date: 2024, 2024-06 or 2024-06-30. sensor: of the imagery. heights: what they contain;
+    None: measured (`MapKind`).
 
-    skip_bad_tiles: leave out tiles that cannot be imported (their parents are shown there) instead
-    of failing. overwrite: replace a cache of another source or of other options. rules: what a
-    source may ask for, and which doubts about it are meant.
+    skip_bad_tiles: skip tiles that cannot be imported; their parents are shown. overwrite: replace
+    a cache of another source or other options. rules: limits, and accepted doubts.
 
-    workers: processes, else one per core; more than one needs the usual
-    ``if __name__ == "__main__"`` guard in a script. apart: read the source in processes with limits
-    of memory and time, else unless workers is 1. scheduler: address of a Dask scheduler whose
-    workers share the file system, instead of local processes.
+    workers: processes; None: one per core. More than one needs the ``if __name__ == "__main__"``
+    guard. apart: read the source in processes with memory and time limits; None: unless workers
+    is 1. scheduler: address of a Dask scheduler whose workers share the file system.
     """
 
     geoid_separation_m: float | None = None

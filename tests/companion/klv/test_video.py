@@ -19,7 +19,7 @@ import pytest
 from stanag4609.st0601 import decode_uas_local_set
 
 from companion.config import CompanionConfig, KlvConfig, RecordConfig
-from companion.errors import RecordError
+from companion.errors import RecordError, StreamOpenError
 from companion.flight.recorder import RecordKeeper
 from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.relay import KlvRelay
@@ -256,6 +256,19 @@ def _rows(folder):
         for row in csv.DictReader(file):
             names = ("latitude_deg", "longitude_deg", "height_m")
             yield int(row["exposure_time_ns"]), {name: float(row[name]) for name in names}
+
+
+def test_a_raw_video_without_times_is_named(flown, tmp_path):
+    folder, *_ = flown
+    write_video(tmp_path / "in.ts", 3, [0, 0, 0])
+    with av.open(str(tmp_path / "in.ts")) as source, av.open(str(tmp_path / "in.h264"), "w") as raw:
+        stream = raw.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                raw.mux(packet)
+    with pytest.raises(StreamOpenError, match="ffmpeg -r RATE"):
+        describe_recording(tmp_path / "in.h264", folder, tmp_path / "out.ts", begin_s=0.0)
 
 
 def test_a_video_of_another_flight_is_told_and_leaves_no_file(flown, tmp_path):

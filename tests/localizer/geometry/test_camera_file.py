@@ -126,6 +126,9 @@ def test_another_lens_is_refused_by_name(change, message):
 
 def test_one_camera_is_read_of_one_file(tmp_path):
     path = tmp_path / "cameras.txt"
+    path.write_text("<?xml version='1.0'?><calibration><projection>frame</projection>")
+    with pytest.raises(CameraError, match="it is XML; export OpenCV's YAML"):
+        Camera.from_json(path)
     path.write_text("1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 64 48 50 50 32 24\n")
     with pytest.raises(CameraError, match="2 cameras; leave one line"):
         Camera.from_json(path)

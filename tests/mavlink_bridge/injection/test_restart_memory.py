@@ -28,11 +28,12 @@ from mavlink_bridge.link.link import sleep_until
 _CHILD = """
 import sys, time
 from pathlib import Path
-from mavlink_bridge.config import RcGateConfig
-from mavlink_bridge.injection.restart_memory import GateMemory, RestartMemory
-from mavlink_bridge.injection.injection_enable import InjectionGate
+from mavlink_bridge.config import InjectionEnableConfig
+from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 path = Path(sys.argv[1])
-gate = InjectionGate(RcGateConfig(), lambda _: None, GateMemory(RestartMemory(path)))
+memory = InjectionEnableMemory(RestartMemory(path))
+gate = InjectionEnable(InjectionEnableConfig(), lambda _: None, memory)
 if sys.argv[2] == "command":
     gate.command(31010, 1.0)
 else:

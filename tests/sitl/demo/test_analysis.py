@@ -5,6 +5,7 @@ from companion.offline.tables import read_columns
 from localizer.geometry.pose import Pose, quaternion_from_matrix, so3_exp
 from sitl.demo.analysis import (
     Spread,
+    bound_figures,
     ekf_errors,
     frame_errors,
     localization_summary,
@@ -49,6 +50,21 @@ def test_frames_outside_the_span_do_not_count():
     truth = _columns([_pose(0.0), _pose(1.0)], [0, 10**9])
     estimates = _columns([_pose(0.0), _pose(1.0)], [0, 10**9], accepted=np.array([1, 1]))
     assert len(frame_errors(truth, estimates, (5, 2 * 10**9)).time_ns) == 1
+
+
+def test_fixes_are_counted_against_their_bound_and_their_protection_level():
+    times = [k * 10**8 for k in range(5)]
+    truth = _columns([_pose(0.0)] * 5, times)
+    wrong_m = [0.5, 1.0, 3.0, 9.0, 9.0]  # 2.45 sigmas are the ellipse; the last is not accepted
+    estimates = _columns(
+        [_pose(x) for x in wrong_m], times, accepted=np.array([1, 1, 1, 1, 0]),
+        sigma_east_m=np.full(5, 1.0), sigma_north_m=np.full(5, 1.0),
+        hpl_m=np.array([2.0, 2.0, 4.0, 4.0, 1.0]),
+    )  # fmt: skip
+    found = bound_figures(truth, estimates, (0, 10**9))
+    assert (found.inside_bound, found.inside_level) == (50.0, 75.0)
+    assert found.level_m.median == 3.0
+    assert bound_figures(truth, {}, (0, 10**9)).inside_level is None
 
 
 def test_no_estimate_at_all_counts_as_dropped():

@@ -8,9 +8,9 @@ from sitl.demo.criteria import ComputingRates, FlightFigures, headline, judge, l
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
 
-def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0):
+def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0, level=100.0):
     metrics = LocalizationMetrics(**(GOOD.to_dict() | (localizer or {})))
-    return FlightFigures(metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside)
+    return FlightFigures(metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside, level)
 
 
 def _missed(**changes):
@@ -30,6 +30,8 @@ def _missed(**changes):
         ({"fixed": None}, ["fixed targets p95"]),
         ({"inside": 94.9}, ["fixes in their bound"]),
         ({"inside": None}, ["fixes in their bound"]),
+        ({"level": 99.8}, ["fixes in their level"]),
+        ({"level": None}, ["fixes in their level"]),
     ],
 )
 def test_each_target_is_missed_for_its_own_reason(changes, missed):

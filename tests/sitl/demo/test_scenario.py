@@ -91,5 +91,5 @@ def test_every_number_has_its_bounds():
 
 @pytest.mark.parametrize("distortion", [(9.0, 0, 0, 0, 0), (0, 0, -1e300, 0, 0)])
 def test_a_distortion_that_is_no_lens_is_named(distortion):
-    with pytest.raises(ValueError, match="the distortion moves a corner"):
+    with pytest.raises(ValueError, match=r"the distortion (cannot be undone|bends)|optical axis"):
         CameraSpec(distortion=distortion)

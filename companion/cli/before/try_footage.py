@@ -1,0 +1,108 @@
+"""``companion try``: will vision work at this place? Answered from footage, without hardware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from companion.terminal.links import file_link
+from companion.terminal.steps import COMPILES, shown_count, shown_steps
+from companion.writing import made_folder
+
+if TYPE_CHECKING:
+    from companion.recorded.flight import RecordedFlight
+
+
+def try_command(
+    footage: Annotated[Path, typer.Argument(help="a photo, a folder of photos, or a video")],
+    map_cache: Annotated[
+        Path | None, typer.Option("--map", help="tile cache made by `companion map build`")
+    ] = None,
+    report: Annotated[Path, typer.Option(help="folder of the report")] = Path("try-report"),
+    places: Annotated[
+        Path | None, typer.Option(help="CSV or text with the photos' places; else found beside")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="ArduPilot .bin or .tlog of the flight; else found beside")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.json; else the footage's own tags")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
+    ] = None,
+    mount_pitch: Annotated[
+        float, typer.Option(min=-180, max=180, help="of a camera on the airframe; -90 looks down")
+    ] = -90.0,
+    frames: Annotated[int, typer.Option(min=1, max=2000, help="that are used, at most")] = 100,
+    searches: Annotated[
+        int, typer.Option(min=0, max=2000, help="frames that are searched without their place")
+    ] = 20,
+    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
+) -> None:
+    """Try recorded footage over a map: verdict, report and deployment file.
+
+    Exit code 0: vision works there; 1: it does not, or there is no map.
+    """
+    from companion.recorded.footage import FootageOptions, read_footage
+
+    made_folder(report, "--report")
+    console = Console(stderr=True)
+    options = FootageOptions(report, frames, places, log, camera, fov, mount_pitch)
+    with shown_count(console, "reading footage") as count:
+        flight = read_footage(footage, options, count)
+    if map_cache is None:
+        _tell_map(flight)
+        raise typer.Exit(1)
+    _try(flight, map_cache, report, width, searches)
+
+
+def _tell_map(flight: RecordedFlight) -> None:
+    from companion.trial.wanted_map import wanted_map
+
+    wanted = wanted_map(flight)
+    out = Console()
+    _tell_notes(flight.notes)
+    out.print(
+        f"{len(flight.frames)} frames, {flight.located} with a position; no map is given. "
+        f"{wanted.sentence}.",
+        soft_wrap=True, highlight=False,
+    )  # fmt: skip
+    out.print(f"Where open data exist: {wanted.command('area')}", soft_wrap=True, highlight=False)
+
+
+def _tell_notes(notes: tuple[str, ...]) -> None:
+    for note in notes:
+        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
+
+
+def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, searches: int) -> None:
+    from companion.trial.deployment import write_trial_deployment
+    from companion.trial.page import write_trial
+    from companion.trial.result import judge
+    from companion.trial.run import TrialOptions, run_trial
+    from localizer.map.cache.cache import TileCache
+
+    TileCache.open(map_cache)  # what is missing is said before anything is computed
+    console = Console(stderr=True)
+
+    def stage(what: str) -> AbstractContextManager[Callable[..., None]]:
+        return shown_count(console, what, begins=COMPILES if what == "localizing" else "begun")
+
+    trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
+    judgement = judge(trial)
+    _tell_notes(trial.notes)
+    with shown_steps(console) as say:
+        page = write_trial(report, trial, judgement, map_cache, say)
+    deployment = write_trial_deployment(report / "deployment.yaml", trial, map_cache)
+    out = Console()
+    out.print(judgement.sentence, style="bold", soft_wrap=True, highlight=False)
+    out.print("deployment file:", str(deployment), soft_wrap=True, highlight=False)
+    out.print("report:", file_link(page), soft_wrap=True, highlight=False)
+    raise typer.Exit(judgement.exit_code)

@@ -1,0 +1,1 @@
+"""Flights as they were recorded, by whatever program: frames, telemetry and camera in one form."""

@@ -1,0 +1,216 @@
+"""The one form in which recorded flights are used: `RecordedFlight`.
+
+Angles are those of a gimbal against north and the horizon: Rz(yaw) Ry(pitch) Rx(roll) from NED,
+pitch -90 looks down, yaw from true north clockwise. `None` means that nothing was recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from companion.geometry import GIMBAL_FROM_CAMERA
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, matrix_from_euler, so3_exp, so3_log
+
+Kind = Literal["photos", "video", "sequence"]
+
+
+class Datum(Enum):
+    """What a height is above."""
+
+    ELLIPSOID = "WGS84 ellipsoid"
+    AMSL = "mean sea level"
+    TAKEOFF = "take-off point"
+
+
+@dataclass(frozen=True)
+class Height:
+    """One recorded height, metres, with its standard deviation."""
+
+    value_m: float
+    datum: Datum
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class RecordedPosition:
+    """Where the camera was, WGS84 degrees. sigma_m: per horizontal axis. heights: all that were
+    recorded; which one is used depends on the map.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    sigma_m: float
+    heights: tuple[Height, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedView:
+    """Where the camera looked. ned_from_camera: (3, 3), axes OpenCV; heading_sigma_deg: None where
+    the heading is unknown; then the view is of heading 0. measured: whether gimbal or autopilot
+    measured roll and pitch; else they are assumed.
+    """
+
+    ned_from_camera: Array
+    tilt_sigma_deg: float
+    heading_sigma_deg: float | None
+    measured: bool = True
+
+    @classmethod
+    def of_angles(
+        cls,
+        roll_deg: float,
+        pitch_deg: float,
+        yaw_deg: float,
+        tilt_sigma_deg: float,
+        heading_sigma_deg: float | None,
+        *,
+        measured: bool = True,
+    ) -> RecordedView:
+        """From a gimbal's angles against north and the horizon."""
+        angles = (float(a) for a in np.radians([roll_deg, pitch_deg, yaw_deg]))
+        attitude = np.asarray(matrix_from_euler(*angles) @ GIMBAL_FROM_CAMERA)
+        return cls(attitude, tilt_sigma_deg, heading_sigma_deg, measured)
+
+    @property
+    def nadir_angle_deg(self) -> float:
+        """Between the optical axis and straight down."""
+        return float(np.degrees(np.arccos(np.clip(self.ned_from_camera[2, 2], -1.0, 1.0))))
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What was recorded about one moment. time_ns: on the clock of its source, None if not dated.
+
+    course_deg: direction of flight or of the aircraft's nose, from true north; zoom: multiple of
+    the camera's focal length.
+    """
+
+    time_ns: int | None = None
+    position: RecordedPosition | None = None
+    view: RecordedView | None = None
+    course_deg: float | None = None
+    zoom: float = 1.0
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """One image on disk with what was recorded about it. time_ns: exposure, on the footage's own
+    clock; frames without a time are in the order of their names.
+    """
+
+    name: str
+    path: Path
+    time_ns: int | None
+    telemetry: Telemetry
+
+    def with_telemetry(self, telemetry: Telemetry) -> RecordedFrame:
+        """The same image with other telemetry."""
+        return replace(self, telemetry=telemetry)
+
+
+@dataclass(frozen=True)
+class CameraGuess:
+    """A camera model and how far its focal length may be off, one sigma. source: who says so."""
+
+    camera: Camera
+    focal_percent: float
+    source: str
+
+
+@dataclass(frozen=True)
+class RecordedFlight:
+    """Frames in order of time, their telemetry and camera. kind: photos are independent of each
+    other; a sequence has overlapping frames; notes: what was assumed or left out, and why.
+    """
+
+    name: str
+    kind: Kind
+    frames: tuple[RecordedFrame, ...]
+    camera: CameraGuess
+    notes: tuple[str, ...] = ()
+
+    @property
+    def located(self) -> int:
+        """How many frames have a position."""
+        return sum(frame.telemetry.position is not None for frame in self.frames)
+
+
+class Track:
+    """Telemetry over time, interpolated. Samples must be dated; gaps above `gap_s` give None."""
+
+    def __init__(self, samples: Sequence[Telemetry], gap_s: float = 2.5) -> None:
+        dated = sorted((s.time_ns, k) for k, s in enumerate(samples) if s.time_ns is not None)
+        self._samples = tuple(samples[k] for _, k in dated)
+        self._times = np.array([t for t, _ in dated], dtype=np.int64)
+        self._gap_ns = round(1e9 * gap_s)
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @property
+    def times_ns(self) -> np.ndarray:
+        """Ascending times of the samples, int64."""
+        return self._times
+
+    def at(self, time_ns: int) -> Telemetry | None:
+        """Telemetry at a time; None outside the record and in its gaps."""
+        if not len(self._times):
+            return None
+        after = int(np.searchsorted(self._times, time_ns))
+        if after < len(self._times) and self._times[after] == time_ns:
+            return self._samples[after]
+        if after in (0, len(self._times)):
+            near = 0 if after == 0 else after - 1
+            away_ns = abs(int(self._times[near]) - time_ns)
+            return self._samples[near] if away_ns < self._gap_ns // 10 else None
+        begin, end = int(self._times[after - 1]), int(self._times[after])
+        if end - begin > self._gap_ns:
+            return None
+        return _between(
+            self._samples[after - 1],
+            self._samples[after],
+            time_ns,
+            (time_ns - begin) / (end - begin),
+        )
+
+
+def _between(a: Telemetry, b: Telemetry, time_ns: int, share: float) -> Telemetry:
+    nearer = a if share < 0.5 else b
+    position, view = nearer.position, nearer.view
+    if a.position is not None and b.position is not None:
+        position = _position_between(a.position, b.position, share)
+    if a.view is not None and b.view is not None:
+        first, last = a.view.ned_from_camera, b.view.ned_from_camera
+        turn = so3_exp(share * so3_log(last @ first.T))
+        view = replace(nearer.view or a.view, ned_from_camera=turn @ first)
+    course = nearer.course_deg
+    if a.course_deg is not None and b.course_deg is not None:
+        course = _angle_between(a.course_deg, b.course_deg, share)
+    return Telemetry(time_ns, position, view, course, nearer.zoom)
+
+
+def _position_between(a: RecordedPosition, b: RecordedPosition, share: float) -> RecordedPosition:
+    heights = tuple(
+        replace(low, value_m=low.value_m + share * (high.value_m - low.value_m))
+        for low in a.heights
+        for high in b.heights
+        if low.datum is high.datum
+    )
+    turn = (b.longitude_deg - a.longitude_deg + 180.0) % 360.0 - 180.0  # across the antimeridian
+    return RecordedPosition(
+        a.latitude_deg + share * (b.latitude_deg - a.latitude_deg),
+        a.longitude_deg + share * turn,
+        max(a.sigma_m, b.sigma_m),
+        heights,
+    )
+
+
+def _angle_between(a: float, b: float, share: float) -> float:
+    return a + share * ((b - a + 180.0) % 360.0 - 180.0)

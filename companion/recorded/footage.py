@@ -1,0 +1,384 @@
+"""Whatever somebody recorded, as one `RecordedFlight`: photos, a video, telemetry beside them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from companion.errors import FootageError
+from companion.recorded.autopilot_log import LOG_SUFFIXES, LogTrack, read_autopilot_log
+from companion.recorded.cameras import camera_given, camera_of_tags, equivalent_camera
+from companion.recorded.clock import ClockOffset, find_offset
+from companion.recorded.flight import (
+    CameraGuess,
+    RecordedFlight,
+    RecordedFrame,
+    Telemetry,
+    Track,
+)
+from companion.recorded.klv_video import read_klv
+from companion.recorded.photo_tags import (
+    PHOTO_SUFFIXES,
+    RAW_SUFFIXES,
+    PhotoTags,
+    read_photo_tags,
+)
+from companion.recorded.places_file import PLACES_SUFFIXES, is_places_file, read_places
+from companion.recorded.subtitles import Subtitles, read_subtitles
+from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
+from companion.sources.base import fitted_camera
+from companion.sources.folder_source import list_images
+from localizer.geometry.camera import Camera
+from localizer.plain_files import files_of
+
+Progress = Callable[[int, int], None]
+_VIDEO_FOCAL_PERCENT = 5.0  # a video's crop of the sensor is not told
+_KLV_FOCAL_PERCENT = 3.0
+_FOV_FOCAL_PERCENT = 5.0
+_UTC_REACH_S = 3.0  # of clocks that both claim to be UTC
+_DAY_NS = 86_400 * 10**9
+
+
+@dataclass(frozen=True)
+class FootageOptions:
+    """What the user says beside the footage. frames: at most so many are read; places, log: files
+    of telemetry; fov_deg: horizontal; fixed_pitch_deg: of a camera on the airframe, for a log
+    without a gimbal; work: folder for the frames of a video.
+    """
+
+    work: Path
+    frames: int = 100
+    places: Path | None = None
+    log: Path | None = None
+    camera: Path | None = None
+    fov_deg: float | None = None
+    fixed_pitch_deg: float = -90.0
+
+
+def read_footage(
+    path: Path, options: FootageOptions, progress: Progress = lambda _done, _total: None
+) -> RecordedFlight:
+    """Read photos or a video with all telemetry that is in them or beside them.
+
+    `FootageError` says what is missing and which option gives it.
+    """
+    if not path.exists():
+        raise FootageError(f"{path}: no such file or folder")
+    if path.suffix.lower() in RAW_SUFFIXES:
+        raise FootageError(f"{path}: raw photos are not read; give the JPEG of the same shot")
+    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
+        return _read_video(path, options, progress)
+    if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES:
+        return _read_photos(path.parent, [path], options, progress)
+    if path.is_file():
+        raise FootageError(f"{path}: neither a photo ({_list(PHOTO_SUFFIXES)}) nor a video "
+                           f"({_list(VIDEO_SUFFIXES)})")  # fmt: skip
+    return _read_folder(path, options, progress)
+
+
+def _list(suffixes: frozenset[str]) -> str:
+    return ", ".join(sorted(suffixes))
+
+
+def _read_folder(path: Path, options: FootageOptions, progress: Progress) -> RecordedFlight:
+    inner = path / "images"
+    for folder in (path, inner):
+        if not folder.is_dir():
+            continue
+        photos, videos = files_of(folder, PHOTO_SUFFIXES), files_of(folder, VIDEO_SUFFIXES)
+        if photos and videos:
+            raise FootageError(
+                f"{folder}: holds {len(photos)} photos and {len(videos)} videos; give one of the "
+                "videos, or a folder of photos alone"
+            )
+        if len(videos) > 1:
+            raise FootageError(f"{folder}: holds {len(videos)} videos; give one of them")
+        if videos:
+            return _read_video(videos[0], options, progress)
+        if photos:
+            ordered = [f for f in list_images(folder) if f in photos]
+            return _read_photos(path, ordered, options, progress)
+    if files_of(path, RAW_SUFFIXES):
+        raise FootageError(f"{path}: holds raw photos only, which are not read; give JPEGs")
+    raise FootageError(f"{path}: holds no photo and no video")
+
+
+def _read_photos(
+    folder: Path, photos: Sequence[Path], options: FootageOptions, progress: Progress
+) -> RecordedFlight:
+    notes: list[str] = []
+    chosen = _spread(photos, options.frames)
+    if len(chosen) < len(photos):
+        notes.append(f"{len(chosen)} of {len(photos)} photos are used (--frames)")
+    tags = []
+    for number, photo in enumerate(chosen, 1):
+        tags.append(read_photo_tags(photo))
+        progress(number, len(chosen))
+    tags = _of_one_camera(tags, notes)
+    camera = _photo_camera(folder, tags, options)
+    frames = [RecordedFrame(t.path.name, t.path, t.time_ns, t.telemetry()) for t in tags]
+    zero = sum(t.has_zero_view for t in tags)
+    if zero:
+        notes.append(
+            f"{zero} of {len(tags)} photos have gimbal angles that are exactly zero: these are "
+            "taken as not measured"
+        )
+    turned = sum(int(t.exif.get("Orientation") or 1) not in (0, 1) for t in tags)
+    if turned:
+        notes.append(f"{turned} photos are marked as rotated; they are used as the sensor saw them")
+    frames = _with_places(frames, _places_file(folder, tags, options), notes)
+    frames.sort(key=lambda f: f.time_ns if f.time_ns is not None else 0)
+    log = _log_file(folder, options)
+    if log is not None:
+        frames = _with_log(frames, camera.camera, log, options, notes, utc=True)
+    return _flight(folder, "photos", frames, camera, notes)
+
+
+def _flight(
+    path: Path, kind: str, frames: Sequence[RecordedFrame], camera: CameraGuess, notes: list[str]
+) -> RecordedFlight:
+    missing = sum(f.telemetry.position is None for f in frames)
+    if missing:
+        notes.append(f"{missing} of {len(frames)} frames have no position")
+    kinds = {"photos": "photos", "video": "video"}
+    return RecordedFlight(
+        path.name, "video" if kinds[kind] == "video" else "photos", tuple(frames), camera,
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _spread(items: Sequence[Path], most: int) -> list[Path]:
+    picked = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
+    return [items[int(k)] for k in picked]
+
+
+def _of_one_camera(tags: Sequence[PhotoTags], notes: list[str]) -> list[PhotoTags]:
+    """The photos of the camera that took most of them: lenses of one drone differ."""
+    sizes = Counter((t.model, t.width, t.height) for t in tags)
+    (model, width, height), count = sizes.most_common(1)[0]
+    if count < len(tags):
+        notes.append(
+            f"{len(tags) - count} photos of another camera or size are left out; those of "
+            f"{model or 'one camera'} at {width}x{height} are used"
+        )
+    return [t for t in tags if (t.model, t.width, t.height) == (model, width, height)]
+
+
+def _photo_camera(folder: Path, tags: Sequence[PhotoTags], options: FootageOptions) -> CameraGuess:
+    given = _given_camera(folder, tags[0].width, tags[0].height, options)
+    return given if given is not None else camera_of_tags(tags[0])
+
+
+def _given_camera(
+    folder: Path, width: int, height: int, options: FootageOptions
+) -> CameraGuess | None:
+    """By --camera, --fov or a camera.json beside the footage."""
+    if options.fov_deg is not None:
+        camera = Camera.from_fov(width, height, options.fov_deg)
+        return CameraGuess(camera, _FOV_FOCAL_PERCENT, "--fov")
+    file = options.camera or folder / "camera.json"
+    if options.camera is None and not file.is_file():
+        return None
+    camera = fitted_camera(width, height, Camera.from_json(file), str(file))
+    return camera_given(camera, file.name)
+
+
+def _places_file(folder: Path, tags: Sequence[PhotoTags], options: FootageOptions) -> Path | None:
+    if options.places is not None:
+        return options.places
+    names = {t.path.name for t in tags} | {t.path.stem for t in tags}
+    candidates = [
+        f
+        for f in files_of(folder, PLACES_SUFFIXES)
+        if is_places_file(f) and names & read_places(f).keys()
+    ]
+    if len(candidates) > 1:
+        told = ", ".join(f.name for f in candidates)
+        raise FootageError(f"{folder}: several files hold places of the photos: {told}; choose one "
+                           "by --places")  # fmt: skip
+    return candidates[0] if candidates else None
+
+
+def _with_places(
+    frames: Sequence[RecordedFrame], file: Path | None, notes: list[str]
+) -> list[RecordedFrame]:
+    """What the file says takes precedence over the tags."""
+    if file is None:
+        return list(frames)
+    places = read_places(file)
+    found = 0
+    told = []
+    for frame in frames:
+        said = places.get(frame.name) or places.get(Path(frame.name).stem)
+        if said is None:
+            told.append(frame)
+            continue
+        found += 1
+        own = frame.telemetry
+        merged = replace(
+            own, position=said.position, view=said.view or own.view,
+            course_deg=said.course_deg if said.course_deg is not None else own.course_deg,
+        )  # fmt: skip
+        time_ns = said.time_ns if said.time_ns is not None else frame.time_ns
+        told.append(replace(frame, telemetry=merged, time_ns=time_ns))
+    if not found:
+        raise FootageError(f"{file}: names none of the photos; first photo: {frames[0].name}")
+    notes.append(f"places of {found} of {len(frames)} photos are read from {file.name}")
+    return told
+
+
+def _log_file(folder: Path, options: FootageOptions) -> Path | None:
+    if options.log is not None:
+        return options.log
+    logs = files_of(folder, LOG_SUFFIXES)
+    if len(logs) > 1:
+        raise FootageError(f"{folder}: holds {len(logs)} logs; choose one by --log")
+    return logs[0] if logs else None
+
+
+def _with_log(
+    frames: Sequence[RecordedFrame], camera: Camera, file: Path, options: FootageOptions,
+    notes: list[str], *, utc: bool,
+) -> list[RecordedFrame]:  # fmt: skip
+    """Telemetry from the log, at the images' times plus the clocks' offset."""
+    log = read_autopilot_log(file, options.fixed_pitch_deg)
+    notes.extend(log.notes)
+    if any(f.time_ns is None for f in frames):
+        raise FootageError(
+            f"{file}: the images have no times, so the log cannot be laid beside them; give "
+            "--places FILE with a column utc"
+        )
+    reach = _reach_s(frames, log, file, utc=utc)
+    found = find_offset(frames, camera, log.track, reach)
+    offset_s = _offset(found, file, notes, utc=utc)
+    moved = []
+    for frame in frames:
+        time_ns = (frame.time_ns or 0) + round(1e9 * offset_s)
+        said = log.track.at(time_ns)
+        moved.append(frame.with_telemetry(said) if said is not None else frame)
+    return moved
+
+
+def _reach_s(
+    frames: Sequence[RecordedFrame], log: LogTrack, file: Path, *, utc: bool
+) -> tuple[float, float]:
+    """Offsets, s, that are looked for. `FootageError` for a log of another time."""
+    times = [f.time_ns for f in frames if f.time_ns is not None]
+    begin, end = int(log.track.times_ns[0]), int(log.track.times_ns[-1])
+    if utc and times[0] <= end and times[-1] >= begin:
+        return -_UTC_REACH_S, _UTC_REACH_S
+    if utc:
+        # A camera's clock is of its own time zone: whole quarters of an hour are looked at.
+        apart_s = (0.5 * (begin + end) - 0.5 * (times[0] + times[-1])) / 1e9
+        hours = round(apart_s / 900.0) * 900.0
+        if abs(apart_s) > _DAY_NS / 1e9:
+            raise FootageError(
+                f"{file}: is of another day than the images, {apart_s / 86400.0:+.1f} days away"
+            )
+        half_s = 0.5 * (end - begin) / 1e9
+        return hours - half_s - 60.0, hours + half_s + 60.0
+    return (begin - times[0]) / 1e9, (end - times[-1]) / 1e9
+
+
+def _offset(found: ClockOffset | None, file: Path, notes: list[str], *, utc: bool) -> float:
+    if found is not None and found.is_decisive:
+        notes.append(
+            f"clock of the images against {file.name}: {found.offset_s:+.2f} s, found by motion "
+            f"({found.pairs} pairs of images, {found.residual_deg:.2f} degrees left, "
+            f"{found.elsewhere_deg:.2f} at other offsets)"
+        )
+        return found.offset_s
+    if not utc:
+        raise FootageError(
+            f"{file}: where the video lies in it cannot be found by motion: is it this flight's?"
+        )
+    notes.append(
+        f"the clock's offset against {file.name} cannot be found by motion: taken as zero, as "
+        "both are UTC"
+    )
+    return 0.0
+
+
+def _read_video(path: Path, options: FootageOptions, progress: Progress) -> RecordedFlight:
+    notes: list[str] = []
+    facts = video_facts(path)
+    duration_ns = round(1e9 * max(facts.duration_s, 1e-3))
+    step_ns = max(duration_ns // options.frames, 500_000_000)
+    times = list(range(0, duration_ns, step_ns))
+    extracted = extract_frames(path, options.work / "frames", times, progress)
+    if facts.rotation_deg % 360:
+        notes.append(
+            f"the video is marked as rotated by {facts.rotation_deg} degrees; its frames are used "
+            "as they are stored"
+        )
+    subtitles = _subtitles(path)
+    track, focal_35mm, klv_fov = _video_track(path, subtitles, notes)
+    width, height = extracted[0].width, extracted[0].height
+    camera = _video_camera(path, width, height, options, focal_35mm, klv_fov)
+    frames = []
+    for image in extracted:
+        said = track.at(image.time_ns) if track is not None else None
+        frames.append(
+            RecordedFrame(image.path.name, image.path, image.time_ns, said or Telemetry())
+        )
+    log = options.log or _beside(path, LOG_SUFFIXES)
+    if log is not None:
+        frames = _with_log(frames, camera.camera, log, options, notes, utc=False)
+    elif track is None:
+        notes.append(
+            "the video has no telemetry: no .SRT beside it, no KLV in it, no log; every frame is "
+            "searched on the whole map"
+        )
+    return _flight(path, "video", frames, camera, notes)
+
+
+def _beside(path: Path, suffixes: frozenset[str]) -> Path | None:
+    """A file of the same name with another ending, in any letter case."""
+    return next((f for f in files_of(path.parent, suffixes) if f.stem == path.stem), None)
+
+
+def _subtitles(path: Path) -> Subtitles | None:
+    file = _beside(path, frozenset({".srt"}))
+    return read_subtitles(file) if file is not None else None
+
+
+def _video_track(
+    path: Path, subtitles: Subtitles | None, notes: list[str]
+) -> tuple[Track | None, float | None, float | None]:
+    """Telemetry on the video's time, 35 mm equivalent, field of view."""
+    if subtitles is not None:
+        notes.append(f"telemetry is read from the subtitles: {len(subtitles.samples)} samples")
+        return Track(subtitles.samples, 5.0), subtitles.focal_35mm, None
+    klv = read_klv(path)
+    if klv.damaged:
+        notes.append(f"{klv.damaged} of {klv.packets} KLV packets cannot be read")
+    if not klv.samples:
+        return None, None, klv.field_of_view_deg
+    notes.append(f"telemetry is read from {klv.packets} KLV packets in the video")
+    return Track(klv.samples), None, klv.field_of_view_deg
+
+
+def _video_camera(
+    path: Path, width: int, height: int, options: FootageOptions, focal_35mm: float | None,
+    klv_fov: float | None,
+) -> CameraGuess:  # fmt: skip
+    given = _given_camera(path.parent, width, height, options)
+    if given is not None:
+        return given
+    if klv_fov is not None and not math.isnan(klv_fov):
+        camera = Camera.from_fov(width, height, klv_fov)
+        return CameraGuess(camera, _KLV_FOCAL_PERCENT, "field of view in the video's KLV")
+    if focal_35mm is not None:
+        camera = equivalent_camera(width, height, focal_35mm, small=True)
+        return CameraGuess(
+            camera, _VIDEO_FOCAL_PERCENT, f"35 mm equivalent in the subtitles, {focal_35mm:g} mm"
+        )
+    raise FootageError(
+        f"{path}: nothing says the focal length; give the camera's model as --camera FILE or its "
+        "horizontal field of view as --fov DEGREES"
+    )

@@ -1,0 +1,274 @@
+"""What a photo says about itself: EXIF and XMP of DJI, Autel, Parrot, Skydio and senseFly.
+
+XMP stands in the JPEG (an APP1 segment) or beside it as NAME.xmp, which takes precedence. Angles
+become those of `companion.recorded.flight`; each maker's convention stands in `_VIEWS`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from PIL import ExifTags, Image
+
+from companion.errors import FootageError
+from companion.recorded.flight import (
+    Datum,
+    Height,
+    RecordedPosition,
+    RecordedView,
+    Telemetry,
+)
+from localizer.plain_files import plain_text
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
+RAW_SUFFIXES = frozenset({".dng", ".arw", ".cr2", ".cr3", ".nef", ".raf"})
+_XMP_BEGIN, _XMP_END = b"<x:xmpmeta", b"</x:xmpmeta>"
+_LARGEST_BYTES = 1 << 20  # of a photo's head, in which its tags stand
+_TAG = r"(?:[\w-]+):(\w+)"
+
+# Standard deviations of what the tags say. DJI states 0.5 to 1.5 m for hovering with GNSS; photos
+# are tagged in motion (5 to 15 m/s, up to 0.2 s late).
+_GNSS_M, _RTK_M = 3.0, 0.1
+_ABSOLUTE_M = 30.0  # of DJI's altitude without RTK: barometer and model of the atmosphere
+_GNSS_HEIGHT_M = 8.0
+_BAROMETER_M, _BAROMETER_SHARE = 2.0, 0.02
+_TILT_DEG, _HEADING_DEG = 2.0, 6.0  # of a gimbal that is not calibrated; of its compass
+_DOWN_DEG = 10.0  # of a camera of which nothing is said: survey photos look down
+
+
+@dataclass(frozen=True)
+class PhotoTags:
+    """The tags of one photo. exif: by EXIF name; xmp: by name without its namespace."""
+
+    path: Path
+    width: int
+    height: int
+    exif: Mapping[str, Any] = field(default_factory=dict)
+    gps: Mapping[int, Any] = field(default_factory=dict)
+    xmp: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def maker(self) -> str:
+        """Lower case; empty if not said."""
+        return str(self.exif.get("Make") or self.xmp.get("Make") or "").strip("\x00 ").lower()
+
+    @property
+    def model(self) -> str:
+        """As the maker writes it; empty if not said."""
+        return str(self.exif.get("Model") or self.xmp.get("Model") or "").strip("\x00 ")
+
+    def number(self, *names: str) -> float | None:
+        """The first of these XMP tags that is a finite number; fractions like 35/10 are read."""
+        for name in names:
+            value = _number(self.xmp.get(name))
+            if value is not None:
+                return value
+        return None
+
+    def exif_number(self, name: str) -> float | None:
+        """An EXIF number; None if it is missing, not finite or 0, which means unknown there."""
+        value = _number(self.exif.get(name))
+        return value if value else None
+
+    @property
+    def time_ns(self) -> int | None:
+        """Nanoseconds since 1970 on the photo's own clock, whose time zone is not known."""
+        text = str(self.exif.get("DateTimeOriginal") or self.exif.get("DateTime") or "")
+        try:
+            day = datetime.strptime(text.strip("\x00 "), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            return None
+        seconds = day.replace(tzinfo=timezone.utc).timestamp()
+        part = str(self.exif.get("SubsecTimeOriginal") or "").strip("\x00 ")
+        fraction = float(f"0.{part}") if part.isdigit() else 0.0
+        return round((seconds + fraction) * 1e9)
+
+    def telemetry(self) -> Telemetry:
+        """Position, view and direction, as far as the tags say them."""
+        return Telemetry(self.time_ns, self._position(), self.view(), self._course())
+
+    def view(self) -> RecordedView | None:
+        """The measured view, by the first maker's convention whose tags are there."""
+        for names, convert in _VIEWS:
+            angles = [self.number(name) for name in names]
+            values = [a for a in angles if a is not None]
+            # All three exactly zero: the firmware has no measurement (DJI Mini 2, P1).
+            if len(values) == 3 and any(values):
+                roll, pitch, yaw = convert(values[0], values[1], values[2])
+                roll = -roll if self.maker == "sensefly" else roll  # positive to the left there
+                return RecordedView.of_angles(roll, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+        return None
+
+    @property
+    def has_zero_view(self) -> bool:
+        """Whether there are angles, and all of them are exactly zero: they were not measured."""
+        return self.view() is None and any(
+            all(self.number(name) == 0.0 for name in names) for names, _ in _VIEWS
+        )
+
+    def _course(self) -> float | None:
+        course = self.number("FlightYawDegree", "DroneYaw", "DroneOrientationNEDYaw")
+        if course is not None:
+            return course
+        return _number(self.gps.get(ExifTags.GPS.GPSImgDirection))
+
+    def _position(self) -> RecordedPosition | None:
+        # "GpsLongtitude" is how some of DJI's firmwares spell it.
+        latitude = self.number("GpsLatitude", "Latitude")
+        longitude = self.number("GpsLongitude", "GpsLongtitude", "Longitude")
+        if latitude is None or longitude is None:
+            latitude, longitude = self._exif_place
+        if latitude is None or longitude is None or (latitude == 0.0 and longitude == 0.0):
+            return None
+        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+            raise FootageError(
+                f"{self.path}: its tags say latitude {latitude:g}, longitude {longitude:g}: no "
+                "place on Earth"
+            )
+        spread = [self.number(name) for name in ("RtkStdLat", "RtkStdLon")]
+        told = [s for s in spread if s is not None and s > 0.0]
+        sigma = max(_RTK_M, *told) if told else self.number("GPSXYAccuracy") or _GNSS_M
+        return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
+
+    @property
+    def exif_position(self) -> tuple[float, float, float] | None:
+        """Latitude, longitude and altitude of EXIF; None where one of them is missing."""
+        latitude, longitude = self._exif_place
+        height = self._exif_altitude
+        if latitude is None or longitude is None or height is None:
+            return None
+        return latitude, longitude, height
+
+    @property
+    def _exif_place(self) -> tuple[float | None, float | None]:
+        gps, tag = self.gps, ExifTags.GPS
+        latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef) == "S")
+        longitude = _degrees(gps.get(tag.GPSLongitude), gps.get(tag.GPSLongitudeRef) == "W")
+        return latitude, longitude
+
+    def _heights(self) -> list[Height]:
+        heights = []
+        relative = self.number("RelativeAltitude", "AboveGroundAltitude")
+        if relative is not None:
+            sigma = math.hypot(_BAROMETER_M, _BAROMETER_SHARE * relative)
+            heights.append(Height(relative, Datum.TAKEOFF, sigma))
+        absolute = self.number("AbsoluteAltitude")
+        kind = self.xmp.get("AltitudeType", "").lower()
+        fixed = self.number("RtkFlag") in (16.0, 34.0, 50.0)
+        if absolute is not None and (kind == "rtkalt" or fixed):
+            heights.append(Height(absolute, Datum.ELLIPSOID, _RTK_M))
+        elif absolute is not None:
+            heights.append(Height(absolute, Datum.AMSL, _ABSOLUTE_M))
+        else:
+            heights += self._exif_height()
+        return heights
+
+    def _exif_height(self) -> list[Height]:
+        value = self._exif_altitude
+        return [] if value is None else [Height(value, Datum.AMSL, _GNSS_HEIGHT_M)]
+
+    @property
+    def _exif_altitude(self) -> float | None:
+        value = _number(self.gps.get(ExifTags.GPS.GPSAltitude))
+        # 1 and b"\x01" both occur; Pillow gives the byte as it stands. EXIF 3 has 3 below the sea.
+        below = self.gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, 3, b"\x01", b"\x03")
+        return -value if below and value is not None else value
+
+
+Convert = Callable[[float, float, float], tuple[float, float, float]]
+
+
+def _same(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
+    return roll, pitch, yaw
+
+
+def _from_nadir(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
+    """Pix4D's ``Camera:`` tags: pitch 0 looks down, 90 ahead (Autel, Parrot, Sentera)."""
+    return roll, pitch - 90.0, yaw
+
+
+# Names of roll, pitch and yaw in each maker's XMP, and how they become a gimbal's angles.
+_VIEWS: tuple[tuple[tuple[str, str, str], Convert], ...] = (
+    (("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree"), _same),  # DJI
+    (("CameraOrientationNEDRoll", "CameraOrientationNEDPitch", "CameraOrientationNEDYaw"), _same),
+    (("CameraRollDegree", "CameraPitchDegree", "CameraYawDegree"), _same),  # Parrot ANAFI
+    (("Roll", "Pitch", "Yaw"), _from_nadir),
+)
+
+
+def looking_down(heading_deg: float | None) -> RecordedView:
+    """The view that is assumed where none was measured: straight down, the top of the image ahead.
+
+    heading_deg: of the aircraft, None if unknown.
+    """
+    sigma = None if heading_deg is None else 2.0 * _HEADING_DEG
+    return RecordedView.of_angles(0.0, -90.0, heading_deg or 0.0, _DOWN_DEG, sigma, measured=False)
+
+
+def read_photo_tags(path: Path) -> PhotoTags:
+    """The tags of a photo. `FootageError` where it is no image."""
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            base = {ExifTags.TAGS.get(k, str(k)): v for k, v in exif.items()}
+            inner = exif.get_ifd(ExifTags.IFD.Exif)
+            more = {ExifTags.TAGS.get(k, str(k)): v for k, v in inner.items()}
+            gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
+            width, height = image.size
+    except (OSError, ValueError, SyntaxError) as error:
+        raise FootageError(f"{path}: not an image that can be read: {error}") from error
+    return PhotoTags(path, width, height, base | more, gps, read_xmp(path))
+
+
+def read_xmp(path: Path) -> dict[str, str]:
+    """XMP tags by name, attributes and elements alike; empty where there are none."""
+    sidecar = next((p for p in map(path.with_suffix, (".xmp", ".XMP")) if p.is_file()), None)
+    try:
+        if sidecar is not None:
+            text = plain_text(sidecar)
+        else:
+            with path.open("rb") as file:
+                head = file.read(_LARGEST_BYTES)
+            begin = head.find(_XMP_BEGIN)
+            end = head.find(_XMP_END, begin)
+            text = head[begin:end].decode("utf-8", "replace") if 0 <= begin < end else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise FootageError(f"{path}: cannot be read: {error}") from error
+    tags = dict(re.findall(rf"""\s{_TAG}\s*=\s*["']([^"']*)["']""", text))
+    tags |= dict(re.findall(rf"<{_TAG}>\s*([^<]*?)\s*</", text))
+    # A structure of Skydio and Parrot: <a:CameraOrientationNED><a:Pitch>..</a:Pitch>...
+    for name, body in re.findall(r"<[\w-]+:(\w+NED)[^>]*>(.*?)</[\w-]+:\1>", text, re.DOTALL):
+        for part, value in re.findall(rf"<{_TAG}>\s*([^<]*?)\s*</", body):
+            tags[f"{name}{part}"] = value
+        for part, value in re.findall(rf'\s{_TAG}\s*=\s*"([^"]*)"', body):
+            tags[f"{name}{part}"] = value
+    return tags
+
+
+def _number(value: Any) -> float | None:
+    try:
+        if isinstance(value, str) and "/" in value:
+            above, below = value.split("/", 1)
+            number = float(above) / float(below)
+        else:
+            number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _degrees(parts: Sequence[Any] | None, negative: bool) -> float | None:
+    try:
+        degrees, minutes, seconds = (float(part) for part in parts or ())
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    value = degrees + minutes / 60.0 + seconds / 3600.0
+    if not math.isfinite(value):
+        return None
+    return -value if negative else value

@@ -1,0 +1,136 @@
+"""Places of photos in a file beside them: CSV or text with one line a photo.
+
+With a header, columns are found by their names. Without one, lines are ``name longitude latitude
+[altitude]``, which OpenDroneMap's geo.txt and this project's pose files have in common.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from companion.errors import FootageError
+from companion.recorded.flight import (
+    Datum,
+    Height,
+    RecordedPosition,
+    RecordedView,
+    Telemetry,
+)
+from localizer.plain_files import plain_text
+
+PLACES_SUFFIXES = frozenset({".csv", ".txt", ".tsv"})
+_UNKNOWN_M, _HEIGHT_M = 5.0, 25.0  # of a position and a height of which no one says the source
+_TILT_DEG, _HEADING_DEG = 2.0, 6.0
+_COLUMNS = {
+    "name": ("name", "filename", "file", "image", "photo", "label", "imagename"),
+    "latitude": ("lat", "latitude", "gpslatitude", "latitudedeg", "y"),
+    "longitude": ("lon", "lng", "long", "longitude", "gpslongitude", "longitudedeg", "x"),
+    "amsl": ("alt", "altitude", "z", "elevation", "gpsaltitude", "altamslm", "amsl", "altm"),
+    "ellipsoid": ("height", "heightm", "ellipsoidalheight", "hae"),
+    "takeoff": ("relalt", "relativealtm", "relativealtitude", "agl", "heightabovetakeoff"),
+    "roll": ("gimbalroll", "gimbalrolldeg", "cameraroll"),
+    "pitch": ("gimbalpitch", "gimbalpitchdeg", "camerapitch"),
+    "yaw": ("gimbalyaw", "gimbalyawdeg", "camerayaw"),
+    "course": ("heading", "course", "track", "yaw", "yawdeg"),
+    "time": ("utc", "timestamp", "unixtime"),
+    "accuracy": ("horizontalaccuracy", "hacc", "gpsxyaccuracy", "accuracy"),
+}
+
+
+def read_places(path: Path) -> dict[str, Telemetry]:
+    """Telemetry by the photo's name. `FootageError` where the file holds no place."""
+    try:
+        lines = plain_text(path).removeprefix("\ufeff").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FootageError(f"{path}: cannot be read: {error}") from error
+    rows = list(_rows(lines))
+    columns = _columns(rows[0][1]) if rows else None
+    if columns is not None:
+        rows = rows[1:]
+    else:
+        columns = {"name": 0, "longitude": 1, "latitude": 2, "amsl": 3}
+    places = dict(_place(row, columns, f"{path}:{number}") for number, row in rows)
+    if not places:
+        raise FootageError(f"{path}: holds no place; expected lines of: name longitude latitude")
+    return places
+
+
+def is_places_file(path: Path) -> bool:
+    """Whether a text file holds places of photos."""
+    try:
+        return bool(read_places(path))
+    except FootageError:
+        return False
+
+
+def _rows(lines: list[str]) -> Iterator[tuple[int, list[str]]]:
+    """Fields of the lines that hold some: by comma, semicolon, tab or blanks."""
+    kept = [
+        (number, line)
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.startswith("#") and not line.upper().startswith("EPSG:")
+    ]
+    sample = kept[0][1] if kept else ""
+    mark = next((m for m in (",", ";", "\t") if m in sample), None)
+    for number, line in kept:
+        fields = next(csv.reader([line], delimiter=mark)) if mark else line.split()
+        yield number, [f.strip() for f in fields]
+
+
+def _columns(first: list[str]) -> dict[str, int] | None:
+    """Which column holds what, if the first row is a header."""
+    if len(first) > 1 and _number(first[1]) is not None:
+        return None
+    plain = [re.sub(r"[^a-z]", "", name.lower()) for name in first]
+    found = {}
+    for key, names in _COLUMNS.items():
+        index = next((plain.index(name) for name in names if name in plain), None)
+        if index is not None:
+            found[key] = index
+    if not {"name", "latitude", "longitude"} <= found.keys():
+        return None
+    return found
+
+
+def _place(row: list[str], columns: dict[str, int], where: str) -> tuple[str, Telemetry]:
+    def number(key: str) -> float | None:
+        index = columns.get(key)
+        return _number(row[index]) if index is not None and index < len(row) else None
+
+    latitude, longitude = number("latitude"), number("longitude")
+    if latitude is None or longitude is None:
+        raise FootageError(f"{where}: expected a name, longitude and latitude, got {row[:4]}")
+    if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+        raise FootageError(
+            f"{where}: latitude {latitude:g}, longitude {longitude:g} is no place on Earth "
+            "(without a header, longitude comes before latitude)"
+        )
+    heights = [
+        Height(value, datum, _HEIGHT_M)
+        for key, datum in (
+            ("ellipsoid", Datum.ELLIPSOID), ("amsl", Datum.AMSL), ("takeoff", Datum.TAKEOFF)
+        )
+        if (value := number(key)) is not None
+    ]  # fmt: skip
+    position = RecordedPosition(
+        latitude, longitude, number("accuracy") or _UNKNOWN_M, tuple(heights)
+    )
+    roll, pitch, yaw = number("roll"), number("pitch"), number("yaw")
+    view = None
+    if pitch is not None and yaw is not None:
+        view = RecordedView.of_angles(roll or 0.0, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+    seconds = number("time")
+    time_ns = None if seconds is None else round(seconds * 1e9)
+    return row[columns["name"]], Telemetry(time_ns, position, view, number("course"))
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

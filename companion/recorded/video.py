@@ -1,0 +1,115 @@
+"""Images out of a video file, with their times from its first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import cv2
+
+from companion.errors import FootageError
+from companion.sources.base import video_stream
+from localizer.pictures import write_rgb
+from localizer.types import Image
+
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".m4v", ".mkv", ".avi", ".ts", ".m2ts", ".mpg", ".mpeg", ".webm"}
+)
+_LARGEST_PX = 1920  # of an image's width: registration works on less
+_QUALITY_SUFFIX = ".jpg"
+
+
+@dataclass(frozen=True)
+class ExtractedFrame:
+    """An image that was written. time_ns: from the video's first frame."""
+
+    path: Path
+    time_ns: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class VideoFacts:
+    """What a video file says. width, height: of its frames; duration_s: 0 where it is not said."""
+
+    width: int
+    height: int
+    duration_s: float
+    rotation_deg: int
+
+
+def video_facts(path: Path) -> VideoFacts:
+    """Size, duration and orientation. `FootageError` where it is no video."""
+    try:
+        with av.open(str(path)) as container:
+            stream = video_stream(container, str(path))
+            duration = container.duration / av.time_base if container.duration else 0.0
+            frame = next(container.decode(stream), None)
+            if frame is None:
+                raise FootageError(f"{path}: no frame in it can be decoded")
+            rotation = round(getattr(frame, "rotation", 0) or 0)
+            return VideoFacts(frame.width, frame.height, float(duration), rotation)
+    except av.error.FFmpegError as error:
+        raise FootageError(f"{path}: not a video, or damaged: {error}") from error
+
+
+def extract_frames(
+    path: Path, folder: Path, times_ns: list[int], progress: Callable[[int, int], None]
+) -> list[ExtractedFrame]:
+    """Write the frames nearest after each of the ascending times, at most `_LARGEST_PX` wide."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames: list[ExtractedFrame] = []
+    wanted = list(times_ns)
+    for time_ns, picture in _pictures(path):
+        if not wanted:
+            break
+        if time_ns < wanted[0]:
+            continue
+        while wanted and wanted[0] <= time_ns:
+            wanted.pop(0)
+        image = _shrunk(picture.to_ndarray(format="rgb24"))
+        file = folder / f"frame-{time_ns / 1e9:08.3f}s{_QUALITY_SUFFIX}"
+        write_rgb(file, image)
+        frames.append(ExtractedFrame(file, time_ns, image.shape[1], image.shape[0]))
+        progress(len(frames), len(times_ns))
+    if not frames:
+        raise FootageError(f"{path}: no frame in it can be decoded")
+    return frames
+
+
+def _pictures(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
+    first: int | None = None
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            stream = video_stream(container, str(path))
+            stream.thread_type = "AUTO"
+            rate = float(stream.average_rate or 30.0)
+            for packet in container.demux(stream):
+                try:
+                    pictures = packet.decode()
+                except av.error.InvalidDataError:  # a damaged frame: the next ones may be good
+                    continue
+                for picture in pictures:
+                    own = picture.pts * picture.time_base if picture.pts is not None else None
+                    stamp = (
+                        round(1e9 * float(own)) if own is not None else round(1e9 * count / rate)
+                    )
+                    first = stamp if first is None else first
+                    count += 1
+                    yield stamp - first, picture
+    except av.error.FFmpegError as error:
+        if first is None:
+            raise FootageError(f"{path}: not a video, or damaged: {error}") from error
+
+
+def _shrunk(image: Image) -> Image:
+    height, width = image.shape[:2]
+    if width <= _LARGEST_PX:
+        return image
+    size = (_LARGEST_PX, round(height * _LARGEST_PX / width))
+    shrunk: Image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return shrunk

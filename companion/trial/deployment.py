@@ -1,0 +1,79 @@
+"""A deployment file with the camera, mounting and map of a trial."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.config import parse_config
+from companion.preflight.map_pin import map_hash
+from companion.setup.write import deployment_text, write_deployment
+from companion.trial.result import Trial
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, euler_from_matrix, matrix_from_euler, so3_exp
+
+_SOURCE, _CONNECTION = "udp://0.0.0.0:5600", "serial:/dev/ttyTHS1:921600"
+
+
+def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
+    """Write the file; what the footage does not tell stands in it as a note to check."""
+    settings = _settings(trial, map_cache)
+    config = parse_config(settings, str(path))
+    write_deployment(deployment_text(config, _notes(trial), "companion try"), path, overwrite=True)
+    return path
+
+
+def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
+    found = trial.estimated
+    camera = found.camera if found is not None else trial.flight.camera.camera
+    bridge: dict[str, Any] = {"mount": "gimbal" if _is_measured(trial) else "fixed"}
+    names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
+    for name, angle in zip(names, _mount_deg(trial), strict=True):
+        bridge[name] = round(float(angle), 2)
+    return {
+        "map": str(map_cache.resolve()),
+        "map_sha256": map_hash(map_cache),
+        "camera": {"source": _SOURCE, "model": _model(camera)},
+        "bridge": {"connection": _CONNECTION, "camera": bridge},
+        "record": {"folder": str(Path("flights/flight").resolve())},
+    }
+
+
+def _model(camera: Camera) -> dict[str, Any]:
+    """Rounded to what footage can tell."""
+    model = camera.to_dict()
+    rounded = {name: round(model[name], 2) for name in ("fx", "fy", "cx", "cy")}
+    return model | rounded | {"distortion": [round(k, 5) for k in model["distortion"]]}
+
+
+def _is_measured(trial: Trial) -> bool:
+    return sum(p.measured for p in trial.priors) > len(trial.priors) / 2
+
+
+def _mount_deg(trial: Trial) -> Array:
+    """Roll, pitch, yaw of the mounting: the gimbal's bias, or a fixed camera's direction."""
+    turn = np.zeros(3) if trial.estimated is None else np.radians(trial.estimated.mount_deg)
+    down = np.eye(3) if _is_measured(trial) else matrix_from_euler(0.0, -np.pi / 2, 0.0)
+    return np.degrees(euler_from_matrix(down @ so3_exp(turn)))
+
+
+def _notes(trial: Trial) -> list[str]:
+    notes = [
+        f"Camera and mounting are those of the footage {trial.flight.name}.",
+        "CHECK camera.source and bridge.connection: the footage does not tell them.",
+        f"Focal length: {trial.flight.camera.source}.",
+    ]
+    if not _is_measured(trial):
+        notes.append(
+            "The footage has no gimbal angles: the camera is written as fixed to the airframe. "
+            "With a gimbal set bridge.camera.mount: gimbal and its three angles to 0."
+        )
+    if trial.estimated is not None and trial.estimated.has_shift:
+        east, north = trial.estimated.shift_m[:2]
+        notes.append(
+            f"The map lies {east:+.1f} m east, {north:+.1f} m north of GNSS; positions will be "
+            "the map's."
+        )
+    return notes

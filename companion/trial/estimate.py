@@ -1,0 +1,267 @@
+"""Gimbal bias, focal length and map offset of footage, by `companion.calibrate`'s least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.calibrate import unknowns as u
+from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
+from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
+from companion.calibrate.pictures import Parts, PictureReader
+from companion.calibrate.solve import Solution, solve
+from companion.errors import StreamDecodeError, StreamSizeError
+from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.recorded.flight import CameraGuess, RecordedFrame
+from companion.trial.localize import FrameLocalizer, Localized
+from companion.trial.priors import Correction, FramePrior
+from localizer.features.extractor import FeatureExtractor
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.render.base import MapRenderer
+
+_LEAST_FRAMES = 4
+_TURNS = 2  # with the camera as given, and with the one that was found
+_MOST_FRAMES = 40  # more of them tell little that these do not
+_RELIEF_SHARE = 0.004  # of the height above ground: flatter ground shows no focal length
+_SIGNIFICANT = 3.0  # sigmas: the given focal length is kept unless it differs by so much
+_UP_SIGMA_M = 10.0  # of the map's surface against the height that is recorded
+_OUTLIER_SHARE, _OUTLIER_SIGMAS = 0.1, 3.0  # of the height above ground; of the median deviation
+_ROBUST_ROUNDS = 10
+_LEAST_TILT_DEG = 0.5
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """What the footage says about its camera and the map.
+
+    focal_percent, focal_sigma_percent: against the camera as given, which is kept within three
+    sigmas; None where this map cannot tell it. mount_deg: (3,) about the boresight, up, right;
+    shift_m: (3,) map less GNSS, east, north, up; has_shift: whether positions were recorded to tell
+    it. poses: by frame, of those that were used.
+    """
+
+    camera: Camera
+    correction: Correction
+    focal_percent: float | None
+    focal_sigma_percent: float
+    mount_deg: Array
+    mount_sigma_deg: Array
+    shift_m: Array
+    shift_sigma_m: Array
+    has_shift: bool
+    poses: dict[int, Pose]
+    pixel_sigma: float
+
+    @property
+    def frames(self) -> int:
+        """How many were used."""
+        return len(self.poses)
+
+
+@dataclass(frozen=True)
+class Tools:
+    """What reads images over the map. width: of the working image, pixels; has_buildings: whether
+    the map's heights hold them.
+    """
+
+    renderer: MapRenderer
+    extractor: FeatureExtractor
+    width: int
+    has_buildings: bool = True
+
+
+def estimate(
+    frames: Sequence[RecordedFrame],
+    priors: Sequence[FramePrior],
+    localized: Sequence[Localized],
+    guess: CameraGuess,
+    tools: Tools,
+    loader: FrameLocalizer,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Estimated | None:
+    """None where too few frames lie on the map consistently."""
+    used = consistent(priors, localized)
+    if len(used) > _MOST_FRAMES:
+        used = [used[int(k)] for k in np.linspace(0, len(used) - 1, _MOST_FRAMES).round()]
+    if len(used) < _LEAST_FRAMES:
+        return None
+    poses = {k: pose for k in used if (pose := localized[k].pose) is not None}
+    shared, solution, camera = np.zeros(u.COUNT), None, guess.camera
+    focal: tuple[float, float] | None = None
+    fixed = np.ones(u.COUNT, bool)
+    for turn in range(_TURNS):
+        believed = changed_camera(guess.camera, shared)
+        reader = PictureReader(tools.renderer, tools.extractor, believed, tools.width)
+        sighted: dict[int, CalibrationFrame] = {}
+        for number, (k, pose) in enumerate(poses.items(), 1):
+            progress(turn * len(used) + number, _TURNS * len(used))
+            parts = _parts(frames[k], pose, believed, reader, loader)
+            if parts is not None:
+                said = _said(priors[k], pose)
+                sighted[k] = CalibrationFrame(10_000_000_000 * (k + 1), pose, parts, said)
+        if len(sighted) < _LEAST_FRAMES:
+            return None
+        fixed = _fixed(list(sighted.values()), tools.has_buildings)
+        evidence = CalibrationProblem(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
+        solution = solve(evidence, fixed, _sigmas(guess))
+        focal = _focal(solution, fixed)
+        if focal is not None and abs(focal[0]) < _SIGNIFICANT * focal[1]:
+            fixed[u.FOCAL] = True
+            solution = solve(evidence, fixed, _sigmas(guess))
+        shared = solution.guess.shared
+        camera = changed_camera(guess.camera, shared)
+        found = zip(sighted, solution.guess.rotations, solution.guess.places, strict=True)
+        poses = {k: Pose(R, t) for k, R, t in found}
+    if solution is None:
+        return None
+    return _estimated(camera, solution, focal, priors, poses)
+
+
+def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> list[int]:
+    """Frames whose ground at the optical axis lies where most have it: recorded place plus one
+    offset of the map and one of the camera's tilt. A registration at a wrong place does not.
+
+    The point on the optical axis is used because position and tilt err together, and it does not.
+    """
+    which = [k for k, one in enumerate(localized) if one.pose is not None]
+    placed = [k for k in which if priors[k].pose is not None and priors[k].height_known]
+    if len(placed) < _LEAST_FRAMES:
+        return [k for k in which if localized[k].accepted]
+    rows, values, heights = [], [], []
+    for k in placed:
+        pose, prior = localized[k].pose, priors[k].pose
+        if pose is None or prior is None:
+            continue
+        height = priors[k].clearance_m
+        away = _axis_ground(pose, height) - _axis_ground(prior, height)
+        yaw = float(np.arctan2(-prior.rotation[1, 1], -prior.rotation[0, 1]))  # of the image's top
+        ahead = np.array([np.cos(yaw), np.sin(yaw)])
+        beside = np.array([ahead[1], -ahead[0]])
+        rows.append(np.column_stack([np.eye(2), height * ahead, height * beside]))
+        values.append(away)
+        heights.append(height)
+    A, b = np.array(rows), np.array(values)
+    weight = np.ones(len(b))
+    for _ in range(_ROBUST_ROUNDS):
+        flat = (A * weight[:, None, None]).reshape(-1, 4)
+        normal = flat.T @ flat + np.diag([1e-4, 1e-4, 1e-2, 1e-2])
+        x = np.linalg.solve(normal, flat.T @ (b * weight[:, None]).ravel())
+        off = np.linalg.norm(b - A @ x, axis=1)
+        scale = max(float(np.median(off)), 0.5)
+        weight = 1.0 / (1.0 + (off / scale) ** 2)
+    limit = np.maximum(_OUTLIER_SIGMAS * scale, _OUTLIER_SHARE * np.array(heights))
+    return [k for k, good in zip(placed, off <= limit, strict=True) if good]
+
+
+def _axis_ground(pose: Pose, height_m: float) -> Array:
+    """(2,): where the optical axis meets flat ground so far below the camera."""
+    axis = pose.rotation[:, 2]
+    down = max(-float(axis[2]), 0.2)
+    return np.asarray(pose.translation[:2] + axis[:2] * height_m / down)
+
+
+def _parts(
+    recorded: RecordedFrame, pose: Pose, camera: Camera, reader: PictureReader,
+    loader: FrameLocalizer,
+) -> Parts | None:  # fmt: skip
+    if recorded.telemetry.zoom != 1.0:
+        return None  # of another focal length
+    try:
+        frame = loader.load(recorded)
+    except (StreamDecodeError, StreamSizeError, OSError):
+        return None
+    return reader.read(replace(frame, camera=camera), pose, None)
+
+
+def _said(prior: FramePrior, pose: Pose) -> AutopilotWindow:
+    """The telemetry, the same at all offsets: no time offset is looked for. An unknown heading is
+    the registration's.
+    """
+    rotation = prior.rotation
+    if prior.heading_sigma_deg is None:
+        turn = float(np.arctan2(*(pose.rotation @ rotation.T)[[1, 0], 0]))
+        rotation = np.asarray(so3_exp([0.0, 0.0, turn]) @ rotation)
+    housing = rotation @ GIMBAL_FROM_CAMERA.T
+    known = prior.pose is not None and prior.height_known
+    place = prior.pose.translation if known and prior.pose is not None else np.full(3, np.nan)
+    count = len(OFFSETS_S)
+    return AutopilotWindow(
+        np.repeat(housing[None], count, 0), np.repeat(housing[None], count, 0),
+        np.repeat(place[None], count, 0),
+    )  # fmt: skip
+
+
+def _fixed(sighted: Sequence[CalibrationFrame], has_buildings: bool) -> np.ndarray:
+    """Which numbers keep their value: all but focal length, mounting and map offset; over flat
+    ground the focal length, too, because it cannot be told from the height; nor over a map without
+    the buildings that the images show, which are nearer than it says.
+    """
+    fixed = np.ones(u.COUNT, bool)
+    fixed[u.MOUNT], fixed[u.SHIFT] = False, False
+    is_flat = float(np.median([_relief(s) for s in sighted])) < _RELIEF_SHARE
+    fixed[u.FOCAL] = is_flat or not has_buildings
+    return fixed
+
+
+def _relief(one: CalibrationFrame) -> float:
+    """How far the ground in an image strays from a plane, as a share of the height above it."""
+    points = one.parts.points
+    design = np.column_stack([points[:, :2] - points[:, :2].mean(axis=0), np.ones(len(points))])
+    left = points[:, 2] - design @ np.linalg.lstsq(design, points[:, 2], rcond=None)[0]
+    height = float(one.pose.translation[2] - points[:, 2].mean())
+    return float(left.std()) / max(height, 1.0)
+
+
+def _sigmas(guess: CameraGuess) -> Array:
+    sigmas: Array = u.SIGMAS.copy()
+    sigmas[u.FOCAL] = guess.focal_percent / 100.0
+    sigmas[u.SHIFT][2] = _UP_SIGMA_M
+    return sigmas
+
+
+def _focal(solution: Solution, fixed: np.ndarray) -> tuple[float, float] | None:
+    """The focal length's difference and its sigma, per cent; None where it was not looked for."""
+    if fixed[u.FOCAL]:
+        return None
+    difference = float(np.expm1(solution.guess.shared[u.FOCAL]))
+    return 100.0 * difference, 100.0 * float(np.sqrt(solution.covariance[u.FOCAL, u.FOCAL]))
+
+
+def _estimated(
+    camera: Camera,
+    solution: Solution,
+    focal: tuple[float, float] | None,
+    priors: Sequence[FramePrior],
+    poses: dict[int, Pose],
+) -> Estimated:
+    shared, sigma = solution.guess.shared, np.sqrt(np.diag(solution.covariance))
+    has_shift = any(priors[k].pose is not None and priors[k].height_known for k in poses)
+    shift, shift_sigma = shared[u.SHIFT].copy(), sigma[u.SHIFT].copy()
+    if not has_shift:
+        shift, shift_sigma, has_shift = _shift_alone(priors, poses)
+    housing = so3_exp(shared[u.MOUNT])
+    mount = GIMBAL_FROM_CAMERA.T @ housing @ GIMBAL_FROM_CAMERA
+    left = max(float(np.degrees(solution.attitude.sigma[:3].max())), _LEAST_TILT_DEG)
+    percent, percent_sigma = (None, 0.0) if focal is None else focal
+    return Estimated(
+        camera, Correction(np.asarray(mount), shift, left), percent, percent_sigma,
+        np.degrees(shared[u.MOUNT]), np.degrees(sigma[u.MOUNT]), shift, shift_sigma, has_shift,
+        poses, solution.pixel_sigma,
+    )  # fmt: skip
+
+
+def _shift_alone(priors: Sequence[FramePrior], poses: dict[int, Pose]) -> tuple[Array, Array, bool]:
+    """Horizontal offset from positions without a usable height: the median, and its spread."""
+    away = [
+        pose.translation[:2] - prior.translation[:2]
+        for k, pose in poses.items()
+        if (prior := priors[k].pose) is not None
+    ]
+    if len(away) < _LEAST_FRAMES:
+        return np.zeros(3), np.full(3, np.inf), False
+    middle = np.median(away, axis=0)
+    spread = 1.48 * np.median(np.abs(np.array(away) - middle), axis=0) / np.sqrt(len(away))
+    return np.array([*middle, 0.0]), np.array([*spread, np.inf]), True

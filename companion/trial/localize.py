@@ -1,0 +1,132 @@
+"""Each frame localized for itself: from its prior, or by a search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.errors import StreamDecodeError, StreamSizeError
+from companion.recorded.flight import RecordedFrame
+from companion.sources.base import fitted_camera
+from companion.sources.folder_source import read_image
+from companion.trial.priors import FramePrior
+from localizer.errors import OutsideMapError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, so3_log
+from localizer.relocalization.relocalizer import Relocalizer
+from localizer.relocalization.types import PlaceQuery, SearchRegion
+from localizer.tracking.pipeline import Localizer
+from localizer.types import Frame, PosePrior, RegistrationStatus
+
+_PASSES = 3  # the view from a prior that is metres off shows another place
+_STEP_NS = 10_000_000_000  # between frames: no motion model carries from one photo to the next
+_REGION_SIGMAS, _LEAST_REGION_M = 3.0, 30.0
+_FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
+
+
+@dataclass(frozen=True)
+class Localized:
+    """One frame's result. pose: the registration's, also where it was not accepted; covariance:
+    (6, 6) as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose.
+    """
+
+    name: str
+    pose: Pose | None
+    covariance: Array | None = None
+    quality: float = 0.0
+    accepted: bool = False
+    searched: bool = False
+    problem: str = ""
+
+
+class FrameLocalizer:
+    """Localizes recorded frames independently of each other. camera: of the footage."""
+
+    def __init__(
+        self, localizer: Localizer, relocalizer: Callable[[], Relocalizer], camera: Camera
+    ) -> None:
+        self._localizer, self._relocalizer, self._camera = localizer, relocalizer, camera
+        self._sequence = 0
+        self._height_m: float | None = None
+
+    def load(self, recorded: RecordedFrame) -> Frame:
+        """The image with the camera's model, zoom included. Stream errors for an unusable one."""
+        image = read_image(recorded.path)
+        camera = fitted_camera(image.shape[1], image.shape[0], self._camera, recorded.name)
+        zoom = recorded.telemetry.zoom
+        if zoom != 1.0:
+            camera = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+        self._sequence += 1
+        return Frame(image, self._sequence * _STEP_NS, camera, self._sequence)
+
+    def from_prior(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
+        """By its own telemetry; what that lacks (heading, height) is searched about its place."""
+        if prior.pose is None:
+            return Localized(recorded.name, None, problem="has no position")
+        try:
+            frame = self.load(recorded)
+        except (StreamDecodeError, StreamSizeError, OSError) as error:
+            return Localized(recorded.name, None, problem=str(error))
+        if prior.is_complete:
+            return self._tracked(recorded.name, frame, prior.pose_prior(frame.exposure_time_ns))
+        radius = max(_REGION_SIGMAS * prior.sigma_m, _LEAST_REGION_M)
+        region = SearchRegion.circle(prior.pose.translation[:2], radius)
+        return self._found(recorded.name, frame, self._at_likely_height(prior), region)
+
+    def anywhere(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
+        """On the whole map, without its position."""
+        try:
+            frame = self.load(recorded)
+        except (StreamDecodeError, StreamSizeError, OSError) as error:
+            return Localized(recorded.name, None, problem=str(error))
+        return self._found(recorded.name, frame, self._at_likely_height(prior), None)
+
+    def _tracked(self, name: str, frame: Frame, prior: PosePrior) -> Localized:
+        self._localizer.set_prior(prior)
+        try:
+            estimate = self._localizer.track(frame, passes=_PASSES)
+        except OutsideMapError as error:
+            return Localized(name, None, problem=str(error))
+        if estimate.status is not RegistrationStatus.OK:
+            return Localized(name, None, problem=estimate.status.value)
+        return Localized(
+            name, estimate.world_from_camera, estimate.covariance, estimate.quality,
+            estimate.accepted,
+        )  # fmt: skip
+
+    def _at_likely_height(self, prior: FramePrior) -> FramePrior:
+        """Where the height is unknown, about that at which others of this flight were found."""
+        if prior.height_known or self._height_m is None:
+            return prior
+        ground = prior.height_m - prior.height_sigma_m
+        sigma = max(_FOUND_HEIGHT_SHARE * abs(self._height_m - ground), 5.0)
+        return replace(prior, height_m=self._height_m, height_sigma_m=sigma)
+
+    def _found(
+        self, name: str, frame: Frame, prior: FramePrior, region: SearchRegion | None
+    ) -> Localized:
+        heading = prior.heading_sigma_deg
+        query = PlaceQuery(
+            frame, prior.rotation, math.radians(prior.tilt_sigma_deg),
+            None if heading is None else math.radians(heading), prior.height_m,
+            prior.height_sigma_m, region,
+        )  # fmt: skip
+        found = self._relocalizer().find(query)
+        if found is None:
+            return Localized(name, None, searched=True, problem="no place was confirmed")
+        if not prior.height_known:
+            self._height_m = float(found.world_from_camera.translation[2])
+        return Localized(name, found.world_from_camera, found.covariance, found.quality, True, True)
+
+
+def horizontal_m(a: Pose, b: Pose) -> float:
+    """Horizontal distance of two cameras, m."""
+    return float(np.hypot(*(a.translation - b.translation)[:2]))
+
+
+def turn_deg(a: Array, b: Array) -> float:
+    """Angle between two rotations (3, 3)."""
+    return float(np.degrees(np.linalg.norm(so3_log(a.T @ b))))

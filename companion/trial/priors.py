@@ -1,0 +1,267 @@
+"""What telemetry says about a camera's pose over a map: priors with their sigmas.
+
+A flight records several heights of different worth. Which of them can be used depends on the map:
+one that puts cameras below the ground is of another datum, or not measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.geometry import ned_from_world
+from companion.recorded.flight import (
+    Datum,
+    Height,
+    RecordedFlight,
+    RecordedFrame,
+    RecordedPosition,
+    RecordedView,
+)
+from companion.recorded.photo_tags import looking_down
+from localizer.errors import MapCacheError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.types import PosePrior
+
+_LEAST_CLEARANCE_M, _MOST_CLEARANCE_M = 3.0, 10_000.0
+_IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not used at all
+_UNKNOWN_CLEARANCE_M = (15.0, 115.0)  # where cameras of small drones are
+_KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
+_ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
+
+
+@dataclass(frozen=True)
+class FramePrior:
+    """One frame's. pose: None where no position is known. sigma_m: horizontal; height_m: world z
+    and its sigma, half of the range where it is not known; clearance_m: above the map's ground.
+    """
+
+    pose: Pose | None
+    rotation: Array
+    sigma_m: float
+    height_m: float
+    height_sigma_m: float
+    height_known: bool
+    tilt_sigma_deg: float
+    heading_sigma_deg: float | None
+    measured: bool
+    over_map: bool
+    clearance_m: float
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether registration can start from it, without a search."""
+        return self.pose is not None and self.height_known and self.heading_sigma_deg is not None
+
+    def pose_prior(self, time_ns: int) -> PosePrior:
+        """As the localizer takes it. ValueError where it is not complete."""
+        if self.pose is None or self.heading_sigma_deg is None:
+            raise ValueError("the prior is not complete")
+        tilt, heading = np.radians([self.tilt_sigma_deg, self.heading_sigma_deg])
+        sigma = [self.sigma_m, self.sigma_m, self.height_sigma_m, tilt, tilt, heading]
+        return PosePrior(self.pose, np.diag(np.square(sigma)), time_ns)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What was found to be wrong with the telemetry. mount: (3, 3), turns the camera in its own
+    axes; shift: (3,) m east, north, up, map less GNSS; tilt_sigma_deg: what is left.
+    """
+
+    mount: Array
+    shift: Array
+    tilt_sigma_deg: float
+
+    def applied(self, prior: FramePrior) -> FramePrior:
+        """The prior without these errors."""
+        rotation = prior.rotation @ self.mount
+        pose = prior.pose
+        if pose is not None:
+            pose = Pose(rotation, pose.translation + self.shift)
+        return replace(
+            prior, pose=pose, rotation=rotation, height_m=prior.height_m + float(self.shift[2]),
+            tilt_sigma_deg=min(prior.tilt_sigma_deg, self.tilt_sigma_deg),
+        )  # fmt: skip
+
+
+class Ground:
+    """Heights of the map's surface."""
+
+    def __init__(self, cache: TileCache) -> None:
+        self._surface = MapSurface(cache)
+        self._frame = cache.frame
+        self._top = float(cache.index.box_max[:, 2].max()) + _ABOVE_M
+
+    def height(self, east: float, north: float) -> float | None:
+        """World z, m; None beside the map."""
+        down = np.array([[0.0, 0.0, -1.0]])
+        try:
+            eye = np.array([east, north, self._top])
+            distance = float(self._surface.cast(eye, down).distances[0])
+        except MapCacheError:
+            return None  # told by `map verify`
+        return self._top - distance if math.isfinite(distance) else None
+
+
+@dataclass(frozen=True)
+class FlightPriors:
+    """Priors of all frames, in their order. datum: of the heights that are used, None where they
+    are not known; notes: what was decided, and why.
+    """
+
+    priors: tuple[FramePrior, ...]
+    datum: Datum | None
+    notes: tuple[str, ...]
+
+
+def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
+    """What the flight's telemetry says over this map."""
+    ground, frame = Ground(cache), cache.frame
+    geoid_m = cache.manifest.geoid_separation_m
+    places = [_enu(f.telemetry.position, frame) for f in flight.frames]
+    below = [None if p is None else ground.height(float(p[0]), float(p[1])) for p in places]
+    known = [z for z in below if z is not None]
+    notes: list[str] = []
+    heights: list[Height | None] = [None] * len(places)
+    datum: Datum | None = None
+    if known:
+        levels = _levels(flight.frames, frame, geoid_m, known[0], float(np.std(known)))
+        datum = _usable(levels, below, notes)
+        if datum is not None:
+            heights = [by_datum.get(datum) for by_datum in levels]
+    usual = float(np.median(known)) if known else float(cache.index.box_min[:, 2].min())
+    made = [
+        _prior(f, p, z, h, usual, frame)
+        for f, p, z, h in zip(flight.frames, places, below, heights, strict=True)
+    ]
+    notes += _assumptions(flight.frames, made)
+    return FlightPriors(tuple(made), datum, tuple(notes))
+
+
+def _enu(position: RecordedPosition | None, frame: LocalFrame) -> Array | None:
+    if position is None:
+        return None
+    return np.asarray(
+        frame.enu_from_geodetic(
+            position.latitude_deg, position.longitude_deg, frame.origin.height_m
+        )
+    )
+
+
+def _levels(
+    frames: Sequence[RecordedFrame], frame: LocalFrame, geoid_m: float, takeoff_m: float,
+    relief_m: float,
+) -> list[dict[Datum, Height]]:  # fmt: skip
+    """Each frame's heights as world z, by datum. takeoff_m: world z of the ground below the first
+    frame, which stands for the take-off place.
+    """
+    levels = []
+    for one in frames:
+        position = one.telemetry.position
+        found: dict[Datum, Height] = {}
+        for height in position.heights if position is not None else ():
+            if height.datum is Datum.TAKEOFF:
+                z, sigma = takeoff_m + height.value_m, math.hypot(height.sigma_m, relief_m)
+            else:
+                lift = geoid_m if height.datum is Datum.AMSL else 0.0
+                z, sigma = height.value_m + lift - frame.origin.height_m, height.sigma_m
+            found[height.datum] = Height(z, height.datum, sigma)
+        levels.append(found)
+    return levels
+
+
+def _usable(
+    levels: Sequence[dict[Datum, Height]], below: Sequence[float | None], notes: list[str]
+) -> Datum | None:
+    """The datum with the smallest sigma whose heights can be true over this map."""
+    sigmas: dict[Datum, float] = {}
+    clearances: dict[Datum, float] = {}
+    for datum in Datum:
+        rows = [
+            (by_datum[datum], z)
+            for by_datum, z in zip(levels, below, strict=True)
+            if datum in by_datum and z is not None
+        ]
+        if len(rows) < max(1, len(levels) // 2):
+            continue
+        above = np.array([h.value_m - z for h, z in rows])
+        wrong = (above < _LEAST_CLEARANCE_M) | (above > _MOST_CLEARANCE_M)
+        if wrong.mean() > _IMPOSSIBLE_SHARE:
+            notes.append(
+                f"heights above the {datum.value} cannot be true over this map: they put "
+                f"{int(wrong.sum())} of {len(rows)} frames {above.min():.0f} to "
+                f"{above.max():.0f} m above its ground; they are not used"
+            )
+            continue
+        sigmas[datum] = float(np.median([h.sigma_m for h, _ in rows]))
+        clearances[datum] = float(np.median(above))
+    if not sigmas:
+        notes.append("no height is known: heights of 15 to 115 m above the ground are tried")
+        return None
+    best = min(sigmas, key=lambda d: sigmas[d])
+    for datum, clearance in clearances.items():
+        apart = clearance - clearances[best]
+        if abs(apart) > 3.0 * math.hypot(sigmas[datum], sigmas[best]):
+            notes.append(
+                f"heights above the {datum.value} are {apart:+.0f} m from those above the "
+                f"{best.value}, which are used: is the map's height datum right?"
+            )
+    return best
+
+
+def _prior(
+    one: RecordedFrame, place: Array | None, ground_m: float | None, height: Height | None,
+    usual_m: float, frame: LocalFrame,
+) -> FramePrior:  # fmt: skip
+    telemetry = one.telemetry
+    view = telemetry.view or looking_down(telemetry.course_deg)
+    at = frame.origin if telemetry.position is None else _geodetic(telemetry.position)
+    rotation = np.asarray(ned_from_world(frame, at).T @ view.ned_from_camera)
+    base = ground_m if ground_m is not None else usual_m
+    low, high = (base + c for c in _UNKNOWN_CLEARANCE_M)
+    z, sigma, is_known = 0.5 * (low + high), 0.5 * (high - low), False
+    if height is not None:
+        z, sigma = height.value_m, height.sigma_m
+        is_known = sigma < _KNOWN_SHARE * (z - base)
+    pose = None if place is None else Pose(rotation, np.array([place[0], place[1], z]))
+    sigma_m = telemetry.position.sigma_m if telemetry.position is not None else math.inf
+    return FramePrior(
+        pose, rotation, sigma_m, z, sigma, is_known, view.tilt_sigma_deg, _heading(view),
+        view.measured, ground_m is not None, max(z - base, 1.0),
+    )  # fmt: skip
+
+
+def _heading(view: RecordedView) -> float | None:
+    return view.heading_sigma_deg
+
+
+def _geodetic(position: RecordedPosition) -> Geodetic:
+    return Geodetic(position.latitude_deg, position.longitude_deg, 0.0)
+
+
+def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) -> list[str]:
+    notes = []
+    assumed = sum(not p.measured for p in priors)
+    if assumed:
+        notes.append(
+            f"the camera's tilt is not measured in {assumed} of {len(priors)} frames: taken as "
+            f"straight down, {priors[0].tilt_sigma_deg:.0f} degrees unsure"
+        )
+    unknown = sum(p.heading_sigma_deg is None for p in priors)
+    if unknown:
+        notes.append(f"the heading is not known in {unknown} of {len(priors)} frames: searched")
+    beside = sum(f.telemetry.position is not None for f in frames) - sum(p.over_map for p in priors)
+    if beside:
+        notes.append(f"{beside} frames were taken beside the map")
+    return notes
+
+
+def turned(rotation: Array, heading_rad: float) -> Array:
+    """A camera's rotation (3, 3) turned about the vertical, counter-clockwise."""
+    return np.asarray(so3_exp([0.0, 0.0, heading_rad]) @ rotation)

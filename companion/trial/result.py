@@ -1,0 +1,150 @@
+"""What a trial found, its figures and its verdict in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.integrity_monitor.config import ProtectionConfig
+from companion.integrity_monitor.protection import budget
+from companion.recorded.flight import RecordedFlight
+from companion.trial.estimate import Estimated
+from companion.trial.localize import Localized, horizontal_m
+from companion.trial.priors import FramePrior
+from localizer.geometry.pose import Array
+
+WORKS, PARTLY, NOT, UNKNOWN = "works", "works partly", "does not work", "cannot be told"
+_GOOD_SHARE, _SOME_SHARE = 0.8, 0.3
+_SAME_PLACE_SIGMAS, _LEAST_SAME_M = 4.0, 10.0
+_STILL_MPS = (0.0, 0.0)  # of photos: time stamps are no part of their positions' error
+
+
+@dataclass(frozen=True)
+class Trial:
+    """All of it. priors: corrected ones; first: localized with the telemetry as recorded; second:
+    with what was estimated; searched: without positions, by frame; reasons: of failed frames.
+    """
+
+    flight: RecordedFlight
+    priors: tuple[FramePrior, ...]
+    first: tuple[Localized, ...]
+    second: tuple[Localized, ...]
+    searched: dict[int, Localized]
+    estimated: Estimated | None
+    reasons: dict[int, str]
+    notes: tuple[str, ...]
+
+    @property
+    def accepted(self) -> int:
+        """Frames that were localized from their telemetry."""
+        return sum(one.accepted for one in self.second)
+
+    @property
+    def best(self) -> tuple[Localized, ...]:
+        """Of each frame its result from telemetry, else that of the search."""
+        return tuple(
+            one if one.accepted or not found.accepted else found
+            for k, one in enumerate(self.second)
+            for found in (self.searched.get(k, one),)
+        )
+
+    def errors_m(self) -> Array:
+        """(F,) horizontal distance of accepted positions from the recorded ones, the estimated
+        offset taken off; NaN where there is none of both.
+        """
+        found = np.full(len(self.best), np.nan)
+        for k, (one, prior) in enumerate(zip(self.best, self.priors, strict=True)):
+            if one.accepted and one.pose is not None and prior.pose is not None:
+                found[k] = horizontal_m(one.pose, prior.pose)
+        return found
+
+    def levels_m(self, config: ProtectionConfig | None = None) -> Array:
+        """(F,) horizontal protection level of accepted positions, m; NaN of others."""
+        config = config or ProtectionConfig()
+        levels = np.full(len(self.best), np.nan)
+        for k, (one, prior) in enumerate(zip(self.best, self.priors, strict=True)):
+            if one.accepted and one.covariance is not None:
+                P = one.covariance
+                sigma = float(np.sqrt(max(np.linalg.eigvalsh(P[:2, :2])[-1], 0.0)))
+                sigmas = (sigma, float(np.sqrt(max(P[2, 2], 0.0))))
+                levels[k] = budget(sigmas, prior.clearance_m, _STILL_MPS, config)[0]
+        return levels
+
+    def search_outcome(self) -> tuple[int, int, int]:
+        """Frames that were searched without their position, found there, and found elsewhere."""
+        right = wrong = 0
+        for k, one in self.searched.items():
+            if not one.accepted or one.pose is None:
+                continue
+            known = self.second[k].pose if self.second[k].accepted else self.priors[k].pose
+            if known is None:
+                right += 1  # nobody says otherwise
+                continue
+            sigma = 0.0 if self.second[k].accepted else self.priors[k].sigma_m
+            limit = max(_LEAST_SAME_M, _SAME_PLACE_SIGMAS * sigma)
+            near = horizontal_m(one.pose, known) <= limit
+            right, wrong = right + near, wrong + (not near)
+        return len(self.searched), right, wrong
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """kind: one of the four words; sentence: the verdict; exit_code: 0 works, else 1."""
+
+    kind: str
+    sentence: str
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command."""
+        return 0 if self.kind == WORKS else 1
+
+
+def judge(trial: Trial) -> Judgement:
+    """The verdict in one sentence."""
+    count = len(trial.best)
+    localized = sum(one.accepted for one in trial.best)
+    searched, right, wrong = trial.search_outcome()
+    errors = trial.errors_m()
+    known = errors[np.isfinite(errors)]
+    kind = _kind(localized / count, trial, known)
+    parts = [f"{localized} of {count} frames are localized"]
+    if len(known):
+        parts[0] += f", {np.median(known):.1f} m from GNSS in the median"
+        if trial.estimated is not None and trial.estimated.has_shift:
+            offset = float(np.hypot(*trial.estimated.shift_m[:2]))
+            parts[0] += f" after a map offset of {offset:.1f} m"
+    if searched:
+        found = f"without positions {right} of {searched} are found"
+        parts.append(found + (f" and {wrong} at a wrong place" if wrong else ""))
+    return Judgement(kind, f"Vision {kind} here: {'; '.join(parts)}{_because(trial)}.")
+
+
+def _kind(share: float, trial: Trial, known: Array) -> str:
+    if share < _SOME_SHARE:
+        return NOT
+    wrong = trial.search_outcome()[2]
+    spread = _spread_limit(trial)
+    scattered = len(known) > 0 and float(np.median(known)) > spread
+    return PARTLY if share < _GOOD_SHARE or wrong or scattered else WORKS
+
+
+def _spread_limit(trial: Trial) -> float:
+    """What positions may differ from GNSS by in the median: its own error, and 3 m of ours."""
+    sigmas = [p.sigma_m for p in trial.priors if p.pose is not None]
+    own = float(np.median(sigmas)) if sigmas else 0.0
+    return float(np.hypot(2.0 * own, 3.0))
+
+
+def _because(trial: Trial) -> str:
+    if not trial.reasons:
+        return ""
+    common = _most_common(list(trial.reasons.values()))
+    return f"; most of the others: {common}"
+
+
+def _most_common(texts: Sequence[str]) -> str:
+    heads = [text.split(":", maxsplit=1)[0] for text in texts]
+    return max(set(heads), key=heads.count)

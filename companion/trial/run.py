@@ -1,0 +1,145 @@
+"""One trial: localize with telemetry, estimate what is wrong with it, again, and without places."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from companion.recorded.flight import RecordedFlight
+from companion.trial.estimate import Tools, estimate
+from companion.trial.localize import FrameLocalizer, Localized
+from companion.trial.priors import FramePrior, priors_of
+from companion.trial.reasons import reasons
+from companion.trial.result import Trial
+from localizer.config import LocalizerConfig
+from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
+from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.kind import map_kind
+from localizer.map.kind import MapKind
+from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
+from localizer.tracking.opening import MapStack, build_localizer
+
+Count = Callable[[int, int], None]
+Stage = Callable[[str], AbstractContextManager[Count]]
+_AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
+
+
+@dataclass(frozen=True)
+class TrialOptions:
+    """width: of the working image, pixels; searches: frames that are searched without a place."""
+
+    width: int = 320
+    searches: int = 20
+
+
+def run_trial(
+    flight: RecordedFlight,
+    map_cache: Path,
+    options: TrialOptions | None = None,
+    stage: Stage = lambda _what: nullcontext(lambda _done, _total: None),
+) -> Trial:
+    """Localize the footage over the map. stage: given what is done now, it counts it.
+
+    Errors of the map and of images that cannot be used are named ones.
+    """
+    options = options or TrialOptions()
+    config = LocalizerConfig(width=options.width, feature_threads=2)
+    with ExitStack() as opened:
+        stack = MapStack(map_cache, config)
+        opened.callback(stack.close)
+        known, kind = priors_of(flight, stack.cache), map_kind(stack.cache)
+        search = _Search(stack.cache, config, opened)
+        first_loader = FrameLocalizer(
+            build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
+        )
+        first = _all(flight, known.priors, first_loader, stage, "localizing")
+        extractor = DetailExtractor(load_extractor(None, threads=2))
+        tools = Tools(stack.renderer, extractor, options.width, kind.has_buildings)
+        with stage("estimating camera and map offset") as count:
+            found = estimate(
+                flight.frames, known.priors, first, flight.camera, tools, first_loader, count
+            )
+        priors, second, loader = known.priors, first, first_loader
+        if found is not None:
+            priors = tuple(found.correction.applied(p) for p in known.priors)
+            loader = FrameLocalizer(
+                build_localizer(stack, found.camera, config), search, found.camera
+            )
+            begun = tuple(map(_begun, priors, first))
+            second = _all(flight, begun, loader, stage, "localizing again")
+        searched = _searched(flight, priors, loader, options.searches, stage)
+    why = reasons(flight.frames, priors, second, found, kind)
+    notes = (*flight.notes, *known.notes, *_map_notes(kind, flight))
+    return Trial(flight, priors, first, second, searched, found, why, notes)
+
+
+def _map_notes(kind: MapKind, flight: RecordedFlight) -> tuple[str, ...]:
+    advice = kind.advice(flight.camera.camera.horizontal_fov_deg / 2)
+    return (f"map: {kind.line()}", *([advice] if advice else []))
+
+
+class _Search:
+    """Opens the relocalizer when it is first needed: it computes the map's overview."""
+
+    def __init__(self, cache: TileCache, config: LocalizerConfig, opened: ExitStack) -> None:
+        relocalization = config.relocalization.model_copy(update={"threads": 2})
+        self._config = config.model_copy(update={"relocalization": relocalization})
+        self._cache, self._opened = cache, opened
+        self._relocalizer: Relocalizer | None = None
+
+    def __call__(self) -> Relocalizer:
+        if self._relocalizer is None:
+            made = open_relocalizer(self._cache, self._config)
+            assert made is not None  # only a `should_stop` gives None
+            self._relocalizer = self._opened.enter_context(made)
+        return self._relocalizer
+
+
+def _all(
+    flight: RecordedFlight,
+    priors: tuple[FramePrior, ...],
+    loader: FrameLocalizer,
+    stage: Stage,
+    what: str,
+) -> tuple[Localized, ...]:
+    done = []
+    with stage(what) as count:
+        for recorded, prior in zip(flight.frames, priors, strict=True):
+            done.append(loader.from_prior(recorded, prior))
+            count(len(done), len(priors))
+    return tuple(done)
+
+
+def _begun(prior: FramePrior, first: Localized) -> FramePrior:
+    """The second time, a frame that was searched begins where it was found."""
+    if prior.is_complete or not first.accepted or first.pose is None:
+        return prior
+    return replace(
+        prior, pose=first.pose, rotation=first.pose.rotation, sigma_m=_AGAIN_M,
+        height_m=float(first.pose.translation[2]), height_sigma_m=_AGAIN_M, height_known=True,
+        tilt_sigma_deg=_AGAIN_DEG, heading_sigma_deg=_AGAIN_DEG,
+    )  # fmt: skip
+
+
+def _searched(
+    flight: RecordedFlight,
+    priors: tuple[FramePrior, ...],
+    loader: FrameLocalizer,
+    most: int,
+    stage: Stage,
+) -> dict[int, Localized]:
+    """Frames without their positions, spread over the flight."""
+    chosen = np.unique(np.linspace(0, len(priors) - 1, min(most, len(priors))).round().astype(int))
+    found: dict[int, Localized] = {}
+    if not len(chosen):
+        return found
+    with stage("searching without positions") as count:
+        for k in map(int, chosen):
+            found[k] = loader.anywhere(flight.frames[k], priors[k])
+            count(len(found), len(chosen))
+    return found

@@ -1,0 +1,115 @@
+"""EG 0104's universal set, and ST 0601 read back, against other ways to read the same bytes."""
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from klvdata.misb0601 import UASLocalMetadataSet
+from stanag4609.klv.local_set import parse_local_set
+
+from companion.klv import local_set as tag
+from companion.klv.universal_set import (
+    ANGLE_TO_NORTH,
+    OBLIQUITY,
+    UNIVERSAL_SET_LABEL,
+    decode_universal,
+)
+from companion.recorded.klv_video import decode, read_klv, read_klv_packets
+
+_SHARED = {5, 13, 14, 15, 16, 17, 21, 23, 24}
+_KEYS = {  # by hand, from ST 0601.12 section 8: name, whole key, format
+    tag.TIME: ("060e2b34010101010702010101050000", ">Q"),
+    tag.SENSOR_LATITUDE: ("060e2b34010101030701020102040200", ">d"),
+    tag.SENSOR_LONGITUDE: ("060e2b34010101030701020102060200", ">d"),
+    tag.SENSOR_ALTITUDE: ("060e2b34010101010701020102020000", ">f"),
+    tag.PLATFORM_HEADING: ("060e2b34010101070701100106000000", ">f"),
+    tag.HORIZONTAL_FOV: ("060e2b34010101020420020101080000", ">f"),
+    tag.SLANT_RANGE: ("060e2b34010101010701080101000000", ">f"),
+    ANGLE_TO_NORTH: ("060e2b34010101010701100102000000", ">f"),
+    OBLIQUITY: ("060e2b34010101010701100103000000", ">f"),
+}
+
+
+def _by_search(packet):
+    """Each key looked for in the bytes, its value behind one byte of length."""
+    found = {}
+    for number, (key, kind) in _KEYS.items():
+        at = packet.find(bytes.fromhex(key))
+        if at >= 0:
+            (found[number],) = struct.unpack_from(kind, packet, at + 17)
+    return found
+
+
+def _packet(fields):
+    body = b""
+    for number, value in fields.items():
+        key, kind = _KEYS[number]
+        packed = struct.pack(kind, value)
+        body += bytes.fromhex(key) + bytes((len(packed),)) + packed
+    return UNIVERSAL_SET_LABEL + b"\x82" + len(body).to_bytes(2, "big") + body
+
+
+def test_a_universal_set_is_read_item_by_item():
+    fields = {tag.TIME: 1_221_665_012_027_000, tag.SENSOR_LATITUDE: 38.16, OBLIQUITY: -35.25}
+    assert decode_universal(_packet(fields)) == fields
+
+
+@given(st.integers(min_value=0, max_value=200))
+def test_a_universal_set_that_is_cut_short_is_refused(size):
+    packet = _packet({tag.SENSOR_LATITUDE: 38.16, tag.SENSOR_LONGITUDE: -77.36, OBLIQUITY: -35.0})
+    if size < len(packet):
+        with pytest.raises(ValueError, match=r"cut short|missing|not a universal"):
+            decode_universal(packet[:size])
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from([13, 15, 16, 18, 21, 75, 90]), st.floats(min_value=0.0, max_value=80.0)
+    )
+)
+def test_a_local_set_is_read_as_it_was_written(fields):
+    packet = tag.encode(1_700_000_000_000_000, fields)
+    read = tag.decode(packet)
+    assert read[tag.TIME] == 1_700_000_000_000_000
+    for number, value in fields.items():
+        assert read[number] == pytest.approx(value, abs=0.2)
+    with pytest.raises(ValueError, match="checksum"):
+        tag.decode(packet[:-1] + bytes((packet[-1] ^ 1,)))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("clip", "count"), [("aphill_klv_10s.ts", 300), ("aphill_short.ts", 48)])
+def test_a_real_flights_universal_sets(real_data, clip, count):
+    packets = read_klv_packets(real_data("clips") / clip)
+    assert len(packets) == count
+    for _, packet in packets:
+        read, expected = decode(packet), _by_search(packet)
+        assert {k: read.get(k) for k in expected} == pytest.approx(expected)
+    track = read_klv(real_data("clips") / clip)
+    assert (len(track.samples), track.damaged) == (count, 0)
+    # The ground in the image's middle lies where range and angles put it: 1 % of the range.
+    fields = decode(packets[0][1])
+    down = track.samples[0].view.ned_from_camera[2, 2]
+    height = float(fields[tag.SENSOR_ALTITUDE]) - 0.5 * 60.0  # the ground there is at 0 to 60 m
+    assert float(fields[tag.SLANT_RANGE]) * down == pytest.approx(height, rel=0.05)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("clip", ["h264_klv.ts", "h265_klv.ts", "mpeg2_klv.ts"])
+def test_local_sets_of_other_writers(real_data, clip):
+    packets = read_klv_packets(real_data("clips") / clip)
+    assert len(packets) == 30
+    for _, packet in packets:
+        # Split by one parser, its numbers by the other: neither takes the nested sets as a whole.
+        body = packet[16 + 1 + (packet[16] & 0x7F) :]
+        parsers = UASLocalMetadataSet.parsers
+        told = {
+            item.tag: parsers[bytes((item.tag,))](bytes(item.value)).value.value
+            for item in parse_local_set(body).items
+            if item.tag in _SHARED
+        }
+        read = decode(packet)
+        assert told.keys() == _SHARED
+        for number in _SHARED:
+            assert read[number] == pytest.approx(float(told[number]), rel=1e-4, abs=1e-3), number

@@ -1,0 +1,111 @@
+"""ArduPilot logs of a made-up flight: .tlog and .bin, without an autopilot."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+UTC_S = 1_533_430_800.0  # of the flight's begin
+BOOT_S = 100.0  # since the autopilot's own
+ORIGIN = (47.3, 8.5)
+_METRE_DEG = 1.0 / 111_195.0
+
+# (north m, east m, height m, roll, pitch, yaw rad) at seconds from the begin.
+Motion = Callable[[float], tuple[float, float, float, float, float, float]]
+
+
+def swaying(t: float) -> tuple[float, float, float, float, float, float]:
+    """Ahead to the north, turning and rolling as a small aircraft does."""
+    roll, yaw = 0.15 * math.sin(0.9 * t), 0.3 * math.sin(0.5 * t)
+    return 8.0 * t, 6.0 * math.sin(0.3 * t), 80.0, roll, 0.0, yaw
+
+
+def place(north_m: float, east_m: float) -> tuple[float, float]:
+    """Latitude and longitude, degrees."""
+    shrink = math.cos(math.radians(ORIGIN[0]))
+    return ORIGIN[0] + north_m * _METRE_DEG, ORIGIN[1] + east_m * _METRE_DEG / shrink
+
+
+def write_tlog(
+    path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None
+) -> Path:
+    """Attitude at 10 Hz, position at 5 Hz; gimbal_pitch_deg: MOUNT_STATUS beside them."""
+    codec, frames = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), []
+
+    def send(t: float, message: mavlink.MAVLink_message) -> None:
+        frames.append(struct.pack(">Q", round((UTC_S + t) * 1e6)) + message.pack(codec))
+
+    for step in range(round(seconds * 10)):
+        t = step / 10.0
+        north, east, height, roll, pitch, yaw = motion(t)
+        ms = round((BOOT_S + t) * 1000)
+        if step % 10 == 0:
+            send(t, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+        send(t, mavlink.MAVLink_attitude_message(ms, roll, pitch, yaw, 0, 0, 0))
+        if step % 2 == 0:
+            latitude, longitude = place(north, east)
+            send(t, mavlink.MAVLink_global_position_int_message(
+                ms, round(latitude * 1e7), round(longitude * 1e7), round((500 + height) * 1000),
+                round(height * 1000), 0, 0, 0, 0))  # fmt: skip
+        if gimbal_pitch_deg is not None:
+            hundredths = round(gimbal_pitch_deg * 100)
+            send(t, mavlink.MAVLink_mount_status_message(1, 1, hundredths, 0, 0))
+    path.write_bytes(b"".join(frames))
+    return path
+
+
+_HEAD = b"\xa3\x95"
+_ROWS = {  # name: (type, format, columns)
+    "FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"),
+    "GPS": (130, "QBIHBcLLefffB", "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,U"),
+    "POS": (131, "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
+    "ATT": (132, "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+    "MNT": (133, "QBffffff", "TimeUS,I,DesRoll,Roll,DesPitch,Pitch,DesYawB,YawB"),
+    "CAM": (134, "QBQIHLLefffff", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
+}
+_CODES = {"Q": "Q", "B": "B", "I": "I", "H": "H", "c": "h", "C": "H", "L": "i", "e": "i",
+          "f": "f", "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
+_WEEK_S = 604_800.0
+_GPS_EPOCH_S, _LEAP_S = 315_964_800.0, 18.0
+
+
+def write_dataflash(
+    path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None
+) -> Path:
+    """The same flight as a .bin, with three camera triggers."""
+    body = b"".join(_format(name) for name in _ROWS)
+    gps_s = UTC_S - _GPS_EPOCH_S + _LEAP_S
+    for step in range(round(seconds * 10)):
+        t = step / 10.0
+        north, east, height, roll, pitch, yaw = motion(t)
+        us, (latitude, longitude) = round((BOOT_S + t) * 1e6), place(north, east)
+        lat, lng = round(latitude * 1e7), round(longitude * 1e7)
+        if step % 2 == 0:
+            week, second = divmod(gps_s + t, _WEEK_S)
+            body += _row("GPS", us, 3, round(second * 1000), int(week), 14, 80, lat, lng,
+                         round((500 + height) * 100), 8.0, 0.0, 0.0, 1)  # fmt: skip
+            body += _row("POS", us, lat, lng, 500 + height, height, height)
+        degrees = [round(math.degrees(a) * 100) for a in (roll, pitch)]
+        turn = round(math.degrees(yaw) * 100) % 36000
+        body += _row("ATT", us, 0, degrees[0], 0, degrees[1], turn, turn)
+        if gimbal_pitch_deg is not None:
+            body += _row("MNT", us, 0, 0.0, 0.0, 0.0, gimbal_pitch_deg, 0.0, 0.0)
+        if step in (20, 40, 60):
+            body += _row("CAM", us, 0, step, 0, 0, lat, lng, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    path.write_bytes(body)
+    return path
+
+
+def _format(name: str) -> bytes:
+    number, kinds, columns = _ROWS[name]
+    length = 3 + struct.calcsize("<" + "".join(_CODES[k] for k in kinds))
+    return _row("FMT", number, length, name.encode(), kinds.encode(), columns.encode())
+
+
+def _row(name: str, *values: object) -> bytes:
+    number, kinds, _ = _ROWS[name]
+    return _HEAD + bytes((number,)) + struct.pack("<" + "".join(_CODES[k] for k in kinds), *values)

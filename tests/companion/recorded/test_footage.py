@@ -1,0 +1,167 @@
+"""Folders, photos and videos as people bring them."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from companion.errors import FootageError
+from companion.klv import local_set as tag
+from companion.recorded.footage import FootageOptions, read_footage
+from tests.companion.recorded.logs import UTC_S, swaying, write_tlog
+from tests.companion.recorded.photos import dji, write_photo
+
+_FOCAL_35 = 0xA405
+_TAKEN = 0x9003
+
+
+def _survey(folder, count=4, **more):
+    folder.mkdir(exist_ok=True)
+    for k in range(count):
+        xmp = dji(GpsLatitude=47.3 + 1e-4 * k, GpsLongitude=8.5, RelativeAltitude="+60.0",
+                  GimbalRollDegree="0.0", GimbalPitchDegree="-89.9", GimbalYawDegree="12.0",
+                  **more)  # fmt: skip
+        exif = {_FOCAL_35: 24, _TAKEN: f"2024:05:01 10:00:{2 * k:02d}"}
+        write_photo(folder / f"DJI_{k:04d}.JPG", xmp, exif=exif)
+    return folder
+
+
+def write_video(path, seconds=4.0, klv=None, rates=(10, 10), size=(160, 120)):
+    """Moving blocks; rates: frames a second in the first and the second half; klv: packets by
+    time.
+    """
+    times, t = [], 0.0
+    while t < seconds:
+        times.append(t)
+        t += 1.0 / rates[0 if t < seconds / 2 else 1]
+    with av.open(str(path), "w", format="mpegts" if klv else None) as out:
+        stream = out.add_stream("libx264", rate=10)
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        stream.codec_context.options = {"bf": "0", "g": "5", "preset": "ultrafast"}
+        data = out.add_mux_stream("klv", time_base=Fraction(1, 90_000)) if klv else None
+        for at in times:
+            for when, body in [x for x in klv or [] if x[0] <= at]:
+                klv.remove((when, body))
+                packet = av.Packet(body)
+                packet.stream, packet.time_base = data, Fraction(1, 90_000)
+                packet.pts = packet.dts = round(when * 90_000)
+                out.mux(packet)
+            image = np.full((size[1], size[0], 3), 60, np.uint8)
+            image[20:60, round(20 * at) : round(20 * at) + 40] = 220
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = round(at * 1000), Fraction(1, 1000)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    return path
+
+
+def test_a_folder_of_photos_needs_nothing_else(tmp_path):
+    flight = read_footage(_survey(tmp_path / "p"), FootageOptions(tmp_path / "w", frames=3))
+    assert (flight.kind, len(flight.frames), flight.located) == ("photos", 3, 3)
+    assert "3 of 4 photos are used" in flight.notes[0]
+    assert flight.frames[0].telemetry.view.nadir_angle_deg < 1.0
+    assert flight.camera.focal_percent == 2.0
+
+
+def test_what_is_wrong_with_photos_is_named(tmp_path):
+    options = FootageOptions(tmp_path / "w")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(FootageError, match="no photo and no video"):
+        read_footage(empty, options)
+    (empty / "DJI_0001.DNG").write_bytes(b"II*\0")
+    with pytest.raises(FootageError, match="raw photos"):
+        read_footage(empty, options)
+    with pytest.raises(FootageError, match="raw photos are not read"):
+        read_footage(empty / "DJI_0001.DNG", options)
+    with pytest.raises(FootageError, match="no such file"):
+        read_footage(tmp_path / "nowhere", options)
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    write_photo(bare / "a.jpg")
+    with pytest.raises(FootageError, match="focal length"):
+        read_footage(bare, options)
+    flight = read_footage(bare, FootageOptions(tmp_path / "w", fov_deg=70.0))
+    assert "1 of 1 frames have no position" in flight.notes
+
+
+def test_zero_angles_other_lenses_and_rotated_photos_are_told(tmp_path):
+    folder = _survey(tmp_path / "p", FlightYawDegree="90.0")
+    for k in range(4):
+        zero = dji(GimbalRollDegree="+0.00", GimbalPitchDegree="+0.00", GimbalYawDegree="+0.00")
+        write_photo(folder / f"Z_{k:04d}.JPG", zero, exif={_FOCAL_35: 24, 0x0112: 6})
+    write_photo(folder / "thermal.jpg", exif={_FOCAL_35: 24}, size=(32, 24))
+    notes = " ".join(read_footage(folder, FootageOptions(tmp_path / "w")).notes)
+    assert "4 of 8 photos have gimbal angles that are exactly zero" in notes
+    assert "1 photos of another camera or size are left out" in notes
+    assert "4 photos are marked as rotated" in notes
+
+
+def test_several_files_of_places_are_asked_about(tmp_path):
+    folder = _survey(tmp_path / "p")
+    for name in ("a.csv", "b.csv"):
+        (folder / name).write_text("name,lat,lon\nDJI_0000.JPG,47.0,8.0\n")
+    with pytest.raises(FootageError, match=r"a\.csv, b\.csv; choose one by --places"):
+        read_footage(folder, FootageOptions(tmp_path / "w"))
+    flight = read_footage(folder, FootageOptions(tmp_path / "w", places=folder / "a.csv"))
+    assert flight.frames[0].telemetry.position.latitude_deg == 47.0
+
+
+def test_a_video_with_subtitles(tmp_path):
+    video = write_video(tmp_path / "DJI_0001.MP4", rates=(10, 4))
+    cues = "".join(
+        f"{s + 1}\n00:00:0{s},000 --> 00:00:0{s},500\n[focal_len: 24] "
+        f"[latitude: {47.3 + 1e-4 * s}] "
+        "[longitude: 8.5] [rel_alt: 60.0 abs_alt: 500]\n\n"
+        for s in range(5)
+    )
+    (tmp_path / "DJI_0001.SRT").write_text(cues)
+    flight = read_footage(video, FootageOptions(tmp_path / "w", frames=4))
+    assert flight.kind == "video"
+    times = [(f.time_ns or 0) / 1e9 for f in flight.frames]
+    assert times == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.26)
+    for frame in flight.frames:
+        latitude = frame.telemetry.position.latitude_deg
+        assert latitude == pytest.approx(47.3 + 1e-13 * (frame.time_ns or 0), abs=1e-7)
+
+
+def test_a_video_with_metadata_in_it(tmp_path):
+    fields = {tag.SENSOR_LATITUDE: 47.3, tag.SENSOR_LONGITUDE: 8.5, tag.SENSOR_ALTITUDE: 560.0,
+              tag.HORIZONTAL_FOV: 60.0, tag.PLATFORM_HEADING: 90.0, tag.PLATFORM_PITCH: 0.0,
+              tag.PLATFORM_ROLL: 0.0, tag.RELATIVE_AZIMUTH: 0.0, tag.RELATIVE_ELEVATION: -60.0,
+    }  # fmt: skip
+    packets = [(0.1 * k, tag.encode(round(1e6 * (UTC_S + 0.1 * k)), fields)) for k in range(40)]
+    packets[7] = (packets[7][0], packets[7][1][:-1] + b"\x00")
+    video = write_video(tmp_path / "a.ts", klv=packets)
+    flight = read_footage(video, FootageOptions(tmp_path / "w", frames=4))
+    assert "1 of 40 KLV packets cannot be read" in flight.notes
+    assert flight.camera.camera.horizontal_fov_deg == pytest.approx(60.0, abs=0.01)
+    axis = flight.frames[2].telemetry.view.ned_from_camera[:, 2]
+    np.testing.assert_allclose(axis, [0, 0.5, np.sqrt(0.75)], atol=1e-3)
+
+
+def test_a_video_without_telemetry_or_with_anothers_is_named(tmp_path):
+    video = write_video(tmp_path / "a.mp4")
+    with pytest.raises(FootageError, match="focal length"):
+        read_footage(video, FootageOptions(tmp_path / "w"))
+    flight = read_footage(video, FootageOptions(tmp_path / "w", fov_deg=70.0))
+    assert any("no telemetry" in note for note in flight.notes)
+    write_tlog(tmp_path / "a.tlog", swaying, 20.0)
+    with pytest.raises(FootageError, match="cannot be found by motion"):
+        read_footage(video, FootageOptions(tmp_path / "w", fov_deg=70.0))
+    (tmp_path / "b.mp4").write_bytes(video.read_bytes()[:200])
+    with pytest.raises(FootageError, match="not a video, or damaged"):
+        read_footage(tmp_path / "b.mp4", FootageOptions(tmp_path / "w", fov_deg=70.0))
+
+
+def test_the_sample_of_the_tutorial_is_complete(tmp_path):
+    sample = Path(__file__).parents[3] / "examples" / "footage"
+    flight = read_footage(sample / "photos", FootageOptions(tmp_path / "w"))
+    assert (len(flight.frames), flight.located, flight.notes) == (8, 8, ())
+    assert all(f.telemetry.view is not None for f in flight.frames)
+    assert (sample / "dsm.tif").is_file()
+    assert (sample / "ortho.tif").is_file()

@@ -1,0 +1,77 @@
+"""``companion try`` on photos of a generated world whose tags are wrong by known amounts."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from companion.config import load_config
+from companion.convert.angles import gimbal_of_pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.map.cache.cache import TileCache
+from tests.companion.recorded.photos import dji, write_photo
+
+_EAST_M, _UP_DEG, _FOCAL_35 = 5.0, 4.0, 0xA405
+_FRAMES = 5
+
+
+def _photos(folder, sequence, frame: LocalFrame, camera: Camera):
+    """JPEGs with DJI's tags: GNSS 5 m west of the map, the gimbal 4 degrees below the truth."""
+    folder.mkdir()
+    rows = read_poses(sequence / "poses.txt")
+    for row in [rows[int(k)] for k in np.linspace(0, len(rows) - 1, _FRAMES)]:
+        pose = world_from_camera(row, frame)
+        told = frame.position(pose.translation - [_EAST_M, 0.0, 0.0])
+        down = so3_exp([-np.radians(_UP_DEG), 0.0, 0.0])  # about the image's right
+        gimbal = gimbal_of_pose(Pose(pose.rotation @ down, pose.translation), frame)
+        xmp = dji(GpsLatitude=told.latitude_deg, GpsLongitude=told.longitude_deg,
+                  AbsoluteAltitude=told.height_m, AltitudeType="RtkAlt",
+                  GimbalRollDegree=gimbal.roll_deg, GimbalPitchDegree=gimbal.pitch_deg,
+                  GimbalYawDegree=gimbal.yaw_deg)  # fmt: skip
+        pixels = np.asarray(Image.open(sequence / "images" / row.name).convert("RGB"))
+        focal = camera.fx * 43.267 / np.hypot(camera.width, camera.height)
+        name = row.name.rsplit(".", 1)[0] + ".jpg"
+        write_photo(folder / name, xmp, pixels=pixels, exif={_FOCAL_35: round(focal, 3)})
+    return folder
+
+
+def _run(*arguments):
+    return CliRunner().invoke(app, ["try", *map(str, arguments)])
+
+
+def test_photos_tell_what_is_wrong_with_their_tags(small_assets, small_sequence, tmp_path):
+    frame = TileCache.open(small_assets.map_cache).frame
+    camera = Camera.from_json(small_sequence / "camera.json")
+    photos = _photos(tmp_path / "photos", small_sequence, frame, camera)
+    report = tmp_path / "report"
+    result = _run(photos, "--map", small_assets.map_cache, "--report", report, "--searches", 1,
+                  "--camera", small_sequence / "camera.json")  # fmt: skip
+    figures = json.loads((report / "trial.json").read_text())
+    assert figures["accepted"] >= _FRAMES - 1, result.output
+    assert figures["found_elsewhere"] == 0
+    assert result.exit_code == 0, result.output
+    estimated = figures["estimated"]
+    assert estimated["mount_deg"][1] == pytest.approx(_UP_DEG, abs=1.0)
+    assert estimated["shift_m"][:2] == pytest.approx([_EAST_M, 0.0], abs=1.5)
+    assert "Vision works here" in result.output
+    page = (report / "report.html").read_text()
+    assert "Vision works here" in page
+    assert "Estimated camera and map" in page
+    config = load_config(report / "deployment.yaml")
+    assert config.bridge.camera.mount == "gimbal"
+    assert config.bridge.camera.mount_pitch_deg == pytest.approx(_UP_DEG, abs=1.0)
+
+
+def test_without_a_map_the_needed_one_is_named(tmp_path):
+    xmp = dji(GpsLatitude=47.3, GpsLongitude=8.5, RelativeAltitude="+60.0")
+    photo = write_photo(tmp_path / "a.jpg", xmp, exif={_FOCAL_35: 24})
+    result = _run(photo, "--report", tmp_path / "r")
+    assert result.exit_code == 1
+    assert "needs a map of latitude" in result.output
+    assert "companion map fetch --rectangle" in result.output
