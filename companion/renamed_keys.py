@@ -15,15 +15,21 @@ RENAMED = {
     "guardian": "integrity_monitor",
     "integrity_monitor.untold_jump_m": "integrity_monitor.unreported_jump_m",
     "camera.settings.stamps_late_ms": "camera.settings.time_offset_ms",
-    "localizer.integrity.min_agreement": "localizer.integrity.min_patch_inlier_ratio",
-    "localizer.integrity.min_parts": "localizer.integrity.min_patches",
     "localizer.integrity.distinct_from_m": "localizer.integrity.ambiguity_sigma_m",
-    "localizer.integrity.min_peak": "localizer.integrity.peak_to_sidelobe_min",
     "localizer.integrity.gate": "localizer.integrity.chi2_threshold",
     "localizer.odometry.gate": "localizer.odometry.chi2_threshold",
     "localizer.relocalization.min_agreement": "localizer.relocalization.min_patch_inlier_ratio",
 }
 """Old path: new path, both in the same section; a section's own rename comes before its keys'."""
+
+REMOVED = tuple(
+    f"localizer.integrity.{key}"
+    for key in (
+        "min_quality", "max_sigma_m", "min_agreement", "min_parts", "min_peak",
+        "min_patch_inlier_ratio", "min_patches", "peak_to_sidelobe_min",
+    )
+)  # fmt: skip
+"""Thresholds that `localizer.integrity.min_log_odds` replaces: left out, with a warning."""
 
 
 def with_current_keys(data: dict[str, Any], where: str) -> dict[str, Any]:
@@ -40,7 +46,22 @@ def with_current_keys(data: dict[str, Any], where: str) -> dict[str, Any]:
         if isinstance(section, dict) and key in section and today not in section:
             _log.warning("%s: %s is called %s since 0.2: rename it", where, old, new)
             data = _renamed(data, path, key, today)
+    for old in REMOVED:
+        *path, key = old.split(".")
+        section = data
+        for name in path:
+            section = section.get(name) if isinstance(section, dict) else None
+        if isinstance(section, dict) and key in section:
+            _log.warning("%s: %s has no effect since 0.2: remove it", where, old)
+            data = _without(data, path, key)
     return data
+
+
+def _without(data: dict[str, Any], path: list[str], key: str) -> dict[str, Any]:
+    """A copy in which one key of a section is missing."""
+    if not path:
+        return {name: value for name, value in data.items() if name != key}
+    return {**data, path[0]: _without(data[path[0]], path[1:], key)}
 
 
 def _renamed(data: dict[str, Any], path: list[str], key: str, today: str) -> dict[str, Any]:

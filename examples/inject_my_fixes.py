@@ -48,7 +48,9 @@ def main(connection: str, latitude: str, longitude: str, altitude: str, geoid: s
         }
     )
     # What the operator reads, on the ground station and here: "injecting", "not sent: ...", ...
-    with Bridge(config, float(geoid), on_text=lambda _, text: print(text, flush=True)) as bridge:
+    with Bridge(
+        config, float(geoid), on_text=lambda _, text, _alert: print(text, flush=True)
+    ) as bridge:
         for line in sys.stdin:
             try:
                 bridge.submit(fix_of(line))  # never blocks; the bridge has threads of its own

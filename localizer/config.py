@@ -35,7 +35,7 @@ class LocalizerConfig(BaseModel):
         "auto", description="auto: a GPU if there is one, otherwise numba"
     )
     device: DeviceChoice = Field(
-        "auto", description="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"
+        "cpu", description="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"
     )
     threads: int = Field(2, ge=1, le=256, description="CPU threads of rendering and optimization")
     feature_threads: int = Field(
@@ -54,7 +54,13 @@ class LocalizerConfig(BaseModel):
     calibration: CalibrationSigmas = CalibrationSigmas()
     attitude: AttitudePrior | None = Field(
         AttitudePrior(),
-        description="use roll and pitch of autopilot and gimbal; null: no",
+        description="fuse roll and pitch of autopilot and gimbal with each fix; null: no",
+    )
+    height_sigma_m: float | None = Field(
+        3.0,
+        ge=0.1,
+        le=1000,
+        description="of the autopilot's height (barometer) against the map's; null: not used",
     )
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()

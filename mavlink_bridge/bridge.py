@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.components import COMMANDS_IN, Components
@@ -65,7 +67,7 @@ class Bridge:
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
-    on_text: called likewise with every line for the operator (severity, text), for a record.
+    on_text: called likewise with every line for the operator (severity, text, its alert).
     on_vehicle_text: called likewise with every STATUSTEXT of the autopilot (severity, text, sender
     as "system/component"), long ones in their parts.
     opener: opens the links' transports; raises OSError or EndpointError while it cannot.
@@ -79,7 +81,7 @@ class Bridge:
         *,
         on_track: Callable[[TrackRequest], None] | None = None,
         on_hint: Callable[[PlaceHint], bool] | None = None,
-        on_text: Callable[[int, str], None] = lambda _severity, _text: None,
+        on_text: Callable[[int, str, Alert | None], None] = lambda _severity, _text, _alert: None,
         on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None,
         opener: Callable[[Endpoint], Transport] = open_transport,
     ) -> None:
@@ -207,15 +209,15 @@ class Bridge:
         if self._shared.on_track is not None:
             self._shared.on_track(request)
 
-    def suppress_ekf_ok(self, why: str) -> None:
-        """Until it is called with an empty text, "the EKF follows" is not said."""
-        self._fc.outcome.suppress_ekf_ok = why
-
-    def inhibit(self, why: str) -> None:
-        """Until it is called with an empty text, injection and a switch to vision do not begin, but
-        by the pilot's gate (mode ``rc``) or `injection.force`.
+    def inhibit(self, of: AlertId) -> None:
+        """Until `clear`: what the alert inhibits does not begin (`Inhibits`). The pilot's command
+        (mode ``rc``) and `injection.force` overrule it.
         """
-        self._fc.inhibit(why)
+        self._fc.inhibit(of)
+
+    def clear(self, of: AlertId) -> None:
+        """The alert inhibits nothing any more."""
+        self._fc.clear(of)
 
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
@@ -234,6 +236,10 @@ class Bridge:
         tell: false for what the bridge tells by itself.
         """
         self._status.set_health(level, text, tell=tell)
+
+    def report_alert(self, alert: Alert) -> None:
+        """An alert for the operator: STATUSTEXT on the ground side, and the log."""
+        self._status.report(alert)
 
     def say(self, severity: int, text: str) -> None:
         """A line for the operator: STATUSTEXT on the ground side, and the log."""

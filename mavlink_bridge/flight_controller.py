@@ -8,6 +8,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Inhibits
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import BridgeConfig, Mode
@@ -124,9 +127,17 @@ class FlightControllerEnd:
         """After the link has ended; before, where that is not in order."""
         self._interlock.end(clean_shutdown=clean_shutdown)
 
-    def inhibit(self, why: str) -> None:
-        """Until it is called with an empty text, nothing begins."""
-        self._interlock.forbidden = why
+    def inhibit(self, of: AlertId) -> None:
+        """Until `clear`: what the alert inhibits does not begin."""
+        if Inhibits.INJECTION in CATALOGUE[of].inhibits:
+            self._interlock.inhibited_by |= {of}
+        if Inhibits.EKF_OK in CATALOGUE[of].inhibits:
+            self.outcome.ekf_ok_inhibited_by |= {of}
+
+    def clear(self, of: AlertId) -> None:
+        """The alert inhibits nothing any more."""
+        self._interlock.inhibited_by -= {of}
+        self.outcome.ekf_ok_inhibited_by -= {of}
 
     @property
     def injecting(self) -> bool:

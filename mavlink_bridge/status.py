@@ -10,6 +10,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import severity
+from mavlink_bridge.alerts.catalogue import text as alert_text
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import HealthLevel, without_figures
 from mavlink_bridge.status_notifier import Hysteresis
@@ -33,12 +36,15 @@ _SEVERITY = {
 class OperatorStatus:
     """Tells the operator. Every method may be called from any thread.
 
-    send: a line's severity and message to the ground; on_text: every line (severity, text), for a
+    send: a line's severity and message to the ground; on_text: every line (severity, text, its
+    alert), for a
     record.
     """
 
     def __init__(
-        self, send: Callable[[int, Any], None], on_text: Callable[[int, str], None]
+        self,
+        send: Callable[[int, Any], None],
+        on_text: Callable[[int, str, Alert | None], None],
     ) -> None:
         self._send = send
         self._on_text = on_text
@@ -79,7 +85,13 @@ class OperatorStatus:
         if news and tell:
             self.say(_SEVERITY[level], f"PiLoT: {text or level.value}", now_ns)
 
-    def say(self, severity: int, text: str, now_ns: int | None = None) -> None:
+    def report(self, alert: Alert, now_ns: int | None = None) -> None:
+        """An alert: its text, and the alert itself for who records it. As `say`."""
+        self.say(severity(alert), alert_text(alert), now_ns, alert)
+
+    def say(
+        self, severity: int, text: str, now_ns: int | None = None, alert: Alert | None = None
+    ) -> None:
         """STATUSTEXT, and the log. A line that is said again within a second is left out: a flood
         of orders that are refused would hide every other, and wear out the link and the record. One
         after another line is no repetition: "on" after "off" tells how it stands.
@@ -89,7 +101,7 @@ class OperatorStatus:
         self._texts.append((severity, text))
         grave = severity <= mavlink.MAV_SEVERITY_WARNING
         _log.log(logging.WARNING if grave else logging.INFO, text)
-        self._on_text(severity, text)
+        self._on_text(severity, text, alert)
         with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
             self._text_id = text_id = self._text_id % 0xFFFF + 1
         for message in status_texts(severity, text, text_id):

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.site.__main__ import outdated
 from benchmarks.site.kept import DATA, load
-from companion.integrity_monitor.alert_rules import RULES
+from mavlink_bridge.alerts.integrity import INTEGRITY
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -63,10 +63,10 @@ def test_what_the_safety_page_names_exists_and_each_finding_is_on_it():
     settings = {"gimbal_component"}
     assert named - known - settings == set()
     operator = (ROOT / "docs/how-to/when-vision-ends.md").read_text(encoding="utf-8")
-    for rule in RULES:
+    for rule in INTEGRITY:
         words = re.split(r"\{[^}]*\}", rule.text)[0].strip(" (,") or rule.text.split("} ")[1]
-        assert words in page, rule.name
-        assert words in operator, rule.name
+        assert words in page, rule.id
+        assert words in operator, rule.id
 
 
 def test_every_leaf_of_the_hazard_analysis_has_its_test_and_each_test_exists():

@@ -31,7 +31,6 @@ from companion.calibration_watch.observation import CalibrationEstimate, Calibra
 from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.errors import CompanionError, RecordError
 from companion.geometry import ned_from_world
-from companion.integrity_monitor.alert_rules import FOCAL
 from companion.integrity_monitor.inertial import InertialTrack
 from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.replay import FlightRecord, RecordedEstimate, load_record
@@ -39,6 +38,8 @@ from localizer.errors import MapCacheError
 from localizer.geometry.pose import matrix_from_quaternion, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.tlog import read_tlog
@@ -155,7 +156,7 @@ def _latched(bad: Sequence[float], all_s: Sequence[float], begin_s: float) -> fl
             since = None
             continue
         since = t if since is None else since
-        if t - since >= FOCAL.raise_s:
+        if t - since >= CATALOGUE[AlertId.FOCAL_LENGTH].raise_s:
             return t - begin_s
     return None
 

@@ -12,13 +12,13 @@ import numpy as np
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.beginnings import WRONG
 from benchmarks.integrity.run import StartOutcome
-from localizer.integrity.acceptance import IntegrityConfig
+from localizer.integrity.acceptance import IntegrityConfig, ambiguity
 
 Acceptance = Callable[[StartOutcome], bool]
 
-WITHOUT, AGREE = "no added test", "parts agree"
-DISTINCT, FOCAL = "parts agree, stands out: ours", "parts agree, no other focal length"
-OURS = "all three: ours on trial"
+WITHOUT, LIKELY = "overlap and prediction alone", "log odds, any prior"
+DISTINCT, FOCAL = "log odds by the prior: ours", "log odds, no other focal length"
+OURS = "both: ours on trial"
 
 # What is put together beside all: a picture cannot tell a focal length from a distance, nor one of
 # many equal roofs from the next.
@@ -32,32 +32,30 @@ _TOGETHER: dict[str, Acceptance] = {
 
 
 def acceptances(config: IntegrityConfig) -> dict[str, Acceptance]:
-    """What was accepted without the parts' votes, that with each test added, and all of them."""
+    """What is accepted without the evidence, that with each test added, and all of them."""
     c = config
 
     def plain(o: StartOutcome) -> bool:
-        good = o.ok and o.overlap >= c.min_overlap and o.quality >= c.min_quality
-        return good and o.sigma_m <= c.max_sigma_m and o.gate <= c.chi2_threshold
+        return o.ok and o.overlap >= c.min_overlap and o.gate <= c.chi2_threshold
 
-    def votes(o: StartOutcome, share: float) -> bool:
-        return plain(o) and o.parts >= c.min_patches and o.votes >= share * o.parts
+    def likely(o: StartOutcome, ambiguous: float = 0.0) -> bool:
+        return plain(o) and o.log_odds >= c.min_log_odds + ambiguous
+
+    def by_prior(o: StartOutcome) -> bool:
+        return likely(o, ambiguity(c, o.prior_sigma_m))
 
     def focal(o: StartOutcome) -> bool:
         return o.focal_gain <= c.max_focal_gain
-
-    def stands_out(o: StartOutcome) -> bool:
-        return o.prior_sigma_m < c.ambiguity_sigma_m or o.peak >= c.peak_to_sidelobe_min
 
     return {
         WITHOUT: plain,
         "second mode 5 % worse": lambda o: plain(o) and o.lead >= 0.05,
         "quality 0.3": lambda o: plain(o) and o.quality >= 0.3,
         "peak 4.5": lambda o: plain(o) and o.peak >= 4.5,
-        "55 % of parts agree": lambda o: votes(o, 0.55),
-        AGREE: lambda o: votes(o, c.min_patch_inlier_ratio),
-        DISTINCT: lambda o: votes(o, c.min_patch_inlier_ratio) and stands_out(o),
-        FOCAL: lambda o: votes(o, c.min_patch_inlier_ratio) and focal(o),
-        OURS: lambda o: votes(o, c.min_patch_inlier_ratio) and focal(o) and stands_out(o),
+        LIKELY: likely,
+        DISTINCT: by_prior,
+        FOCAL: lambda o: likely(o) and focal(o),
+        OURS: lambda o: by_prior(o) and focal(o),
     }
 
 
@@ -137,7 +135,7 @@ def by_condition(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> s
         lost = sum(not tests[OURS](o) for o in mine)
         lines.append(f"| {condition} | {Rate.of(lost, len(mine))} |")
     focal = [o for o in outcomes if o.kind == "focal near"]
-    for label in (WITHOUT, AGREE, OURS):
+    for label in (WITHOUT, LIKELY, OURS):
         false = sum(tests[label](o) and not o.right for o in focal)
         lines.append(
             f"| focal length 5 % off, begun right: accepted > 3 m off, {label} "
@@ -147,17 +145,16 @@ def by_condition(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> s
 
 
 def plot(outcomes: Sequence[StartOutcome], config: IntegrityConfig, path: Path) -> None:
-    """Share of agreeing parts over quality, of right and of wrong results."""
+    """Log odds over quality, of right and of wrong results."""
     figure, axes = plt.subplots(figsize=(7, 5))
     seen = [o for o in outcomes if o.ok and o.parts]
     for label, right, colour in (("wrong", False, "tab:red"), ("right", True, "tab:green")):
         mine = [o for o in seen if o.right is right and (right or o.far)]
-        x, y = [o.quality for o in mine], [o.votes / o.parts for o in mine]
+        x, y = [o.quality for o in mine], [o.log_odds for o in mine]
         axes.scatter(np.array(x), np.array(y), s=3, color=colour, label=f"{label}, {len(mine)}")
-    axes.axhline(config.min_patch_inlier_ratio, color="black", ls="--", lw=0.8)
-    axes.axvline(config.min_quality, color="black", ls=":", lw=0.8)
+    axes.axhline(config.min_log_odds, color="black", ls="--", lw=0.8)
     axes.set_xlabel("registration quality")
-    axes.set_ylabel("share of the image's parts that agree")
+    axes.set_ylabel("log odds of the right place")
     axes.legend()
     axes.grid(alpha=0.3)
     figure.tight_layout()

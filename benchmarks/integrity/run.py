@@ -19,6 +19,7 @@ from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.geometry.camera import Camera
 from localizer.integrity.acceptance import IntegrityConfig
+from localizer.integrity.probability import evidence, place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration
@@ -62,6 +63,15 @@ class StartOutcome:
     lead: float = 0.0
     focal_gain: float = -1.0
     prior_sigma_m: float = 0.0
+
+    @property
+    def log_odds(self) -> float:
+        """Of the right place, by all the evidence."""
+        if not self.ok or self.parts == 0:
+            return -np.inf
+        share = self.votes / self.parts
+        features = evidence(self.quality, self.parts, share, self.peak, self.lead)
+        return place_model().log_odds(features)
 
     @property
     def right(self) -> bool:
@@ -239,7 +249,7 @@ def again(
                 if row is None or _start(begun) != (row["kind"], row["start_m"], row["start_deg"]):
                     continue  # it did not meet the map
                 kept = StartOutcome(**row, prior_sigma_m=place_sigma_m(begun.prior))
-                if votes_accept(kept, config):
+                if evidence_accepts(kept, config):
                     kept = registrar.repeated(name, views[k], k, begun, shift, kept)
                 fresh.append(asdict(kept))
                 row = next(mine, None)
@@ -261,17 +271,11 @@ def unseen(views: Sequence[BasinView], seen: Path | None) -> list[int]:
     return [k for k, view in enumerate(views) if id(view) not in known and first[id(view)] == k]
 
 
-def votes_accept(outcome: StartOutcome, config: IntegrityConfig) -> bool:
-    """Whether it passes all tests but those for another focal length and for standing out."""
+def evidence_accepts(outcome: StartOutcome, config: IntegrityConfig) -> bool:
+    """Whether it passes all tests but those for another focal length and a wide prior."""
     o, c = outcome, config
-    good = o.ok and o.overlap >= c.min_overlap and o.quality >= c.min_quality
-    return (
-        good
-        and o.sigma_m <= c.max_sigma_m
-        and o.gate <= c.chi2_threshold
-        and o.parts >= c.min_patches
-        and o.votes >= c.min_patch_inlier_ratio * o.parts
-    )
+    good = o.ok and o.overlap >= c.min_overlap and o.gate <= c.chi2_threshold
+    return good and o.log_odds >= c.min_log_odds
 
 
 def places_of(everywhere: Sequence[BasinView]) -> list[BasinView]:

@@ -249,12 +249,10 @@ def _pixloc(stack: MapStack, setting: Setting) -> Tracking:
 
 
 def _gradient(stack: MapStack, setting: Setting) -> Tracking:
-    """Ours, with hand-made features in the network's place, and without the votes of the image's
-    parts: their limits were drawn for the network's features and refuse right poses of these.
+    """Ours, with hand-made features in the network's place, and without the test of the evidence:
+    it is fitted to the network's features and refuses right poses of these.
     """
-    no_votes = setting.config.integrity.model_copy(
-        update={"min_patches": 0, "min_patch_inlier_ratio": 0.0}
-    )
+    no_votes = setting.config.integrity.model_copy(update={"min_log_odds": -20.0})
     config = setting.config.model_copy(update={"integrity": no_votes})
     localizer = Localizer(
         stack.renderer, DetailExtractor(GradientExtractor()), JNGO(config.registration, threads=1),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.protection.fit import exact_interval
-from companion.integrity_monitor.alert_rules import RULES, OutputAction
+from mavlink_bridge.alerts.alert import OutputAction
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.reading import alert_of
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.scenario import ScenarioError
@@ -47,7 +50,8 @@ class FlownPositions:
     @property
     def was_withheld(self) -> bool:
         """Whether the monitor withheld positions."""
-        return any(r.name in self.told for r in RULES if r.action is not OutputAction.NONE)
+        holding = (s for s in CATALOGUE.values() if s.action is not OutputAction.NONE)
+        return any(spec.id.value in self.told for spec in holding)
 
 
 @dataclass(frozen=True)
@@ -202,8 +206,8 @@ def _truth(path: Path) -> np.ndarray:
 def _told(folder: Path) -> dict[str, int]:
     """How often each finding of the monitor was said, by the companion's events."""
     rows = [row for path in sorted(folder.glob("companion*/events.csv")) for row in _rows(path)]
-    said = {rule.name: sum(rule.is_line(row["text"]) for row in rows) for rule in RULES}
-    return {name: count for name, count in said.items() if count}
+    read = (alert_of(row["text"]) for row in rows)
+    return dict(Counter(one[0].value for one in read if one is not None and one[1]))
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -18,7 +18,6 @@ import numpy as np
 
 from companion.conversions import camera_on_body
 from companion.flight.injection import JumpPolicy
-from companion.integrity_monitor.alert_rules import RULES
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.protection import budget
@@ -133,8 +132,8 @@ def replay(
                 due = next(waiting, None)
             else:
                 vehicle.now_ns = step_ns
-                lines = monitor.step(vehicle.now_ns, vehicle)
-                told.update(r.name for r in RULES for one in lines if r.is_line(one.text))
+                alerts = monitor.step(vehicle.now_ns, vehicle)
+                told.update(alert.id.value for alert in alerts if alert.active)
                 step_ns += _STEP_NS
         if vehicle.tracker.accepts(message):
             vehicle.tracker.handle(message, now_ns)

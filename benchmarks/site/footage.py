@@ -7,7 +7,6 @@ earlier visit. The tags are wrong as real ones are: GNSS lies 4 m beside the map
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 
@@ -16,6 +15,8 @@ import rasterio
 from PIL import ExifTags, Image
 from rasterio.transform import from_bounds
 
+from benchmarks.common.arguments import Parser
+from benchmarks.common.named_errors import named_errors
 from companion.convert.angles import gimbal_of_pose
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -123,5 +124,13 @@ def _tags(row: PoseRow, frame: LocalFrame, takeoff_m: float) -> str:
     return " ".join(f'drone-dji:{name}="{value}"' for name, value in tags.items())
 
 
+def main() -> None:
+    """Make it."""
+    parser = Parser(__doc__)
+    parser.add_argument("folder", type=Path, help="where the sample goes")
+    make(parser.parse_args().folder)
+
+
 if __name__ == "__main__":
-    make(Path(sys.argv[1]))
+    with named_errors():
+        main()

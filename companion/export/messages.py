@@ -218,7 +218,8 @@ def target_on_map(row: Row) -> GeoJSON:
 def event(row: Row, time_ns: int) -> Log:
     """What the companion told."""
     level = _LEVELS.get(str(row["level"]), Log.INFO)
-    return Log(timestamp=stamp(time_ns), level=level, message=str(row["text"]), name="companion")
+    alert, text = str(row.get("alert") or ""), str(row["text"])  # of 0.1 a record has no alerts
+    return Log(timestamp=stamp(time_ns), level=level, message=text, name="companion", file=alert)
 
 
 def status_text(text: str, severity: int, sender: str, time_ns: int) -> Log:

@@ -11,6 +11,7 @@ from typing import Generic, ParamSpec
 
 from companion.targets.target_manager import TargetEstimate
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.messages import TrackRequest
 
 P = ParamSpec("P")
@@ -54,8 +55,8 @@ class Channels:
     """The name of every target that ended, on the targets' thread."""
     clicks: Channel[[TrackRequest]] = field(default_factory=Channel)
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
-    texts: Channel[[int, str]] = field(default_factory=Channel)
-    """Every line (MAV_SEVERITY, text) that the bridge told the operator, on any thread."""
+    texts: Channel[[int, str, Alert | None]] = field(default_factory=Channel)
+    """Every line (MAV_SEVERITY, text, its alert) that the operator was told, on any thread."""
     vehicle_texts: Channel[[int, str, str]] = field(default_factory=Channel)
     """Every line (MAV_SEVERITY, text, sender) of the autopilot, on a MAVLink link's thread."""
     events: Channel[[str, str]] = field(default_factory=Channel)

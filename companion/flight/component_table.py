@@ -33,8 +33,8 @@ from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.view_reporter import ViewReporter
 from companion.ground.vital_signs import VitalSigns
-from companion.integrity_monitor.alert_rules import InhibitMemory
 from companion.integrity_monitor.checks import IntegrityLimits
+from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.klv.metadata import KlvContext
 from companion.klv.relay import KlvRelay
@@ -62,6 +62,7 @@ from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.injection.restart_memory import RestartMemory
@@ -130,9 +131,13 @@ def _record(making: BuildContext) -> RecordKeeper:
         channels.estimates.subscribe(record)
         channels.targets.subscribe(lambda target: recorder.target(target.fix))
         channels.events.subscribe(recorder.event)
+
         # What the operator was told belongs in the record; the bridge has logged it.
-        channels.texts.subscribe(lambda severity, text: recorder.event(_level(severity), text))
-        channels.texts.subscribe(lambda severity, text: recorder.text(severity, text, "companion"))
+        def told(severity: int, text: str, alert: Alert | None) -> None:
+            recorder.event(_level(severity), text, "" if alert is None else alert.id.value)
+            recorder.text(severity, text, "companion")
+
+        channels.texts.subscribe(told)
         channels.vehicle_texts.subscribe(recorder.text)
     return keeper
 
@@ -428,7 +433,7 @@ def _console(making: BuildContext) -> Publisher:
     channels.targets.subscribe(shown.add_target)
     channels.gone.subscribe(shown.forget_target)
     channels.events.subscribe(shown.add_event)
-    channels.texts.subscribe(lambda severity, text: shown.add_event(_level(severity), text))
+    channels.texts.subscribe(lambda severity, text, _: shown.add_event(_level(severity), text))
     return publisher
 
 

@@ -23,6 +23,7 @@ from companion.sources import StreamState
 from companion.writing import NewestFile
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
+from mavlink_bridge.alerts.catalogue import body
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel
 
@@ -35,7 +36,7 @@ _LEAST_HZ = 3.0  # below 4 an EKF does without; a frame or two more or less is n
 _SHORT_BRIDGE_NS = 2_000_000_000
 _NOTICE = 5  # MAV_SEVERITY_NOTICE
 _NOT_USED = "vision not used: "
-_TOLD = (_NOT_USED, "withheld: ")
+_TOLD = (_NOT_USED, "output held: ")
 _SILENT_VEHICLE = "no heartbeat from the flight controller"
 
 _NO_FRAME = "no frame is being localized"
@@ -189,7 +190,8 @@ class HealthMonitor:
         overload = self._overload(engine)
         if overload and level is HealthLevel.OK:
             level, text = HealthLevel.DEGRADED, overload
-        withheld = self._integrity_monitor.reason if self._integrity_monitor is not None else ""
+        held = self._integrity_monitor.reason if self._integrity_monitor is not None else None
+        withheld = body(held) if held is not None else ""
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):

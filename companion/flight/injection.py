@@ -6,14 +6,15 @@ import logging
 from collections.abc import Callable
 
 from companion.conversions import CameraExtrinsics, vision_fix
-from companion.integrity_monitor.alert_rules import UNJUDGED, AlertDebouncer, CheckResult
+from companion.integrity_monitor.debouncer import AlertDebouncer, CheckResult
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.injection.fix_queue import PendingJump
 from mavlink_bridge.messages import VisionFix
 
 _log = logging.getLogger(__name__)
-_ERROR, _NOTICE = 3, 5  # MAV_SEVERITY
 
 Judge = Callable[[PoseEstimate, VisionFix], VisionFix | None]
 """Has a word before injection: the fix, or one with another covariance; None withholds it. Called
@@ -71,7 +72,7 @@ class FixInjection:
         self._extrinsics = extrinsics
         self._jump = JumpPolicy()
         self._judges: tuple[Judge, ...] = ()
-        self._unjudged = AlertDebouncer(UNJUDGED)
+        self._unjudged = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
 
     def add_judge(self, judge: Judge) -> None:
         """Have `judge` asked about every fix from now on, after those that are there already."""
@@ -105,7 +106,7 @@ class FixInjection:
             if not self._unjudged.raised:
                 _log.exception("a fix could not be judged")
             failed, fix = True, None
-        text = self._unjudged.update(estimate.exposure_time_ns, CheckResult(failed))
-        if text is not None:
-            self._bridge.say(_ERROR if self._unjudged.raised else _NOTICE, text)
+        alert = self._unjudged.update(estimate.exposure_time_ns, CheckResult(failed))
+        if alert is not None:
+            self._bridge.report_alert(alert)
         return fix

@@ -51,7 +51,7 @@ TARGET_COLUMNS = (
     "velocity_east", "velocity_north", "velocity_up", "u", "v",
     "cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu", "elsewhere", "visibility",
 )  # fmt: skip
-EVENT_COLUMNS = ("time_ns", "level", "text")
+EVENT_COLUMNS = ("time_ns", "level", "text", "alert")
 _COLUMNS = {"estimates": ESTIMATE_COLUMNS, "targets": TARGET_COLUMNS, "events": EVENT_COLUMNS}
 
 
@@ -234,9 +234,9 @@ class Recorder:
         """Record one target fix."""
         self._put("targets", lambda: _target_row(fix, self._frame))
 
-    def event(self, level: str, text: str) -> None:
-        """Record something that happened, at the current time."""
-        row = (time.monotonic_ns(), level, text)
+    def event(self, level: str, text: str, alert: str = "") -> None:
+        """Record something that happened, at the current time. alert: its identifier, if any."""
+        row = (time.monotonic_ns(), level, text, alert)
         self._put("events", lambda: row)
 
     def text(self, severity: int, text: str, sender: str) -> None:

@@ -12,14 +12,8 @@ import numpy as np
 from companion.calibration_watch.ground import GroundView
 from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
 from companion.calibration_watch.watch import CalibrationWatch
-from companion.integrity_monitor import alert_rules as f
-from companion.integrity_monitor.alert_rules import (
-    ActiveAlerts,
-    AlertDebouncer,
-    CheckResult,
-    OutputAction,
-)
 from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.debouncer import ActiveAlerts, AlertDebouncer, CheckResult
 from companion.integrity_monitor.ekf import EkfWatch
 from companion.integrity_monitor.inertial import InertialTrack
 from companion.integrity_monitor.jump import JumpCheck
@@ -37,6 +31,9 @@ from companion.integrity_monitor.telemetry import (
 from companion.integrity_monitor.tilt import TiltCheck
 from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
 from localizer.types import Image
+from mavlink_bridge.alerts.alert import Alert, Inhibits, OutputAction
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.integrity import INTEGRITY
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _AIRBORNE_M = 3.0
@@ -67,15 +64,6 @@ class IntegrityLimits:
     horizontal_fov_deg: float = 60.0
 
 
-@dataclass(frozen=True)
-class OperatorLine:
-    """A line for the operator. bad: a finding began or lasts; else it is over."""
-
-    text: str
-    bad: bool
-    withholds: bool
-
-
 class IntegrityChecks:
     """Every method is called under one lock, or from one thread.
 
@@ -95,12 +83,12 @@ class IntegrityChecks:
         self._ekf = EkfWatch()
         self._calibration = CalibrationWatch(config.calibration)
         self._ground = GroundView(limits.horizontal_fov_deg)
-        raise_s = min(f.LIMIT.raise_s, limits.time_to_alert_s)
-        changed = {
-            f.GNSS.name: replace(f.GNSS, repeat_s=config.gnss_repeat_s),
-            f.LIMIT.name: replace(f.LIMIT, raise_s=raise_s),
-        }
-        self._debouncers = {r.name: AlertDebouncer(changed.get(r.name, r)) for r in f.RULES}
+        specs = {spec.id: spec for spec in INTEGRITY}
+        gnss, limit = specs[AlertId.GNSS_VISION_MISMATCH], specs[AlertId.HPL_OVER_LIMIT]
+        raise_s = min(limit.raise_s, limits.time_to_alert_s)
+        specs[gnss.id] = replace(gnss, repeat_s=config.gnss_repeat_s)
+        specs[limit.id] = replace(limit, raise_s=raise_s)
+        self._debouncers = {of: AlertDebouncer(spec) for of, spec in specs.items()}
         self._picture: tuple[int, FrameVerdict] | None = None
         self._verdict: MotionVerdict | None = None
         self._height_reading = CheckResult(None)
@@ -115,43 +103,36 @@ class IntegrityChecks:
 
     @property
     def action(self) -> OutputAction:
-        """The strongest action of all findings that stand."""
-        raised = (
-            debouncer.rule.action for debouncer in self._debouncers.values() if debouncer.raised
-        )
-        return max(raised, default=OutputAction.NONE)
+        """The strongest action of all active alerts."""
+        return max((one.spec.action for one in self._active()), default=OutputAction.NONE)
 
     @property
-    def reason(self) -> str:
-        """Why fixes are withheld, in words; empty while they are not."""
-        for debouncer in self._debouncers.values():
-            if debouncer.raised and debouncer.rule.action is self.action is not OutputAction.NONE:
-                return debouncer.line().removeprefix(f.PREFIX)
-        return ""
+    def reason(self) -> Alert | None:
+        """Why output is held; None while it is not."""
+        action = self.action
+        held = (one for one in self._active() if one.spec.action is action)
+        return next(held).alert() if action is not OutputAction.NONE else None
 
     @property
-    def suppress_ekf_ok(self) -> str:
-        """Why the EKF's following must not be called good; empty where nothing speaks against."""
-        debouncer = self._debouncers[f.EKF_JUMPED.name]
-        return debouncer.line().removeprefix(f.PREFIX) if debouncer.raised else ""
+    def inhibiting(self) -> frozenset[AlertId]:
+        """The active alerts that inhibit something, see `Inhibits`."""
+        return frozenset(one.spec.id for one in self._active() if one.spec.inhibits)
 
-    @property
-    def inhibits(self) -> str:
-        """Why injection must not begin, in words; empty where nothing speaks against."""
-        for debouncer in self._debouncers.values():
-            if debouncer.raised and debouncer.rule.inhibits:
-                return debouncer.line().removeprefix(f.PREFIX)
-        return ""
+    def to_remember(self) -> ActiveAlerts:
+        """The active alerts that inhibit injection."""
+        return {
+            one.spec.id: (one.figure, one.word)
+            for one in self._active()
+            if Inhibits.INJECTION in one.spec.inhibits
+        }
 
-    def forbidding(self) -> ActiveAlerts:
-        """The findings that stand and forbid."""
-        standing = (debouncer for debouncer in self._debouncers.values() if debouncer.raised)
-        return {one.rule.name: (one.figure, one.word) for one in standing if one.rule.inhibits}
+    def _active(self) -> list[AlertDebouncer]:
+        return [debouncer for debouncer in self._debouncers.values() if debouncer.raised]
 
     def restore(self, found: ActiveAlerts) -> None:
         """What stood in a process before this one stands until evidence speaks against it."""
-        for name, (figure, word) in found.items():
-            self._debouncers[name].restore(figure, word)
+        for of, (figure, word) in found.items():
+            self._debouncers[of].restore(figure, word)
 
     @property
     def level(self) -> ProtectionLevel | None:
@@ -159,12 +140,8 @@ class IntegrityChecks:
         return self._level
 
     def standing(self) -> dict[str, float]:
-        """The findings that stand, by name, with their figures."""
-        return {
-            name: debouncer.figure
-            for name, debouncer in self._debouncers.items()
-            if debouncer.raised
-        }
+        """The active alerts by identifier, with their figures."""
+        return {one.spec.id.value: one.figure for one in self._active()}
 
     # --- evidence -----------------------------------------------------------------------------
 
@@ -227,8 +204,8 @@ class IntegrityChecks:
         covariance = fix.position_covariance_ned + known_m**2 * np.eye(3)
         return replace(fix, reset=resets, position_covariance_ned=covariance)
 
-    def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[OperatorLine]:
-        """Look at everything, a few times a second; the lines to be told."""
+    def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[Alert]:
+        """Look at everything, a few times a second; the alerts to report."""
         vehicle = ValidatedTelemetry(vehicle)
         state = vehicle.state()
         for sample in vehicle.inertial_since(self._track.newest_ns):
@@ -237,14 +214,9 @@ class IntegrityChecks:
         self._follow(now_ns, state)
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
-        lines = []
-        readings = self._readings(now_ns, moving_now(state, now_ns))
-        for name, debouncer in self._debouncers.items():
-            text = debouncer.update(now_ns, readings[name])
-            if text is not None:
-                withholds = debouncer.rule.action is not OutputAction.NONE
-                lines.append(OperatorLine(text, debouncer.raised, withholds))
-        return lines
+        results = self._results(now_ns, moving_now(state, now_ns))
+        updates = (one.update(now_ns, results[of]) for of, one in self._debouncers.items())
+        return [alert for alert in updates if alert is not None]
 
     def _doubt_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
         """What the newest fix, or the stamps since, leave in doubt of the positions."""
@@ -267,10 +239,10 @@ class IntegrityChecks:
         if self._picture is None:
             return
         time_ns, verdict = self._picture
-        if verdict.repeat_lag_s > 0.0 or self._debouncers[f.VIDEO_REPEATS.name].raised:
+        if verdict.repeat_lag_s > 0.0 or self._debouncers[AlertId.VIDEO_REPEATS].raised:
             found_s = self._config.picture.repeat_s + _REPEATS_BEFORE_S
             self._calibration.distrust(time_ns - int(found_s * 1e9))
-        elif verdict.still_s >= _IDENTICAL_S or self._debouncers[f.VIDEO_FROZEN.name].raised:
+        elif verdict.still_s >= _IDENTICAL_S or self._debouncers[AlertId.VIDEO_FROZEN].raised:
             self._calibration.distrust(time_ns - int(verdict.still_s * 1e9))
 
     def _follow(self, now_ns: int, state: VehicleState) -> None:
@@ -285,51 +257,57 @@ class IntegrityChecks:
 
     # --- judgement ----------------------------------------------------------------------------
 
-    def _readings(self, now_ns: int, state: VehicleState) -> dict[str, CheckResult]:
+    def _results(self, now_ns: int, state: VehicleState) -> dict[AlertId, CheckResult]:
         newest = self._newest
         fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
         height = state.altitude_relative_m
         # Below take-off it flies, too: it began on a hill.
         flies = state.armed and (height is None or abs(height) >= _AIRBORNE_M)
         none = CheckResult(None)
-        checks: dict[str, Callable[[], CheckResult]] = {
-            f.VIDEO_FROZEN.name: lambda: (
+        checks: dict[AlertId, Callable[[], CheckResult]] = {
+            AlertId.VIDEO_FROZEN: lambda: (
                 self._frozen(now_ns, state) if flies else CheckResult(False)
             ),
-            f.VIDEO_REPEATS.name: lambda: self._repeats(now_ns) if flies else CheckResult(False),
-            f.MOTION.name: lambda: self._moves_otherwise() if fresh else none,
-            f.HEIGHT.name: lambda: self._height_reading if fresh else none,
-            f.JUMP.name: lambda: CheckResult(self._jump_held, self._jumps.distance_m),
-            f.STEP.name: lambda: CheckResult(self._steps.metres > 0.0, self._steps.metres),
-            f.TILT.name: lambda: self._tilts() if fresh else none,
-            f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
-            f.EKF_REFUSES.name: lambda: self._ekf.refuses(state) if fresh else CheckResult(False),
-            f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
-            f.CLOCK.name: lambda: CheckResult(self._backwards >= _BACKWARDS),
-            f.LIMIT.name: lambda: self._beyond_limit() if fresh else none,
+            AlertId.VIDEO_REPEATS: lambda: self._repeats(now_ns) if flies else CheckResult(False),
+            AlertId.VISION_IMU_MISMATCH: lambda: self._moves_otherwise() if fresh else none,
+            AlertId.HEIGHT_MISMATCH: lambda: self._height_reading if fresh else none,
+            AlertId.POSITION_JUMP: lambda: CheckResult(self._jump_held, self._jumps.distance_m),
+            AlertId.POSITION_STEP: lambda: CheckResult(
+                self._steps.metres > 0.0, self._steps.metres
+            ),
+            AlertId.TILT_MISMATCH: lambda: self._tilts() if fresh else none,
+            AlertId.GNSS_VISION_MISMATCH: lambda: (
+                self._against_gnss(state, now_ns) if fresh else none
+            ),
+            AlertId.EKF_REJECTS_VISION: lambda: (
+                self._ekf.refuses(state) if fresh else CheckResult(False)
+            ),
+            AlertId.EKF_JUMP: lambda: self._ekf_jump(state, now_ns),
+            AlertId.VIDEO_TIMESTAMPS: lambda: CheckResult(self._backwards >= _BACKWARDS),
+            AlertId.HPL_OVER_LIMIT: lambda: self._beyond_limit() if fresh else none,
             **self._calibration_checks(),
         }
-        return {name: check() for name, check in checks.items()}
+        return {of: check() for of, check in checks.items()}
 
-    def _calibration_checks(self) -> dict[str, Callable[[], CheckResult]]:
+    def _calibration_checks(self) -> dict[AlertId, Callable[[], CheckResult]]:
         limits, known = self._config.calibration, self._calibration.figures()
         share, late = known.focal, known.late_s
         long = "long" if share.value > 0.0 else "short"
         when = "late" if late.value > 0.0 else "early"
         return {
-            f.FOCAL.name: lambda: _beyond(share, limits.focal_share, 100.0, long),
-            f.BORESIGHT.name: lambda: _beyond(
+            AlertId.FOCAL_LENGTH: lambda: _beyond(share, limits.focal_share, 100.0, long),
+            AlertId.BORESIGHT: lambda: _beyond(
                 known.boresight_deg, limits.boresight_deg, 1.0, known.axis
             ),
-            f.TIME_OFFSET.name: lambda: _beyond(late, limits.time_s, 1e3, when),
+            AlertId.TIME_OFFSET: lambda: _beyond(late, limits.time_s, 1e3, when),
         }
 
     def _known_m(self, state: VehicleState, height_m: float | None) -> float:
         """By how much a fix is wrong for what was found of calibration and tilt, metres."""
         speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
         focal, late = (
-            self._debouncers[f.FOCAL.name].raised,
-            self._debouncers[f.TIME_OFFSET.name].raised,
+            self._debouncers[AlertId.FOCAL_LENGTH].raised,
+            self._debouncers[AlertId.TIME_OFFSET].raised,
         )
         focal_m = self._calibration.known_m(speed, focal=focal, time=False)
         late_m = self._calibration.known_m(speed, focal=False, time=late)
@@ -375,7 +353,7 @@ class IntegrityChecks:
         verdict = self._verdict
         if verdict is None or not verdict.settled:
             return CheckResult(None)
-        if not self._debouncers[f.MOTION.name].raised:
+        if not self._debouncers[AlertId.VISION_IMU_MISMATCH].raised:
             return CheckResult(verdict.share > 1.0, verdict.deviation_m)
         # A filter follows even a frozen position in the end: it must move before it is believed.
         calm = verdict.share < _CALM_SHARE and verdict.still_s < _MOVES_S

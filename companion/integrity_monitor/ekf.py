@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.integrity_monitor.alert_rules import CheckResult
+from companion.integrity_monitor.debouncer import CheckResult
 from mavlink_bridge.messages import VehicleState
 
 _REFUSED = 1.0  # the innovation test's own threshold

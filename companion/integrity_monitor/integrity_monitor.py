@@ -9,18 +9,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from companion.calibration_watch.observation import CalibrationObservation
-from companion.integrity_monitor.alert_rules import (
-    FAILED,
-    PREFIX,
-    STANDS,
-    AlertDebouncer,
-    CheckResult,
-    InhibitMemory,
-)
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.debouncer import AlertDebouncer, CheckResult, InhibitMemory
 from companion.integrity_monitor.protection import ProtectionLevel
 from localizer.types import Image
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import VisionFix
@@ -31,7 +27,6 @@ _BLIND_TURNS = 10  # that failed in a row
 _STANDS_NS = 2_000_000_000  # since its last turn: its thread hangs, or is gone
 _PART_STANDS_NS = 4_000_000_000  # of another part, as the supervisor has it
 _LOCK_S = 1.0  # a turn takes a twentieth of it
-_ERROR, _WARNING, _NOTICE = 3, 4, 5  # MAV_SEVERITY
 
 
 class IntegrityMonitor:
@@ -43,6 +38,8 @@ class IntegrityMonitor:
     What cannot be judged is withheld: a position that nobody watches is believed unwarned. A fix
     that fails it costs itself; a thread that fails for a second, or takes no turn for two, costs
     all until it turns again. Then those who ask tell it: its own thread cannot.
+
+    Above 200 lines: it wires every check to its alert, and the checks share the debounced state.
     """
 
     def __init__(
@@ -56,8 +53,12 @@ class IntegrityMonitor:
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
-        self._failed, self._stands = AlertDebouncer(FAILED), AlertDebouncer(STANDS)
+        self._failed, self._stands = (
+            AlertDebouncer(CATALOGUE[of])
+            for of in (AlertId.MONITOR_FAILED, AlertId.COMPONENT_STALLED)
+        )
         self._turns: Callable[[], Mapping[str, int]] = dict
+        self._inhibiting: frozenset[AlertId] = frozenset()
         self._fails: dict[str, int] = {}  # how often in a row, by what is failing
         self._failures = threading.Lock()
         self.last_tick_ns = monotonic_ns()
@@ -69,7 +70,7 @@ class IntegrityMonitor:
         """Start watching, with what forbade in a process that was killed."""
         if self._memory is not None:
             self._monitor.restore(self._memory.recall())
-            self._bridge.inhibit(self._monitor.inhibits)
+            self._inhibit(self._monitor.inhibiting)
         self.last_tick_ns = monotonic_ns()
         self._thread.start()
 
@@ -126,12 +127,12 @@ class IntegrityMonitor:
             self._bridge.submit(admitted)
 
     @property
-    def reason(self) -> str:
-        """Why fixes are withheld; empty while they are not."""
+    def reason(self) -> Alert | None:
+        """Why output is held; None while it is not."""
         if self._hangs() or self._failed.raised:
-            return FAILED.line(0.0).removeprefix(PREFIX)
+            return self._failed.alert()
         with self._asked() as answers:
-            return self._monitor.reason if answers else ""
+            return self._monitor.reason if answers else None
 
     @property
     def level(self) -> ProtectionLevel | None:
@@ -186,20 +187,19 @@ class IntegrityMonitor:
 
     def _tell_failure(self, now_ns: int) -> None:
         with self._failures:
-            text = self._failed.update(now_ns, CheckResult(bool(self._fails)))
-        if text is not None:
-            self._bridge.say(_ERROR if self._failed.raised else _NOTICE, text)
+            alert = self._failed.update(now_ns, CheckResult(bool(self._fails)))
+        if alert is not None:
+            self._bridge.report_alert(alert)
 
     def _tell_what_stands(self, now_ns: int) -> None:
         """Another part that takes no turns tells nothing any more: its last word would stand."""
         last_ticks_ns = self._turns()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
-        text = self._stands.update(
-            now_ns, CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, name)
-        )
-        if text is not None:
-            self._bridge.say(_WARNING if self._stands.raised else _NOTICE, text)
+        stalled = CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, name)
+        alert = self._stands.update(now_ns, stalled)
+        if alert is not None:
+            self._bridge.report_alert(alert)
 
     @property
     def _is_blind(self) -> bool:
@@ -211,7 +211,9 @@ class IntegrityMonitor:
         with self._failures:
             count = self._fails[what] = self._fails.get(what, 0) + 1
         if count == 1:
-            _log.error("the guardian failed %s", what, exc_info=sys.exc_info()[0] is not None)
+            _log.error(
+                "the integrity monitor failed %s", what, exc_info=sys.exc_info()[0] is not None
+            )
 
     def _works(self, what: str) -> None:
         with self._failures:
@@ -221,14 +223,18 @@ class IntegrityMonitor:
         with self._lock:
             if picture is not None:
                 self._monitor.see(*picture)
-            lines = self._monitor.step(monotonic_ns(), self._bridge)
-            suppress_ekf_ok, inhibits = self._monitor.suppress_ekf_ok, self._monitor.inhibits
-            found = self._monitor.forbidding()
-        self._bridge.suppress_ekf_ok(suppress_ekf_ok)
-        self._bridge.inhibit(inhibits)
+            alerts = self._monitor.step(monotonic_ns(), self._bridge)
+            inhibiting, found = self._monitor.inhibiting, self._monitor.to_remember()
+        self._inhibit(inhibiting)
         if self._memory is not None:
-            # What flies is not taken back, by a restart no more than by the finding.
+            # Injection that runs is not stopped, by a restart no more than by the alert.
             self._memory.note({} if self._bridge.injecting else found)
-        for line in lines:
-            severity = _ERROR if line.withholds else _WARNING
-            self._bridge.say(severity if line.bad else _NOTICE, line.text)
+        for alert in alerts:
+            self._bridge.report_alert(alert)
+
+    def _inhibit(self, inhibiting: frozenset[AlertId]) -> None:
+        for of in inhibiting - self._inhibiting:
+            self._bridge.inhibit(of)
+        for of in self._inhibiting - inhibiting:
+            self._bridge.clear(of)
+        self._inhibiting = inhibiting

@@ -7,8 +7,8 @@ from collections import deque
 
 import numpy as np
 
-from companion.integrity_monitor.alert_rules import CheckResult
 from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.debouncer import CheckResult
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east

@@ -26,7 +26,7 @@ WHEN_VISION_ENDS = (
     ("degraded, bridging N s", "odometry carries it on: turn back over ground that the map knows"),
     ("lost; not sent: ...", "take over in ALT_HOLD or STABILIZE, or select GNSS if it is good"),
     ("5 to 8 s later", "ArduPilot lands (EKF Failsafe) unless somebody has taken over"),
-    ("withheld: ...", "do not believe the position; look which of the two is wrong"),
+    ("output held: ...", "do not believe the position; look which of the two is wrong"),
     ("place found, the EKF follows", "choose the mode again: ArduPilot stays in LAND"),
 )
 

@@ -169,7 +169,7 @@ def read_record(folder: Path) -> RecordTables:
     try:
         estimates = _table(folder / "estimates.csv", ("state", "status"))
         targets = _table(folder / "targets.csv", ("target_id", "visibility"))
-        events = _table(folder / "events.csv", ("level", "text"))
+        events = _table(folder / "events.csv", ("level", "text", "alert"))
     except (OSError, UnicodeDecodeError) as error:
         raise RecordError(
             f"{folder}: not a flight's record: {error}; give the folder that "

@@ -1,16 +1,18 @@
 """Which estimates may be used.
 
-An estimate is acceptable when the registration succeeded, enough anchors were seen, its quality is
-high enough, the image's parts agree on it one by one, and it agrees with the prediction
-(Mahalanobis gate). Where the prediction is wide, the place has to stand out among those beside it;
-where a place is on trial, no other focal length may fit better. What runs of acceptances and
-rejections make of the tracker's state stands in `localizer.tracking.states`.
+An estimate is acceptable when the registration succeeded, enough anchors were seen, it shows the
+right place by all its evidence (`localizer.integrity.probability`), and it agrees with the
+prediction (Mahalanobis distance). A wide prior holds more places that look alike, so it asks for
+more evidence. A place on trial is refused where another focal length fits better. What runs of
+acceptances and rejections make of the tracker's state stands in `localizer.tracking.states`.
 """
 
 from __future__ import annotations
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from localizer.integrity.probability import log_odds
 from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
 
@@ -21,13 +23,11 @@ class IntegrityConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
-    min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
-    min_patch_inlier_ratio: float = Field(
-        0.4, ge=0, le=1, description="share of the image patches that agree on the pose"
-    )
-    min_patches: int = Field(8, ge=0, le=1000, description="patches (32 px) needed for that")
-    max_sigma_m: float = Field(
-        4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
+    min_log_odds: float = Field(
+        2.0,
+        ge=-20,
+        le=50,
+        description="natural log odds that a registration shows the right place",
     )
     max_focal_gain: float = Field(
         0.01,
@@ -37,15 +37,9 @@ class IntegrityConfig(BaseModel):
     )
     ambiguity_sigma_m: float = Field(
         6.0,
-        ge=0,
+        ge=0.1,
         le=1e4,
-        description="prior sigma above which the peak must stand out",
-    )
-    peak_to_sidelobe_min: float = Field(
-        4.5,
-        ge=0,
-        le=100,
-        description="peak-to-sidelobe ratio, in sigmas, that stands out",
+        description="prior sigma above which more evidence is required",
     )
     chi2_threshold: float = Field(
         40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof"
@@ -84,34 +78,13 @@ def is_acceptable(
     """Whether one registration may be used. distance_squared: Mahalanobis, from the prediction;
     prior_sigma_m: of the prediction's horizontal place, the larger axis.
     """
-    if result.status is not RegistrationStatus.OK:
+    if result.status is not RegistrationStatus.OK or result.overlap < config.min_overlap:
         return False
-    if result.overlap < config.min_overlap or result.quality < config.min_quality:
+    if result.focal_gain > config.max_focal_gain or distance_squared > config.chi2_threshold:
         return False
-    if result.covariance.diagonal()[:3].max() > config.max_sigma_m**2:
-        return False
-    if not parts_agree(config, result) or result.focal_gain > config.max_focal_gain:
-        return False
-    if prior_sigma_m >= config.ambiguity_sigma_m and not stands_out(config, result):
-        return False
-    return distance_squared <= config.chi2_threshold
+    return log_odds(result) >= config.min_log_odds + ambiguity(config, prior_sigma_m)
 
 
-def stands_out(config: IntegrityConfig, result: Registration) -> bool:
-    """Whether the image matches its place clearly better than what lies beside it.
-
-    Equal roofs in rows match each other as well as themselves. A prior that is narrower than a
-    lot says which of them is seen; a wider one does not, and no test of one picture can. On a GPU
-    there are no votes: what is searched there is judged by the relocalizer's verdict alone.
-    """
-    return result.agreement is None or result.agreement.peak >= config.peak_to_sidelobe_min
-
-
-def parts_agree(config: IntegrityConfig, result: Registration) -> bool:
-    """Whether enough parts of the image vote for the pose; a registration on a GPU has no votes and
-    passes.
-    """
-    votes = result.agreement
-    if votes is None:
-        return True
-    return votes.patches >= config.min_patches and votes.share >= config.min_patch_inlier_ratio
+def ambiguity(config: IntegrityConfig, prior_sigma_m: float) -> float:
+    """Natural logarithm of how many places a prior of such a horizontal sigma holds."""
+    return 2.0 * float(np.log(max(prior_sigma_m / config.ambiguity_sigma_m, 1.0)))

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.registration.backend import LevelProblem, sample_bilinear
 from localizer.registration.cpu.algebra import JIT
-from localizer.registration.cpu.reference import in_view, project
+from localizer.registration.cpu.reference import (
+    in_view,
+    pose_tangent_map,
+    project,
+    projection_jacobian,
+)
 from localizer.types import Float32
 
 _PART_PX = 16.0  # least side of a part, level px
@@ -24,17 +29,48 @@ _ANCHORS_A_PART = 8.0  # wanted: with few anchors the parts are larger
 _REACH = 6  # of the shifts compared, level px
 _NEAR = 1.5  # shift that is none, level px: 9 of 169 by chance
 _LEAST_ANCHORS = 4  # of a part, to have a vote
+_MEASURED = 5.5  # largest displacement that is one: beyond, the peak lies at the search's edge
+
+
+_RAYLEIGH = 1.1774  # median length of a vector of two independent errors, in their sigmas
+
+
+@dataclass(frozen=True)
+class PatchDisplacements:
+    """Shifts under which the P patches of an image match best at a registered pose.
+
+    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) level px by a pose
+    difference (position and left rotation vector, world axes, as `PosePrior`). rise: (P, 2) level
+    px by a metre that the patch's ground is higher than the map says. ground: (P, 2) east and north
+    of the patch, m.
+    """
+
+    shift: Array
+    motion: Array
+    rise: Array
+    ground: Array
+
+    @property
+    def scatter_px(self) -> float:
+        """Sigma of the shifts per axis, level px, by their median: what has changed since the
+        survey has a shift of its own, and the optimizer's loss leaves it out.
+        """
+        if len(self.shift) == 0:
+            return np.inf
+        return float(np.median(np.hypot(self.shift[:, 0], self.shift[:, 1]))) / _RAYLEIGH
 
 
 @dataclass(frozen=True)
 class PatchAgreement:
     """parts: of the image that could vote; votes: of those that match best where they lie; peak:
     the whole image's match there over its matches under other shifts, in their standard deviations.
+    displacements: where the patches match best; those without a peak are left out.
     """
 
     patches: int
     votes: int
     peak: float
+    displacements: PatchDisplacements | None = None
 
     @property
     def share(self) -> float:
@@ -43,25 +79,73 @@ class PatchAgreement:
 
 
 def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> PatchAgreement:
-    """How the parts vote on a pose camera_from_local; problem: a level and some of its anchors."""
-    sums, anchors = _shifted_sums(problem, rotation, translation)
+    """How the patches of the image agree on a pose camera_from_local; problem: a level and some of
+    its anchors.
+    """
+    grid = _patch_grid(problem, rotation, translation)
+    able = grid.anchors >= _LEAST_ANCHORS
     offset = np.arange(-_REACH, _REACH + 1)
     distance = np.hypot(offset[:, None], offset[None])
     near = (distance <= _NEAR).ravel()
-    able = sums[anchors >= _LEAST_ANCHORS].reshape(-1, near.size)
-    votes = int(near[able.argmax(axis=1)].sum()) if len(able) else 0
-    total = sums.sum(axis=0).ravel()
+    votes = int(near[grid.sums[able].reshape(-1, near.size).argmax(axis=1)].sum())
+    total = grid.sums.sum(axis=0).ravel()
     others = total[(distance > 2 * _NEAR).ravel()]
     peak = (float(total[near].max()) - float(others.mean())) / max(float(others.std()), 1e-9)
-    return PatchAgreement(len(able), votes, peak if len(sums) else 0.0)
+    return PatchAgreement(
+        int(able.sum()), votes, peak if len(able) else 0.0, _displacements(grid, able)
+    )
 
 
-def _shifted_sums(
-    problem: LevelProblem, rotation: Array, translation: Array
-) -> tuple[Float32, NDArray[np.int64]]:
-    """Correlation (parts, 2 r + 1, 2 r + 1) of each part's anchors with the query under shifts
-    (rows, then columns) of up to r = `_REACH` level px, and how many anchors it has (parts,).
+@dataclass(frozen=True)
+class _PatchGrid:
+    """Patches of the image with the anchors in each. sums: (P, 2 r + 1, 2 r + 1) correlation of a
+    patch's anchors with the query under shifts (rows, then columns) of up to r = `_REACH` level px;
+    anchors: (P,) how many it has; motion: (P, 2, 6) level px by a pose difference (position and
+    left rotation vector, world axes), mean of its anchors; rise: (P, 2) level px by a metre that
+    its ground lies higher; ground: (P, 2) east and north of it, m.
     """
+
+    sums: Float32
+    anchors: NDArray[np.int64]
+    motion: Array
+    rise: Array
+    ground: Array
+
+
+def _displacements(grid: _PatchGrid, able: NDArray[np.bool_]) -> PatchDisplacements:
+    """Each patch's best shift, to a fraction of a pixel."""
+    shift = _peaks(grid.sums[able])
+    measured = np.hypot(shift[:, 0], shift[:, 1]) < _MEASURED
+    return PatchDisplacements(
+        shift[measured], grid.motion[able][measured], grid.rise[able][measured],
+        grid.ground[able][measured],
+    )  # fmt: skip
+
+
+def _peaks(sums: Float32) -> Array:
+    """(P, 2) shifts (x, y), level px, of the highest of (P, n, n) correlations: a parabola through
+    the peak and its neighbours.
+    """
+    n = sums.shape[1]
+    best = sums.reshape(len(sums), n * n).argmax(axis=1)
+    row, column = best // n, best % n
+    k = np.arange(len(sums))
+
+    def fraction(before: Array, at: Array, after: Array) -> Array:
+        bend = before - 2.0 * at + after
+        offset = 0.5 * (before - after) / np.where(bend < 0, bend, -1.0)
+        return np.where(bend < 0, offset.clip(-0.5, 0.5), 0.0)
+
+    at = sums[k, row, column].astype(np.float64)
+    left, right = (sums[k, row, (column + d).clip(0, n - 1)] for d in (-1, 1))
+    above, below = (sums[k, (row + d).clip(0, n - 1), column] for d in (-1, 1))
+    inner_x, inner_y = (column > 0) & (column < n - 1), (row > 0) & (row < n - 1)
+    x = column - n // 2 + np.where(inner_x, fraction(left, at, right), 0.0)
+    y = row - n // 2 + np.where(inner_y, fraction(above, at, below), 0.0)
+    return np.stack([x, y], axis=1)
+
+
+def _patch_grid(problem: LevelProblem, rotation: Array, translation: Array) -> _PatchGrid:
     x, uv = project(problem, rotation, translation)
     u, v = uv.T
     h, w = problem.confidence.shape
@@ -69,7 +153,7 @@ def _shifted_sums(
     whole = in_view(problem, x, uv) & (u >= _REACH) & (u < w - 1 - _REACH)
     whole &= (v >= _REACH) & (v < h - 1 - _REACH)
     whole[whole] = sample_bilinear(problem.confidence, u[whole], v[whole]) > 0.0  # a picture there
-    u, v = u[whole], v[whole]
+    x, u, v = x[whole], u[whole], v[whole]
     part_px = max(_PART_PX, (h * w * _ANCHORS_A_PART / problem.points.shape[1]) ** 0.5)
     across = int(w // part_px) + 1
     key = (v // part_px).astype(np.int64) * across + (u // part_px).astype(np.int64)
@@ -86,7 +170,17 @@ def _shifted_sums(
         part.astype(np.int64),
         sums,
     )
-    return sums, np.bincount(part, minlength=len(names))
+    anchors = np.bincount(part, minlength=len(names))
+    tangent = projection_jacobian(problem, x, translation)
+    motion = tangent @ np.linalg.inv(pose_tangent_map(rotation, translation))
+    # Ground that lies higher moves in the image as if the camera were lower.
+    values = np.concatenate(
+        [motion.reshape(-1, 12), -motion[:, :, 2], problem.points.T[whole, :2]], axis=1
+    )
+    mean = np.zeros((len(names), 16))
+    np.add.at(mean, part, values)
+    mean /= np.maximum(anchors, 1)[:, None]
+    return _PatchGrid(sums, anchors, mean[:, :12].reshape(-1, 2, 6), mean[:, 12:14], mean[:, 14:])
 
 
 @njit(**JIT)

@@ -66,7 +66,10 @@ _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 
 
 class JNGO:
-    """The optimizer. Keeps its worker threads and scratch memory between frames."""
+    """The optimizer. Keeps its worker threads and scratch memory between frames.
+
+    Above 200 lines: search, sharpening and evidence share the problems of one frame.
+    """
 
     def __init__(
         self,
@@ -108,10 +111,11 @@ class JNGO:
             return failure(prior, status)
         if self._whole is not None:
             try:
-                return self._whole.register(
+                on_device = self._whole.register(
                     self.config, query, camera, anchors, prior,
                     motion=motion, constraint=constraint, seed=seed,
                 )  # fmt: skip
+                return self._with_agreement(on_device, query, camera, anchors)
             except BackendError as error:
                 _log.error("registration continues on the CPU: %s", error)
                 self.backend, self._whole = NumbaBackend(self._threads), None
@@ -130,6 +134,21 @@ class JNGO:
         winner = self._sharpen(swarm, problems[searched - 1 :], constraint, origin)
         found = self._found(swarm, winner, problems[searched - 1], query.levels[-1].stride)
         return registration(found, self.config, prior, origin)
+
+    def _with_agreement(
+        self, found: Registration, query: FeaturePyramid, camera: Camera, anchors: Anchors
+    ) -> Registration:
+        """A device's registration with the evidence of the image's patches, as the CPU's has it;
+        unchanged where the features are on the device alone.
+        """
+        on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
+        if found.status is not RegistrationStatus.OK or on_device:
+            return found
+        origin = local_origin(anchors, found.world_from_camera)
+        finest = level_problems(query, camera, anchors, origin)[len(self.config.iterations) - 1]
+        pose = found.world_from_camera
+        R, t = camera_from_local(pose.rotation[None], pose.translation[None], origin)
+        return replace(found, agreement=agreement(thinned(finest, _VOTING_ANCHORS), R[0], t[0]))
 
     def focal_tested(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration

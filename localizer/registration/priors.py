@@ -2,6 +2,8 @@
 
 Each function gives a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
 (docs/explanation/registration.md, section 9). All are optional and none is used unless it is given.
+`fused` takes one into a registered pose afterwards: there each has its honest weight, because the
+pose's covariance says what the image cannot tell.
 """
 
 from __future__ import annotations
@@ -75,3 +77,47 @@ def combine(*constraints: PoseConstraint) -> PoseConstraint:
     scaled = information / np.outer(scale, scale)
     mean = np.linalg.pinv(scaled, hermitian=True) @ (weighted / scale) / scale
     return PoseConstraint(Pose(so3_exp(mean[3:]) @ rotation, mean[:3]), information)
+
+
+@dataclass(frozen=True)
+class FusedPose:
+    """A pose after a constraint was taken into it. covariance: (6, 6) as `PosePrior`'s;
+    innovation_squared: squared Mahalanobis distance of the constraint from the pose before, of
+    `dof` degrees of freedom.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    innovation_squared: float
+    dof: int
+
+
+def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Array]:
+    """(K, 6) rows F and (K,) values z of unit variance, so that ``F d = z`` for the difference d
+    (6,) by which `pose` should move: what the constraint knows, in its own sigmas.
+    """
+    scale = np.sqrt(np.maximum(np.diag(constraint.information), 1e-300))
+    values, vectors = np.linalg.eigh(constraint.information / np.outer(scale, scale))
+    known = values > 1e-9
+    rows = (np.sqrt(values[known]) * vectors[:, known]).T * scale
+    target = constraint.world_from_camera
+    turn = np.zeros(3)
+    if constraint.information[3:, 3:].any():
+        turn = so3_log(target.rotation @ pose.rotation.T)
+    difference = np.concatenate([target.translation - pose.translation, turn])
+    return rows, rows @ difference
+
+
+def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
+    """The pose after an independent measurement: Kalman's update. covariance: (6, 6)."""
+    rows, values = constraint_rows(constraint, pose)
+    spread = rows @ covariance @ rows.T + np.eye(len(rows))
+    gain = np.linalg.solve(spread, rows @ covariance).T
+    step = gain @ values
+    after = covariance - gain @ rows @ covariance
+    return FusedPose(
+        Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]),
+        0.5 * (after + after.T),
+        float(values @ np.linalg.solve(spread, values)),
+        len(values),
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,9 @@ class Registration:
     evaluations: cost evaluations spent. agreement: of the image's parts, None where it is not
     known (a registration on a GPU, or one that failed). lead: by how much the best other mode of
     the swarm is worse, as a share of the score, inf without another. focal_gain: how much better
-    another focal length fits (`zoom.FocalTest`), -inf where that was not tested.
+    another focal length fits (`zoom.FocalTest`), -inf where that was not tested. mode_covariance:
+    (6, 6), what of the covariance stems from other modes (equation 14). noise: (6, 6), what is new
+    in each frame, for a filter over frames; None: the covariance.
     """
 
     world_from_camera: Pose
@@ -46,6 +48,8 @@ class Registration:
     agreement: PatchAgreement | None = None
     lead: float = np.inf
     focal_gain: float = -np.inf
+    mode_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    noise: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ def registration(
         found.evaluations,
         found.agreement,
         _lead(found.scores, other),
+        mode_covariance=spread,
     )
 
 

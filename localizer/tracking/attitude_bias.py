@@ -21,10 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.registration.priors import PoseConstraint
 from localizer.tracking.motion import RotationAt
-from localizer.types import PosePrior
 
 _LEAST_LEVEL = 0.3  # of the camera's x axis that is horizontal: rolled further, there is no pitch
-_AGREES, _TAKEN = 4.0, 4.0  # sigmas: beyond, nothing is constrained, and nothing is learned
+_TAKEN = 4.0  # sigmas: beyond, nothing is learned
 _CAUTIOUS = 2.0  # sigmas from which a measurement counts less: over some ground vision errs
 _REFUSED_IN_ROW = 5  # then it is the constant that has changed: a gimbal that was knocked
 _LEAST_SPREAD_COUNT, _MOST_SPREAD_COUNT = 5.0, 60.0  # measurements that the spread is a mean of
@@ -105,20 +104,15 @@ def horizontal_axes(rotation: Array) -> Array | None:
     return np.column_stack([right, np.array([-right[1], right[0], 0.0])])
 
 
-def constraint(bias: AttitudeBias, reported: Array, predicted: PosePrior) -> PoseConstraint | None:
-    """Roll and pitch of a frame's camera, from its rotation (3, 3) as reported at its exposure.
-
-    predicted: by the tracking. None where the two contradict each other: then one of them is wrong,
-    and which is not for this to say.
+def constraint(bias: AttitudeBias, reported: Array) -> PoseConstraint | None:
+    """Roll and pitch of a camera, from its rotation (3, 3) as reported at a frame's exposure; None
+    where it is rolled on its side.
     """
     axes = horizontal_axes(reported)
     if axes is None:
         return None
     rotation = so3_exp(axes @ bias.mean) @ reported
     known = bias.covariance + np.eye(2) * bias.spread
-    off = axes.T @ so3_log(predicted.world_from_camera.rotation @ rotation.T)
-    if _sigmas(off, known + axes.T @ predicted.covariance[3:, 3:] @ axes) > _AGREES:
-        return None
     information = np.zeros((6, 6))
     information[3:, 3:] = axes @ np.linalg.inv(known) @ axes.T
     return PoseConstraint(Pose(rotation, np.zeros(3)), information)
@@ -194,12 +188,12 @@ class AttitudeBiasEstimator:
         self.bias = None if config is None else unknown(config)
         """None where nothing is constrained."""
 
-    def constraint(self, predicted: PosePrior) -> PoseConstraint | None:
-        """On the registration of the frame for whose exposure the pose was predicted."""
-        reported = self._rotation_at(predicted.time_ns)
+    def constraint(self, time_ns: int) -> PoseConstraint | None:
+        """Roll and pitch of the camera at a frame's exposure."""
+        reported = self._rotation_at(time_ns)
         if self.bias is None or reported is None:
             return None
-        return constraint(self.bias, reported, predicted)
+        return constraint(self.bias, reported)
 
     def is_due(self, place: Array, distance_m: float) -> bool:
         """Whether a sight from `place` (3,) is wanted."""

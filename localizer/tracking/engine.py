@@ -122,7 +122,7 @@ class DualThreadEngine:
         """A snapshot of the counters."""
         localizer = self._localizer
         return self._book.read(
-            self._ahead.dropped, localizer.optimizer_name, localizer.attitude_bias.bias
+            self._ahead.dropped, localizer.optimizer_name, localizer.attitude_bias
         )
 
     def last_ticks_ns(self) -> dict[str, int]:
@@ -201,7 +201,7 @@ class DualThreadEngine:
 
     def _may_extract_ahead(self) -> bool:
         """Whether a frame's features will be asked for, and may be computed beside another's."""
-        return self._registers and self._localizer.keeps_features
+        return self._registers
 
     def _localize_once(self) -> None:
         prepared = self._ahead.take(_IDLE_S)

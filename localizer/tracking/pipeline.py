@@ -23,22 +23,21 @@ from localizer.errors import (
     MapLoadingError,
     OutsideMapError,
 )
-from localizer.features.extractor import DeviceExtractor, FeatureExtractor
+from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.pose import Array
 from localizer.map.kind import MapKind
 from localizer.odometry import TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
-from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
-from localizer.tracking.attitude_bias import AttitudeBiasEstimator, AttitudeObservation
+from localizer.tracking.attitude_bias import AttitudeBias
 from localizer.tracking.dead_reckoning import DeadReckoning
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.reference import lead_share, still_serves
+from localizer.tracking.sensor_fusion import SensorFusion, distance_m
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
     Anchors,
@@ -156,8 +155,8 @@ class Localizer:
     Motion, acceptance and dead reckoning are `Tracker`'s.
 
     sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
-    rate of the motion model. Their roll and pitch constrain the registration while tracking
-    (`tracking.attitude_bias`). With the displacement they confirm or refute a tentative track.
+    rate of the motion model. Their roll, pitch and height are fused with each registration
+    (`tracking.sensor_fusion`). With the displacement they confirm or refute a tentative track.
     map_frame, map_kind: the map's. terrain: ground heights outside the map. on_close: releases
     what was opened for this localizer. is_loading: whether requested tiles are still loading.
     """
@@ -193,8 +192,7 @@ class Localizer:
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
         self._fitted_ns: int | None = None  # of the last picture whose focal length was fitted
-        self.attitude_bias = AttitudeBiasEstimator(config.attitude, self._sensors.rotation_at)
-        """What the other sensors' roll and pitch are off by."""
+        self._fusion = SensorFusion(config.attitude, config.height_sigma_m, self._sensors, map_kind)
         self._tracker = Tracker(
             config, self._sensors, self._dead_reckoning(config, optimizer, terrain)
         )
@@ -202,8 +200,7 @@ class Localizer:
     def _dead_reckoning(
         self, config: LocalizerConfig, optimizer: JNGO, terrain: TerrainModel | None
     ) -> DeadReckoning | None:
-        # A GPU's features are valid until the next frame only: there is no keyframe to keep.
-        if config.odometry is None or optimizer.on_gpu:
+        if config.odometry is None:
             return None
         return DeadReckoning(
             self._pinhole, optimizer, config.odometry, config.threads, self._sensors, terrain
@@ -242,14 +239,19 @@ class Localizer:
         return self._tracker.state
 
     @property
+    def attitude_bias(self) -> AttitudeBias | None:
+        """What the other sensors' roll and pitch are off by; None where they are not used."""
+        return self._fusion.attitude_bias.bias
+
+    @property
+    def map_height_sigma_m(self) -> float:
+        """Spread of the heights that the map does not have, as the images so far show it."""
+        return self._fusion.height_error.sigma_m
+
+    @property
     def can_carry(self) -> bool:
         """Whether `localize` can answer without a reference (anchors None)."""
         return self._tracker.can_carry
-
-    @property
-    def keeps_features(self) -> bool:
-        """Whether `extract_query`'s features stay valid after its next call (not on a GPU)."""
-        return not self._optimizer.on_gpu
 
     @property
     def reference_age_s(self) -> float:
@@ -370,18 +372,12 @@ class Localizer:
         self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
-        """Features of the frame. It needs no reference and may run in parallel.
-
-        On a GPU they are valid until the next call.
-        """
+        """Features of the frame (does not need the reference, so it may run beside it)."""
         undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
-        image = undistorter(frame)
-        if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
-            return self._extractor.extract_on_device(image)
-        return only_seen(self._extractor.extract(image), undistorter.seen)
+        return only_seen(self._extractor.extract(undistorter(frame)), undistorter.seen)
 
     def localize(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None
@@ -396,28 +392,24 @@ class Localizer:
             raise OutsideMapError(_NO_PRIOR)
         stage_ms: dict[str, float] = {}
         camera = followed(self._pinhole, frame.camera)
-        result, sweep = None, self._tracker.sweep(frame, ahead)
+        result, image, sweep = None, None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
                 about = ahead.prior.world_from_camera
                 seen_anchors = swept(anchors, sweep, about, frame.camera)
-                # Not on trial: there the reported attitude is what confirms or refutes a place.
-                tracks = seen.track_status.state is TrackingState.TRACKING
-                tracks = tracks and not seen.track_status.tentative
-                level = self.attitude_bias.constraint(ahead.prior) if tracks else None
-                result = self._optimizer.register(
+                image = self._optimizer.register(
                     query,
                     camera,
                     seen_anchors,
                     ahead.prior,
                     motion=ahead.prior if seen.track_status.trusts_prediction else None,
-                    constraint=level,
                     seed=self._config.seed + frame.sequence,
                 )
                 if seen.track_status.tentative and not seen.track_status.independent:
-                    result = self._optimizer.focal_tested(query, camera, seen_anchors, result)
+                    image = self._optimizer.focal_tested(query, camera, seen_anchors, image)
+                result = self._fusion.fuse(image, frame.exposure_time_ns)
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
-        if anchors is not None and estimate.status is RegistrationStatus.OK:
+        if anchors is not None and image is not None and estimate.status is RegistrationStatus.OK:
             # Added to what is told and not to what is filtered: the next frame errs alike.
             moving = (ahead.velocity, ahead.rate)
             unknown = calibration_covariance(
@@ -425,41 +417,14 @@ class Localizer:
                 camera, sweep, moving,
             )  # fmt: skip
             estimate = replace(estimate, covariance=estimate.covariance + unknown)
-            if result is not None and estimate.accepted:
-                free = None if level is not None else result
-                self._learn_level(frame, query, seen_anchors, estimate, unknown, free)
-            if result is not None and self._is_focal_due(estimate):
-                focal = self._optimizer.focal_fitted(query, camera, seen_anchors, result)
+            if estimate.accepted and estimate.state is TrackingState.TRACKING:
+                pose = estimate.world_from_camera
+                away_m = distance_m(anchors.points_world, pose.translation)
+                self._fusion.learn(image, pose, unknown, away_m, frame.exposure_time_ns)
+            if self._is_focal_due(estimate):
+                focal = self._optimizer.focal_fitted(query, camera, seen_anchors, image)
                 estimate = replace(estimate, focal=focal)
         return replace(estimate, stage_ms=stage_ms)
-
-    def _learn_level(
-        self, frame: Frame, query: FeaturePyramid, anchors: Anchors, estimate: PoseEstimate,
-        unknown: Array, free: Registration | None,
-    ) -> None:  # fmt: skip
-        """Measure the other sensors' horizon, over new ground, by a registration of no constraint.
-
-        unknown: (6, 6) covariance of what map and camera err by; free: the frame's own registration
-        if that had none, else another one is made (10 ms, every few seconds).
-        """
-        pose, time_ns = estimate.world_from_camera, frame.exposure_time_ns
-        distance_m = _distance_m(anchors, pose.translation)
-        tracks = estimate.state is TrackingState.TRACKING
-        if not tracks or not self.attitude_bias.is_due(pose.translation, distance_m):
-            return
-        if free is None:
-            prior = PosePrior(pose, estimate.covariance, time_ns)
-            camera = followed(self._pinhole, frame.camera)
-            free = self._optimizer.register(
-                query, camera, anchors, prior, seed=self._config.seed + frame.sequence
-            )
-        if free.status is RegistrationStatus.OK:
-            covariance = free.covariance + unknown
-            self.attitude_bias.learn(
-                AttitudeObservation(free.world_from_camera, covariance, distance_m, time_ns)
-            )
-        else:
-            self.attitude_bias.pass_by(pose.translation, time_ns)
 
     def _is_focal_due(self, estimate: PoseEstimate) -> bool:
         """Whether this picture is one whose focal length is to be fitted."""
@@ -471,11 +436,6 @@ class Localizer:
             return False
         self._fitted_ns = now_ns
         return True
-
-
-def _distance_m(anchors: Anchors, place: Array) -> float:
-    """Of what is seen."""
-    return max(float(np.linalg.norm(anchors.points_world.mean(axis=0) - place)), 1.0)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from localizer.tracking import motion
 from localizer.tracking.dead_reckoning import DeadReckoning, PropagatedPose, PropagationResult
 from localizer.tracking.motion import AuxiliarySensors, MeasuredMotion, MotionState
 from localizer.tracking.rejoining import Rejoining
+from localizer.tracking.sensor_fusion import FusedRegistration
 from localizer.tracking.states import RegistrationOutcome, TrackStatus, judge
 from localizer.types import (
     Anchors,
@@ -110,14 +111,17 @@ class Tracker:
         frame: Frame,
         query: FeaturePyramid,
         anchors: Anchors | None,
-        result: Registration | None,
+        fused: FusedRegistration | None,
     ) -> PoseEstimate:
         """Judge a registration and update motion and standing.
 
         seen, ahead: the state and its motion at the frame that the registration began from.
-        anchors, result: None where there is no reference view to register against.
+        anchors, fused: None where there is no reference view to register against.
         """
+        result = None if fused is None else fused.registration
         acceptable = result is not None and self._is_acceptable(result, ahead.prior)
+        if fused is not None and fused.contradicted and seen.track_status.tentative:
+            acceptable = False  # gravity and height are evidence that the search did not use
         carried = self._carry(seen, ahead, frame, query, anchors, acceptable)
         rejoins = not acceptable and self._rejoins(seen.track_status, result, carried, frame)
         acceptable = acceptable or rejoins
@@ -211,7 +215,8 @@ class Tracker:
         carried: PropagatedPose, lost: bool,
     ) -> MotionState:  # fmt: skip
         if use_map and result is not None:
-            return motion.update(ahead, result.world_from_camera, result.covariance)
+            noise = result.covariance if result.noise is None else result.noise
+            return motion.update(ahead, result.world_from_camera, noise)
         if carried.world_from_camera is not None and carried.covariance is not None:
             return motion.update(ahead, carried.world_from_camera, carried.covariance)
         if result is not None and is_acceptable(self._config.integrity, result, 0.0):

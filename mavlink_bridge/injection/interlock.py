@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore, gnss_healthy
@@ -40,7 +42,7 @@ class ShadowInterlock:
         self._score = score
         self._compared_ns = compared_ns
         self._teller = teller
-        self.forbidden = ""
+        self.inhibited_by: frozenset[AlertId] = frozenset()
         self._next_ns = 0
         self._without_since_ns: int | None = None
         self._go_ns: int | None = None
@@ -87,13 +89,15 @@ class ShadowInterlock:
         """Why nothing is injected in mode ``inject``; empty when that is not the reason."""
         if self._open:
             return ""
-        return self.forbidden or (f"no go: {self._reason}" if self._reason else "")
+        if self.inhibited_by:
+            return ", ".join(sorted(CATALOGUE[of].title for of in self.inhibited_by))
+        return f"no go: {self._reason}" if self._reason else ""
 
     def may_switch(self, now_ns: int) -> bool:
         """Whether vision may be switched to: proven lately, or there is nothing to prove it by."""
         if self._force:
             return True
-        if self.forbidden:
+        if self.inhibited_by:
             return False
         unproven = self._open and not self._compared_ns() and not self._against
         return self._recent_go(now_ns) if self._go_ns is not None else unproven
@@ -108,13 +112,13 @@ class ShadowInterlock:
         """Whether injection may begin, told; a beginning is not taken back."""
         since_ns = self._without_since_ns
         without = since_ns is not None and now_ns - since_ns >= _WITHOUT_GNSS_NS
-        if self._recent_go(now_ns) and not self.forbidden:
+        if self._recent_go(now_ns) and not self.inhibited_by:
             return True
         if self._force:
             self._teller.warn("injection forced, no shadow check")
         elif by_pilot:
             self._teller.warn("injecting without a go from shadow")
-        elif without and not self._against and not self.forbidden:
+        elif without and not self._against and not self.inhibited_by:
             self._teller.warn("injecting without shadow check")
         else:
             return False

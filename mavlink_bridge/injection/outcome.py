@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.injection.encode import EncodedEstimate
 from mavlink_bridge.injection.propagate import PropagatedFix
@@ -22,9 +23,9 @@ _RECEIVER_LATE_NS = 200_000_000  # from what it measured to the arrival of its r
 class InjectionOutcome:
     """Remembers what was made and sent, and judges; one thread.
 
-    verdict: the last one; None while nothing is sent or it is too early. doubt: set from outside,
-    why its following must not be called good. compared_ns: exposure of the last fix that was
-    compared with GNSS, 0 for none.
+    verdict: the last one; None while nothing is sent or it is too early. ekf_ok_inhibited_by:
+    alerts for which "the EKF follows" is not reported. compared_ns: exposure of the last fix that
+    was compared with GNSS, 0 for none.
     """
 
     def __init__(
@@ -32,7 +33,7 @@ class InjectionOutcome:
     ) -> None:
         self.shadow = ShadowScorer(shared.geoid_separation_m)
         self.verdict: LoopVerdict | None = None
-        self.suppress_ekf_ok = ""
+        self.ekf_ok_inhibited_by: frozenset[AlertId] = frozenset()
         self.compared_ns = 0
         self._loop = ClosedLoopCheck(shared.config.injection.message)
         self._tracker = shared.tracker
@@ -82,7 +83,7 @@ class InjectionOutcome:
     def judge(self, state: VehicleState, now_ns: int) -> bool:
         """Whether the EKF follows, told; True when a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
-        if self.verdict is not None and (self.verdict.reason or not self.suppress_ekf_ok):
+        if self.verdict is not None and (self.verdict.reason or not self.ekf_ok_inhibited_by):
             self._teller.tell_settled("loop", self.verdict.reason, "the EKF follows", now_ns)
         if not self._loop.jump_missed():
             return False

@@ -60,8 +60,8 @@ def test_what_was_injected_is_told_from_what_was_not(tmp_path: Path) -> None:
 def test_what_the_guardian_said_is_counted(tmp_path: Path) -> None:
     quiet = read_flight(flown(tmp_path / "embedded-normal-fast-3"))
     folder = flown(tmp_path / "embedded-normal-fast-4")
-    lines = ["PiLoT: withheld: video frozen 4 s", "PiLoT: withheld: video frozen 9 s",
-             "PiLoT: over: video frozen", "PiLoT: GNSS lost, injecting"]  # fmt: skip
+    lines = ["PiLoT: output held: video frozen 4 s", "PiLoT: output held: video frozen 9 s",
+             "PiLoT: cleared: video frozen", "PiLoT: GNSS lost, injecting"]  # fmt: skip
     events = "".join(f"{BEGIN_NS},warning,{line}\n" for line in lines)
     (folder / "companion" / "events.csv").write_text("time_ns,level,text\n" + events)
     loud = read_flight(folder)

@@ -9,17 +9,14 @@ import pytest
 
 from companion.config import CompanionConfig, parse_config
 from companion.errors import ConfigError
-from companion.renamed_keys import RENAMED
+from companion.renamed_keys import REMOVED, RENAMED
 from tests.companion.test_config import CAMERA, MINIMAL
 
 VALUES: dict[str, Any] = {
     "guardian": {"jump_m": 7.0},
     "integrity_monitor.untold_jump_m": 2.5,
     "camera.settings.stamps_late_ms": 40.0,
-    "localizer.integrity.min_agreement": 0.41,
-    "localizer.integrity.min_parts": 9,
     "localizer.integrity.distinct_from_m": 6.5,
-    "localizer.integrity.min_peak": 4.6,
     "localizer.integrity.gate": 41.0,
     "localizer.odometry.gate": 30.0,
     "localizer.relocalization.min_agreement": 0.61,
@@ -42,6 +39,15 @@ def test_an_old_name_is_read_with_a_warning(old: str, caplog: pytest.LogCaptureF
     caplog.clear()
     config(today)
     assert not caplog.text
+
+
+@pytest.mark.parametrize("old", REMOVED)
+def test_a_removed_setting_is_left_out_with_a_warning(
+    old: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert config(nested(old, 0.5)) == config({})
+    assert f"{old} has no effect since 0.2" in caplog.text
 
 
 def test_an_old_section_with_an_old_key() -> None:

@@ -388,7 +388,7 @@ def test_no_flood_of_clicks_ends_the_targets_that_are_followed(flight: Flight) -
 
 def test_a_line_repeated_at_once_is_told_once_and_on_after_off_is_told() -> None:
     told: list[str] = []
-    status = OperatorStatus(lambda *_: None, lambda _, text: told.append(text))
+    status = OperatorStatus(lambda *_: None, lambda _, text, _alert: told.append(text))
     for hundredth in range(250):
         status.say(4, "look-at refused", hundredth * 10 * MS)
     assert told == ["look-at refused"] * 3

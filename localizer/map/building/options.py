@@ -20,10 +20,11 @@ class BuildOptions:
     vertical_datum: datum of the source's heights, needed if neither format nor CRS states it;
     "amsl" heights are lifted by the separation.
 
-    georeference: of a mesh, see `read_georeference`. up_axis: of a mesh or a tileset's content,
-    whatever the source states. height_unit, nodata: of a DSM, see `read_rasters`. origin: of the
-    world frame; None: the source's centre. imagery_date: 2024, 2024-06 or 2024-06-30. sensor: of
-    the imagery. heights: what they contain; None: measured (`MapKind`).
+    georeference: of a mesh, see `read_georeference`. up_axis: of a mesh or a tileset,
+    see `mesh_tree` and `read_tileset`. height_unit, nodata:
+    of a DSM, see `read_rasters`. origin: of the world frame; None: the source's centre.
+    imagery_date: 2024, 2024-06 or 2024-06-30. sensor: of the imagery. heights: what they contain;
+    None: measured (`MapKind`).
 
     skip_bad_tiles: skip tiles that cannot be imported; their parents are shown. overwrite: replace
     a cache of another source or other options. rules: limits, and accepted doubts.

@@ -145,7 +145,10 @@ class _Pictures:
 
 
 class _Document:
-    """The nodes of a document, and the meshes and materials that they show."""
+    """The nodes of a document, and the meshes and materials that they show.
+
+    Above 200 lines: nodes, meshes and materials refer to one another by number.
+    """
 
     def __init__(self, data: bytes, read_uri: Reader, rules: ImportRules) -> None:
         self._data = GltfData(data, read_uri)

@@ -15,8 +15,12 @@ from companion.flight.health import HealthInputs, HealthMonitor
 from companion.sources import StreamState
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import HealthLevel, without_figures
+
+FROZEN = alert(AlertId.VIDEO_FROZEN, seconds=4.0)
 
 
 class FakeBridge:
@@ -33,7 +37,7 @@ class FakeBridge:
         return SimpleNamespace(connected=self._connected)
 
     def set_health(self, level, text, *, tell):
-        known = text.startswith(("vision not used", "withheld"))  # told by bridge and monitor
+        known = text.startswith(("vision not used", "output held"))  # told by bridge and monitor
         assert tell is (self._connected and not known)  # as is a silent vehicle
         self.told.append((level, text))
 
@@ -120,7 +124,7 @@ def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
 
 def test_tracking_that_the_guardian_withholds_is_a_failure(tmp_path):
     """The heartbeat says CRITICAL: nobody has a position of ours."""
-    integrity_monitor = SimpleNamespace(reason="withheld: frozen", level=None, standing=list)
+    integrity_monitor = SimpleNamespace(reason=FROZEN, level=None, standing=list)
     told, _ = _one_report(
         tmp_path,
         StreamState.LIVE,
@@ -128,7 +132,7 @@ def test_tracking_that_the_guardian_withholds_is_a_failure(tmp_path):
         tracking=TrackingState.TRACKING,
         integrity_monitor=integrity_monitor,
     )
-    assert told[-1] == (HealthLevel.FAILED, "withheld: frozen")
+    assert told[-1] == (HealthLevel.FAILED, "output held: video frozen 4 s")
 
 
 def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):

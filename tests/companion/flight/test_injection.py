@@ -11,6 +11,8 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.alerts.catalogue import alert, cleared
+from mavlink_bridge.alerts.ids import AlertId
 
 LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
 DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
@@ -24,8 +26,8 @@ class FakeBridge:
         self.fixes = []
         self.said = []
 
-    def say(self, _severity, text):
-        self.said.append(text)
+    def report_alert(self, alert):
+        self.said.append(alert)
 
     def attitude_at(self, _):
         return None
@@ -105,6 +107,6 @@ def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
         injection.add_estimate(estimate, None)
     assert len(bridge.fixes) == 300 - 30 - 49
     assert bridge.said == [
-        "PiLoT: withheld: fixes cannot be judged", "PiLoT: over: judges",
-        "PiLoT: withheld: fixes cannot be judged",
+        alert(AlertId.FIXES_NOT_CHECKED), cleared(AlertId.FIXES_NOT_CHECKED),
+        alert(AlertId.FIXES_NOT_CHECKED),
     ]  # fmt: skip

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.integrity_monitor.checks import IntegrityChecks, OperatorLine
+from companion.integrity_monitor.checks import IntegrityChecks
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import (
     Attitude,
     GimbalAttitude,
@@ -61,7 +63,7 @@ class Flight:
     height_m: Callable[[float], float] = lambda at_s: 0.0
     reset_at_s: float = -1.0
     at_s: float = 0.0
-    lines: list[tuple[float, str]] = field(default_factory=list)
+    lines: list[tuple[float, Alert]] = field(default_factory=list)
     passed: list[VisionFix] = field(default_factory=list)
     held: list[float] = field(default_factory=list)
     seed: int = 1
@@ -78,14 +80,22 @@ class Flight:
             if tick % (IMU_HZ // FIX_HZ) == 0:
                 self._offer(self._fix(self.at_s))
             if tick % (IMU_HZ // STEP_HZ) == 0:
-                for line in self.monitor.step(second(self.at_s), self):
-                    self._tell(line)
+                alerts = self.monitor.step(second(self.at_s), self)
+                self.lines += [(self.at_s, alert) for alert in alerts]
             self.at_s = (tick + 1) / IMU_HZ
         return self
 
-    def told(self, text: str) -> float:
-        """When a text was told first; infinite if never."""
-        return next((at_s for at_s, line in self.lines if text in line), np.inf)
+    def told(self, of: AlertId) -> float:
+        """When an alert was raised first; infinite if never."""
+        return min(self.times(of), default=np.inf)
+
+    def ended(self, of: AlertId) -> float:
+        """When an alert was cleared first; infinite if never."""
+        return min(self.times(of, active=False), default=np.inf)
+
+    def times(self, of: AlertId, *, active: bool = True) -> list[float]:
+        """When an alert was reported."""
+        return [at_s for at_s, one in self.lines if (one.id, one.active) == (of, active)]
 
     # --- the vehicle ----------------------------------------------------------------------------
 
@@ -167,9 +177,6 @@ class Flight:
             self.held.append(self.at_s)
         else:
             self.passed.append(admitted)
-
-    def _tell(self, line: OperatorLine) -> None:
-        self.lines.append((self.at_s, line.text))
 
 
 def outside(flight: Flight) -> list[float]:

@@ -13,6 +13,7 @@ from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from localizer.geometry.pose import matrix_from_quaternion, so3_exp
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import offset
 from tests.companion.integrity_monitor.simulated import (
@@ -51,7 +52,7 @@ def test_an_honest_flight_is_left_alone(path: Path, noise_m: float) -> None:
 def test_a_position_that_freezes_in_flight_is_told_within_two_seconds() -> None:
     """At 10 m/s: the IMU felt nothing that would have stopped the aircraft."""
     flight = Flight(monitor(), leg, frozen(leg, 12.0), noise_m=0.03).fly(40.0)
-    assert flight.told("withheld: motion is not the IMU's") < 14.0
+    assert flight.told(AlertId.VISION_IMU_MISMATCH) < 14.0
     assert max(flight.held) > 39.0
     assert min(flight.held) < 14.0
     assert not [fix for fix in flight.passed if fix.time_ns > 14.5e9]
@@ -85,7 +86,7 @@ def test_a_picture_that_freezes_on_the_way_is_told_before_5_m() -> None:
     """At 10 m/s. By the IMU alone it took 1.4 s, in which 9 m were injected (ArduPilot)."""
     flight = Filmed(Flight(monitor(), leg, frozen(leg, 12.0), noise_m=0.03), frozen(leg, 12.0))
     flight.fly(14.0)
-    assert flight.flight.told("withheld: video frozen") <= 12.6
+    assert flight.flight.told(AlertId.VIDEO_FROZEN) <= 12.6
     assert not [fix for fix in flight.flight.passed if fix.time_ns > 12.5e9]
 
 
@@ -118,7 +119,7 @@ def test_what_moves_again_is_believed_again_with_a_reset() -> None:
         return leg(12.0 if 12.0 < at_s < 16.0 else at_s)
 
     flight = Flight(monitor(), leg, thaws, noise_m=0.03).fly(60.0)
-    assert 16.0 < flight.told("over: motion") < 55.0
+    assert 16.0 < flight.ended(AlertId.VISION_IMU_MISMATCH) < 55.0
     back = [fix for fix in flight.passed if fix.time_ns > 16e9]
     assert back[0].reset
     assert not any(fix.reset for fix in back[1:])
@@ -132,7 +133,7 @@ def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
         return north + (60.0 if 10.0 <= at_s < 13.0 else 0.0), east
 
     flight = Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(20.0)
-    assert flight.told("withheld: position jumped 5") < 10.2
+    assert flight.told(AlertId.POSITION_JUMP) < 10.2
     assert min(flight.held) == pytest.approx(10.0)
     assert max(flight.held) <= 13.1  # until the next step
     assert len(flight.passed) >= 168
@@ -149,7 +150,7 @@ def test_a_jump_in_fast_flight_does_not_pass_by_waiting_a_second() -> None:
         return north, east + (10.0 if 10.0 <= at_s < 14.0 else 0.0)
 
     flight = Flight(monitor(), cruise, turned).fly(20.0)
-    assert flight.told("withheld: position jumped") < 10.5
+    assert flight.told(AlertId.POSITION_JUMP) < 10.5
     assert not [fix for fix in flight.passed if 10e9 <= fix.time_ns < 14e9]
 
 
@@ -189,7 +190,7 @@ def test_positions_of_a_stream_that_begins_to_lag_are_within_their_level() -> No
     flight = Flight(monitor(), leg, late(12.0), noise_m=0.1, claimed_m=0.1).fly(30.0)
     assert flight.held == []
     assert outside(flight) == []
-    assert flight.told("position stepped 3 m, unexplained") <= 12.5
+    assert flight.told(AlertId.POSITION_STEP) <= 12.5
     assert flight.passed[-1].protection_m is not None
     assert flight.passed[-1].protection_m[0] < 6.0  # a bound, not a refusal
     # The EKF was told 0.1 m of positions 3 m behind: it believed them, and turned its yaw away.
@@ -204,9 +205,9 @@ def test_a_lag_that_ends_leaves_no_doubt() -> None:
     before = next(fix for fix in flight.passed if fix.time_ns >= second(11.5))
     assert flight.passed[-1].protection_m == pytest.approx(before.protection_m, abs=0.01)
     assert flight.passed[-1].position_covariance_ned[0, 0] == pytest.approx(0.1**2)
-    assert [line for _, line in flight.lines] == [
-        "PiLoT: position stepped 3 m, unexplained",
-        "PiLoT: over: step",
+    assert [(one.id, one.active) for _, one in flight.lines] == [
+        (AlertId.POSITION_STEP, True),
+        (AlertId.POSITION_STEP, False),
     ]
 
 
@@ -218,15 +219,15 @@ def test_a_step_aside_is_settled_where_the_place_is_found_anew() -> None:
         return north, east + (2.0 if at_s >= 12.0 else 0.0)
 
     flight = Flight(monitor(), leg, aside, noise_m=0.1, claimed_m=0.1, reset_at_s=20.0).fly(24.0)
-    assert flight.told("position stepped 2 m, unexplained") <= 12.5
-    assert 20.0 <= flight.told("over: step") <= 20.2
+    assert flight.told(AlertId.POSITION_STEP) <= 12.5
+    assert 20.0 <= flight.ended(AlertId.POSITION_STEP) <= 20.2
 
 
 @pytest.mark.parametrize("accuracy_m", [1.0, 12.0])
 def test_gnss_apart_from_vision_is_told_as_long_as_it_lasts(accuracy_m: float) -> None:
     """However bad the receiver claims to be: 12 m times a number of sigma would excuse 60 m."""
     flight = Flight(monitor(), gnss_north_m=lambda _: 20.0, gnss_accuracy_m=accuracy_m).fly(35.0)
-    told = [at_s for at_s, text in flight.lines if "from vision: neither proven" in text]
+    told = flight.times(AlertId.GNSS_VISION_MISMATCH)
     assert told[0] < 4.0
     assert np.diff(told) == pytest.approx(10.0, abs=0.5)
     assert len(told) == 4
@@ -246,7 +247,7 @@ def test_gnss_that_is_gone_is_not_told_as_apart_for_the_rest_of_the_flight() -> 
 def test_gnss_that_is_dragged_away_slowly_is_told_below_the_alert_limit() -> None:
     """0.6 m/s from 5 s on."""
     flight = Flight(monitor(), gnss_north_m=lambda at_s: 0.6 * max(at_s - 5.0, 0.0)).fly(40.0)
-    away_m = 0.6 * (flight.told("from vision: neither proven") - 5.0)
+    away_m = 0.6 * (flight.told(AlertId.GNSS_VISION_MISMATCH) - 5.0)
     assert 3.0 < away_m < 10.0
 
 
@@ -262,7 +263,7 @@ def test_a_receiver_that_lags_is_left_alone_and_a_dragged_one_is_told_at_speed()
     honest = Flight(monitor(), leg, gnss_north_m=behind).fly(16.0)
     assert honest.lines == []
     dragged = Flight(monitor(), leg, gnss_north_m=lambda at_s: -0.6 * max(at_s - 10.0, 0.0))
-    assert 0.6 * (dragged.fly(40.0).told("GNSS") - 10.0) < 10.0
+    assert 0.6 * (dragged.fly(40.0).told(AlertId.GNSS_VISION_MISMATCH) - 10.0) < 10.0
 
 
 def test_our_own_gps_input_is_no_gnss() -> None:
@@ -274,7 +275,7 @@ def test_our_own_gps_input_is_no_gnss() -> None:
 def test_a_height_that_leaves_the_barometers_is_withheld() -> None:
     """By a focal length that is wrong, or another place's ground."""
     flight = Flight(monitor(), height_m=lambda at_s: 2.0 * max(at_s - 10.0, 0.0)).fly(25.0)
-    assert 14.0 < flight.told("off barometer") < 18.0
+    assert 14.0 < flight.told(AlertId.HEIGHT_MISMATCH) < 18.0
     assert max(flight.held) > 24.0
 
 
@@ -311,7 +312,7 @@ def test_a_height_that_was_off_in_one_flight_is_watched_anew_in_the_next() -> No
         return 30.0 if 10.0 <= at_s < 20.0 or at_s >= 50.0 else 0.0
 
     flight = Twice(monitor(), height_m=height).fly(60.0)
-    told = [at_s for at_s, text in flight.lines if "off barometer" in text]
+    told = flight.times(AlertId.HEIGHT_MISMATCH)
     assert told == pytest.approx([12.8, 52.8], abs=1.0)
     assert not [at_s for at_s in flight.held if 27.0 < at_s < 50.0]
 
@@ -354,14 +355,14 @@ def test_a_climb_that_vision_makes_half_is_withheld_in_any_air(celsius: float) -
             return replace(super().state(), pressure_altitude_m=500.0 + standard)
 
     flight = Halved(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
-    assert flight.told("off barometer") < 21.0
+    assert flight.told(AlertId.HEIGHT_MISMATCH) < 21.0
     assert max(flight.held) > 59.0
 
 
 def test_beyond_the_alert_limit_nothing_is_injected() -> None:
     """A sigma of 3 m is honest, and too much for the risk."""
     flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
-    assert flight.told("withheld: position only to") <= 3.0
+    assert flight.told(AlertId.HPL_OVER_LIMIT) <= 3.0
     assert max(flight.held) > 9.8
     relaxed = Flight(monitor(alert_limit_m=20.0), noise_m=0.2, claimed_m=3.0).fly(10.0)
     assert relaxed.held == []
@@ -375,10 +376,10 @@ def test_the_alert_limit_is_told_within_the_time_to_alert(raise_s: float) -> Non
     assert all(level is not None and 0.0 < level[0] < 10.0 for level in levels)
     flight.claimed_m = 3.5
     flight.fly(12.0)
-    assert 5.0 < flight.told("withheld: position only to") <= 5.0 + min(raise_s, 1.0) + 0.21
+    assert 5.0 < flight.told(AlertId.HPL_OVER_LIMIT) <= 5.0 + min(raise_s, 1.0) + 0.21
     flight.claimed_m = 0.3
     flight.fly(15.6)
-    assert 15.0 <= flight.told("over: limit") < 15.5  # 3 s below it, or it would flap
+    assert 15.0 <= flight.ended(AlertId.HPL_OVER_LIMIT) < 15.5  # 3 s below it, or it would flap
     assert max(flight.held) < 15.5
 
 
@@ -412,18 +413,17 @@ def test_a_camera_that_is_mounted_wrong_is_told_and_injection_does_not_begin(
     for quarter in range(1, 37):
         flight.fly(0.25 * quarter)
         watched.add_observation(looking(flight, off_deg))
-    text = f"PiLoT: camera {abs(off_deg):.0f} deg off in yaw"
-    assert [line for _, line in flight.lines] == ([text] if told else [])
-    assert watched.inhibits == (text.removeprefix("PiLoT: ") if told else "")
+    assert [one.id for _, one in flight.lines] == ([AlertId.BORESIGHT] if told else [])
+    assert watched.inhibiting == ({AlertId.BORESIGHT} if told else set())
     assert flight.held == []
     if told:
-        assert flight.told(text) < 9.0
+        assert flight.told(AlertId.BORESIGHT) < 9.0
     if off_deg == 4.0:
         for quarter in range(37, 110):  # put right
             flight.fly(0.25 * quarter)
             watched.add_observation(looking(flight, 0.0))
-        assert flight.told("over: boresight") < 27.0
-        assert watched.inhibits == ""
+        assert flight.ended(AlertId.BORESIGHT) < 27.0
+        assert watched.inhibiting == set()
 
 
 def swung(at_s: float) -> tuple[float, float]:
@@ -443,9 +443,9 @@ def test_a_frozen_picture_is_no_evidence_of_its_stamps() -> None:
         (filmed if flight.at_s > 11.0 else flight).fly(flight.at_s + 0.25)
         place = offset(LATITUDE, LONGITUDE, *shown(flight.at_s))
         watched.add_observation(replace(looking(flight, 0.0), place=(*place, HEIGHT)))
-    texts = [line for _, line in flight.lines]
-    assert flight.told("withheld: video") < 16.0
-    assert not [line for line in texts if "stamped" in line or "focal" in line or "off in" in line]
+    assert min(flight.told(AlertId.VIDEO_FROZEN), flight.told(AlertId.VIDEO_REPEATS)) < 16.0
+    for of in (AlertId.TIME_OFFSET, AlertId.FOCAL_LENGTH, AlertId.BORESIGHT):
+        assert not flight.times(of)
 
 
 class WithoutPosition(Flight):

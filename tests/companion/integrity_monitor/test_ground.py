@@ -12,6 +12,7 @@ from companion.calibration_watch.observation import CalibrationObservation
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig, ProtectionConfig
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import VehicleState, VisionFix
 from tests.companion.integrity_monitor.simulated import HEIGHT, LATITUDE, LONGITUDE, Flight, second
 from tests.companion.integrity_monitor.test_checks import Filmed
@@ -94,7 +95,7 @@ def test_a_video_that_freezes_below_take_off_is_told() -> None:
     for relative_m, is_told in ((-40.0, True), (0.4, False)):
         watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
         flight = Seen(watched, stands, stands, noise_m=0.02, relative_m=relative_m)
-        told_s = Filmed(flight, stands).fly(12.0).told("withheld: video frozen")
+        told_s = Filmed(flight, stands).fly(12.0).told(AlertId.VIDEO_FROZEN)
         assert (told_s < 12.0) is is_told
 
 
@@ -112,7 +113,7 @@ def test_how_long_a_hover_may_look_still_goes_by_the_zoom(
     watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(horizontal_fov_deg=FOV_DEG))
     view = sighting(0.0, depth_m, fov_deg)
     flight = Filmed(Seen(watched, stands, stands, noise_m=0.02, view=view), stands).fly(12.0)
-    assert not_before_s <= flight.told("withheld: video frozen") <= within_s
+    assert not_before_s <= flight.told(AlertId.VIDEO_FROZEN) <= within_s
 
 
 def test_a_tilt_over_a_valley_below_take_off_is_in_the_level() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, VisionFix
 from tests.companion.integrity_monitor.simulated import Flight, hover, second
 
@@ -93,7 +94,7 @@ def test_a_frame_that_turns_in_a_hover_is_not_taken_by_waiting(
     """It moves as the IMU and the EKF do: it was taken after 5 s, 6 to 120 m aside."""
     seen, angle = turns(degrees, 26.0)
     flight = headed(seen, vision_deg=angle, silent=(12.0, 12.0 + silent_s)).fly(27.0)
-    assert flight.told("withheld: position jumped") < 12.3 + silent_s
+    assert flight.told(AlertId.POSITION_JUMP) < 12.3 + silent_s
     assert 26.0 <= taken(flight, 12.0) < 26.2  # the right one, at once
 
 

@@ -10,23 +10,25 @@ from typing import Any
 
 import pytest
 
-from companion.integrity_monitor.alert_rules import InhibitMemory
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.restart_memory import RestartMemory
 from mavlink_bridge.messages import VehicleState
 from tests.companion.integrity_monitor.simulated import Flight
 from tests.companion.integrity_monitor.test_checks import looking
 
-LONG = {"focal_length": (5.0, "long")}
+LONG = {AlertId.FOCAL_LENGTH: (5.0, "long")}
+KEPT = {"focal_length": [5.0, "long"]}
 
 
 class Kept:
     """A `RestartMemory` of this test."""
 
     def __init__(self, found: object = None) -> None:
-        self.told: Any = None if found is None else json.loads(json.dumps({"forbids": found}))
+        self.told: Any = None if found is None else json.loads(json.dumps({"inhibits": found}))
 
     def recall(self) -> tuple[dict[str, Any], float] | None:
         return None if self.told is None else (self.told, 4.0)
@@ -41,38 +43,41 @@ class Kept:
         self.told = None if clean_shutdown else self.told
 
 
-def integrity_monitor(kept: Any, *, injecting: bool = False) -> tuple[IntegrityMonitor, list[str]]:
+def integrity_monitor(
+    kept: Any, *, injecting: bool = False
+) -> tuple[IntegrityMonitor, list[AlertId]]:
     """Over a vehicle on the ground. What it forbids with each turn."""
-    forbidden: list[str] = []
+    inhibited: list[AlertId] = []
     flight = Flight(IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits()))
     bridge: Any = SimpleNamespace(
-        injecting=injecting, state=VehicleState, inertial_since=lambda _: (), say=lambda *_: None,
-        attitude_at=lambda _: None, gimbal_at=flight.gimbal_at, suppress_ekf_ok=lambda _: None,
-        inhibit=forbidden.append, gnss_place_at=lambda _: None,
+        injecting=injecting, state=VehicleState, inertial_since=lambda _: (),
+        report_alert=lambda _: None, attitude_at=lambda _: None, gimbal_at=flight.gimbal_at,
+        clear=inhibited.remove,
+        inhibit=inhibited.append, gnss_place_at=lambda _: None,
     )  # fmt: skip
     return IntegrityMonitor(
         IntegrityMonitorConfig(), IntegrityLimits(), bridge, InhibitMemory(kept)
-    ), forbidden
+    ), inhibited
 
 
 def test_what_forbade_in_a_process_that_was_killed_forbids_from_the_start() -> None:
     """A focal length that was 5 % long: the next process injected after two seconds, and it took a
     turn or a climb until it was found again.
     """
-    kept = Kept(LONG)
-    again, forbidden = integrity_monitor(kept)
+    kept = Kept(KEPT)
+    again, inhibited = integrity_monitor(kept)
     again.start()
-    assert forbidden[0] == "focal length looks 5.0 % long"
+    assert inhibited == [AlertId.FOCAL_LENGTH]
     again.stop()
     again.turn()
-    assert forbidden[-1] == "focal length looks 5.0 % long"
-    assert kept.told == {"forbids": {"focal_length": [5.0, "long"]}}  # for the next, too
+    assert inhibited == [AlertId.FOCAL_LENGTH]
+    assert kept.told == {"inhibits": KEPT}  # for the next, too
     again.close()
     assert kept.told is None
 
 
 def test_an_end_that_is_none_in_order_leaves_it() -> None:
-    kept = Kept(LONG)
+    kept = Kept(KEPT)
     again, _ = integrity_monitor(kept)
     again.start()
     again.hand_over()
@@ -82,7 +87,7 @@ def test_an_end_that_is_none_in_order_leaves_it() -> None:
 
 def test_what_flies_is_not_taken_back_by_a_restart() -> None:
     """Found after injection had begun: a process that was killed goes on, as without the kill."""
-    kept = Kept(LONG)
+    kept = Kept(KEPT)
     flying, _ = integrity_monitor(kept, injecting=True)
     flying.start()
     flying.stop()
@@ -93,20 +98,20 @@ def test_what_flies_is_not_taken_back_by_a_restart() -> None:
 def test_evidence_ends_what_was_kept() -> None:
     """The camera looks where it is said to: 4 degrees off was another, or wrong."""
     monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    monitor.restore({"boresight": (4.0, "yaw")})
+    monitor.restore({AlertId.BORESIGHT: (4.0, "yaw")})
     flight = Flight(monitor, noise_m=0.05)
     for quarter in range(1, 160):
         flight.fly(0.25 * quarter)
         monitor.add_observation(looking(flight, 0.0))
-    assert flight.told("over: boresight") < 40.0
-    assert monitor.inhibits == ""
+    assert flight.ended(AlertId.BORESIGHT) < 40.0
+    assert not monitor.inhibiting
 
 
 def test_without_evidence_it_stands() -> None:
     monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
     monitor.restore(LONG)
     Flight(monitor, noise_m=0.05).fly(40.0)
-    assert monitor.inhibits == "focal length looks 5.0 % long"
+    assert monitor.inhibiting == {AlertId.FOCAL_LENGTH}
 
 
 @pytest.mark.parametrize(
@@ -124,7 +129,7 @@ def test_what_is_no_finding_that_forbids_is_none(found: object) -> None:
 def test_it_is_of_the_camera_and_the_map_that_flew(tmp_path: Path) -> None:
     """Who mends the deployment and begins anew is not kept from it by what was."""
     path = tmp_path / "guardian-forbids.json"
-    path.write_text(json.dumps({"forbids": LONG, "utc_s": time.time(), "about": "this camera"}))
+    path.write_text(json.dumps({"inhibits": KEPT, "utc_s": time.time(), "about": "this camera"}))
     path.chmod(0o600)
     for about, found in (("another", {}), ("this camera", LONG)):
         memory = RestartMemory(path, about=about)

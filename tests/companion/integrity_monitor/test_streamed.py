@@ -18,6 +18,7 @@ from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.sources import SourceSettings, open_source
 from localizer.geometry.camera import Camera
 from localizer.types import Image
+from mavlink_bridge.alerts.ids import AlertId
 from sitl.camera.stream import VideoSender
 from tests.companion.integrity_monitor.simulated import Flight, leg, second
 from tests.companion.sources.paced_sender import (
@@ -72,14 +73,18 @@ def streamed() -> Iterator[Callable[[Image], Image | None]]:
 @pytest.mark.parametrize(
     ("wrong", "told", "within_s"),
     [
-        (lambda at_s: min(at_s, FAULT_S), "video frozen", 1.0),
-        (lambda at_s: at_s if at_s < FAULT_S else 10.0 + (at_s - 10.0) % 6.0, "video repeats", 4.0),
+        (lambda at_s: min(at_s, FAULT_S), AlertId.VIDEO_FROZEN, 1.0),
+        (
+            lambda at_s: at_s if at_s < FAULT_S else 10.0 + (at_s - 10.0) % 6.0,
+            AlertId.VIDEO_REPEATS,
+            4.0,
+        ),
         (lambda at_s: at_s, None, 0.0),
     ],
     ids=["frozen", "loop", "honest"],
 )
 def test_a_stream_that_does_not_show_the_present_is_told(
-    ground: Image, wrong: Callable[[float], float], told: str | None, within_s: float
+    ground: Image, wrong: Callable[[float], float], told: AlertId | None, within_s: float
 ) -> None:
     """At 10 m/s, the fixes as they should be: only the pictures can tell. Each is encoded anew,
     with fresh noise and a fresh stamp, as behind an encoder that goes on.
@@ -96,7 +101,7 @@ def test_a_stream_that_does_not_show_the_present_is_told(
     if told is None:
         assert flight.lines == []
         return
-    assert FAULT_S < flight.told(f"withheld: {told}") <= FAULT_S + within_s
+    assert FAULT_S < flight.told(told) <= FAULT_S + within_s
     assert not [fix for fix in flight.passed if fix.time_ns > second(FAULT_S + within_s + 0.2)]
 
 

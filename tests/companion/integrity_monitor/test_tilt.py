@@ -11,6 +11,8 @@ import pytest
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.tilt import TiltCheck
+from mavlink_bridge.alerts.catalogue import cleared
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 from tests.companion.integrity_monitor.simulated import Flight, leg, outside, second
 
@@ -67,17 +69,17 @@ def low(vision_deg: Angle = never, gimbal_deg: float = 0.5, above_m: float = 30.
 def test_a_shift_that_follows_a_tilt_is_told_and_inside_the_level() -> None:
     """`begins-denied` at 30 m: 4 degrees and 2.7 m for ten seconds, under a level of 1.2 m."""
     flight = low(valley).fly(20.0)
-    assert flight.told("deg off the autopilot's") <= 9.0
+    assert flight.told(AlertId.TILT_MISMATCH) <= 9.0
     assert outside(flight) == []
     assert flight.held == []
-    assert flight.lines[-1][1] == "PiLoT: over: tilt"
+    assert flight.lines[-1][1] == cleared(AlertId.TILT_MISMATCH)
     assert flight.passed[-1].protection_m == pytest.approx(flight.passed[0].protection_m, abs=0.1)
 
 
 def test_a_gimbal_that_is_knocked_costs_no_position() -> None:
     """8 degrees at 120 m would be 17 m: told, and the level is widened, but nothing is withheld."""
     flight = low(gimbal_deg=8.0, above_m=120.0).fly(6.0)
-    assert flight.told("tilt 8 deg off the autopilot's") < 3.0
+    assert flight.told(AlertId.TILT_MISMATCH) < 3.0
     assert flight.held == []
 
 
@@ -130,15 +132,15 @@ def unheard(heard: Callable[[float], bool], vision_deg: Angle = never) -> Unhear
 def test_a_tilt_is_not_over_because_the_attitude_is_gone() -> None:
     """The attitude ends at 10 s, and what it said of the position was forgotten with it."""
     flight = unheard(lambda at_s: at_s < 10.0, valley).fly(13.0)
-    assert flight.told("deg off the autopilot's") <= 9.0
-    assert flight.told("over: tilt") == np.inf
+    assert flight.told(AlertId.TILT_MISMATCH) <= 9.0
+    assert flight.ended(AlertId.TILT_MISMATCH) == np.inf
     assert outside(flight) == []
 
 
 def test_a_tilt_is_told_and_bounded_by_every_other_attitude() -> None:
     """A link that loses some must not hide it."""
     flight = unheard(lambda at_s: round(10.0 * at_s) % 2 == 0, valley).fly(12.5)
-    assert flight.told("deg off the autopilot's") <= 9.0
+    assert flight.told(AlertId.TILT_MISMATCH) <= 9.0
     assert outside(flight) == []
 
 
@@ -146,7 +148,7 @@ def test_attitudes_that_are_missing_are_no_tilt() -> None:
     """Whether some or all, of a flight that is right."""
     for heard in (lambda at_s: round(10.0 * at_s) % 3 == 0, lambda at_s: at_s > 4.0):
         flight = unheard(heard).fly(8.0)
-        assert flight.told("autopilot's") == np.inf
+        assert flight.told(AlertId.TILT_MISMATCH) == np.inf
         assert flight.held == []
 
 

@@ -12,6 +12,9 @@ import pytest
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, cleared
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
 from tests.companion.integrity_monitor.simulated import Flight, hover, leg, second
 
@@ -48,10 +51,11 @@ def flown(path: Any, seconds: float, **answers: Any) -> Answering:
 
 def test_an_ekf_that_refuses_is_told_again_as_long_as_it_does() -> None:
     flight = flown(hover, 30.0, ratio=lambda at_s: 1.4 if 5.0 <= at_s < 20.0 else 0.3)
-    told = [at_s for at_s, text in flight.lines if "EKF refuses vision (1.4)" in text]
+    told = flight.times(AlertId.EKF_REJECTS_VISION)
+    assert {one.values for _, one in flight.lines if one.active} == {(1.4,)}
     assert told[0] == pytest.approx(7.0, abs=0.3)
     assert np.diff(told) == pytest.approx([10.0], abs=0.3)
-    assert 23.0 <= flight.told("over: ekf refuses") < 23.5
+    assert 23.0 <= flight.ended(AlertId.EKF_REJECTS_VISION) < 23.5
     assert flight.held == []  # what it refuses does no harm; silence would
 
 
@@ -68,14 +72,15 @@ def test_a_refusal_of_a_second_is_none() -> None:
 
 def test_a_reset_of_the_ekf_is_unconfirmed_until_the_imu_has_agreed_for_a_while() -> None:
     flight = flown(leg, 30.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
-    assert flight.lines[0][1] == "PiLoT: EKF jumped 15 m: unconfirmed"
+    assert flight.lines[0][1].id is AlertId.EKF_JUMP
+    assert list(flight.lines[0][1].values) == [pytest.approx(15.0, abs=0.5)]
     assert flight.lines[0][0] == pytest.approx(12.0, abs=0.15)
-    assert 21.5 <= flight.told("over: ekf jumped") <= 24.0
+    assert 21.5 <= flight.ended(AlertId.EKF_JUMP) <= 24.0
 
 
 def test_while_it_is_unconfirmed_nobody_says_that_the_ekf_follows() -> None:
     flight = flown(leg, 14.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
-    assert flight.monitor.suppress_ekf_ok == "EKF jumped 15 m: unconfirmed"
+    assert flight.monitor.inhibiting == {AlertId.EKF_JUMP}
 
 
 @dataclass
@@ -98,14 +103,16 @@ def test_an_ekf_that_begins_on_the_ground_is_no_jump_when_it_is_armed() -> None:
     flight.leap_m = lambda at_s: 300.0 if at_s >= 8.0 else 0.0
     flight.fly(30.0)
     assert flight.lines == []
-    assert flight.monitor.suppress_ekf_ok == ""
+    assert not flight.monitor.inhibiting
 
 
 def test_an_ekf_that_jumps_right_after_arming_is_told() -> None:
     flight = Waiting(monitor(), departs, noise_m=0.05)
     flight.leap_m = lambda at_s: 300.0 if at_s >= 20.5 else 0.0
     flight.fly(22.0)
-    assert [text for _, text in flight.lines] == ["PiLoT: EKF jumped 300 m: unconfirmed"]
+    ((_, alert),) = flight.lines
+    assert alert.id is AlertId.EKF_JUMP
+    assert list(alert.values) == [pytest.approx(300.0, abs=0.5)]
 
 
 def test_hard_flight_is_no_jump() -> None:
@@ -124,7 +131,7 @@ def test_pictures_whose_clock_stands_or_runs_back_are_withheld(stamp: Any) -> No
         at_s = 0.1 * tenth
         moved = np.roll(PICTURE, 7 * tenth, axis=1)
         watched.see(second(at_s if at_s < 5.0 else stamp(at_s)), moved)
-        told_s = min(told_s, flight.told("withheld: video clock ran back or stands"))
+        told_s = min(told_s, flight.told(AlertId.VIDEO_TIMESTAMPS))
     assert 5.5 <= told_s < 6.5
     assert max(flight.held) > 9.7
     assert not [at_s for at_s in flight.held if at_s < 5.5]
@@ -137,7 +144,10 @@ def test_pictures_that_come_twice_now_and_then_are_no_broken_clock() -> None:
         flight.fly(0.1 * tenth)
         watched.see(second(0.1 * tenth), PICTURE)
         watched.see(second(0.1 * tenth), PICTURE)  # as a feed repeats a frame
-    assert not [text for _, text in flight.lines if "clock" in text]
+    assert not flight.times(AlertId.VIDEO_TIMESTAMPS)
+
+
+FAILED = alert(AlertId.MONITOR_FAILED)
 
 
 class Faulty:
@@ -146,7 +156,7 @@ class Faulty:
     def __init__(self, flight: Flight) -> None:
         self.flight = flight
         self.fails_at: set[str] = set()
-        self.said: list[tuple[int, str]] = []
+        self.said: list[Alert] = []
 
     def state(self) -> VehicleState:
         if "state" in self.fails_at:
@@ -161,13 +171,13 @@ class Faulty:
     def attitude_at(self, time_ns: int) -> Attitude | None:
         return None
 
-    def say(self, severity: int, text: str) -> None:
-        self.said.append((severity, text))
+    def report_alert(self, alert: Alert) -> None:
+        self.said.append(alert)
 
-    def suppress_ekf_ok(self, why: str) -> None:
+    def inhibit(self, of: AlertId) -> None:
         pass
 
-    def inhibit(self, why: str) -> None:
+    def clear(self, of: AlertId) -> None:
         pass
 
 
@@ -200,14 +210,14 @@ def test_a_fix_that_cannot_be_judged_is_withheld_told_and_costs_itself_only(
     bridge.fails_at = {"state"}
     assert integrity_monitor.judge(FIX) is None
     integrity_monitor.turn()
-    assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
-    assert integrity_monitor.reason == "withheld: guardian failed"
+    assert bridge.said == [FAILED]
+    assert integrity_monitor.reason == FAILED
     bridge.fails_at = set()
     assert integrity_monitor.judge(FIX) is not None
     for _ in range(30):
         integrity_monitor.turn()
-    assert [text for _, text in bridge.said[1:]] == ["PiLoT: over: guardian failed"]
-    assert integrity_monitor.reason == ""
+    assert bridge.said[1:] == [cleared(AlertId.MONITOR_FAILED)]
+    assert integrity_monitor.reason is None
 
 
 def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
@@ -221,7 +231,7 @@ def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
     for _ in range(9):
         integrity_monitor.turn()
     assert integrity_monitor.judge(FIX) is None
-    assert (3, "PiLoT: withheld: guardian failed") in bridge.said
+    assert FAILED in bridge.said
     bridge.fails_at = set()
     integrity_monitor.turn()
     assert integrity_monitor.judge(FIX) is not None
@@ -245,7 +255,7 @@ def test_a_guardian_that_fails_at_each_picture_of_a_slow_video_withholds(
                 integrity_monitor.see(second(10.0 + turn), PICTURE)
             integrity_monitor.turn()
         assert integrity_monitor.judge(FIX) is None
-        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+        assert bridge.said == [FAILED]
     integrity_monitor.turn()
     assert integrity_monitor.judge(FIX) is None  # without a picture it saw nothing
     integrity_monitor.see(second(40.0), PICTURE)
@@ -298,14 +308,14 @@ def test_a_failure_is_told_again_as_long_as_it_lasts_and_not_more_often(
     bridge.fails_at = {"inertial_since"}
     for _ in range(125):  # of 0.2 s by this clock
         integrity_monitor.turn()
-    told = [text for _, text in bridge.said]
-    assert told == 3 * ["PiLoT: withheld: guardian failed"]
+    told = bridge.said
+    assert told == 3 * [FAILED]
 
 
 def test_a_gnss_that_jumps_is_told_and_nothing_is_withheld() -> None:
     """100 km off, as a spoofer or a cold start may say; it is a receiver's word against ours."""
     flight = Flight(monitor(), gnss_north_m=lambda at_s: 1e5 if at_s >= 5.0 else 0.0).fly(9.0)
-    assert 7.0 <= flight.told("GNSS 100000 m from vision") < 8.0
+    assert 7.0 <= flight.told(AlertId.GNSS_VISION_MISMATCH) < 8.0
     assert flight.held == []
 
 
@@ -335,8 +345,8 @@ def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock:
     assert integrity_monitor.judge(FIX) is not None
     clock.now_ns += second(0.2)
     assert integrity_monitor.judge(FIX) is None
-    assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
-    assert integrity_monitor.reason == "withheld: guardian failed"
+    assert bridge.said == [FAILED]
+    assert integrity_monitor.reason == FAILED
     assert (integrity_monitor.level, integrity_monitor.standing()) == (None, {})
     clock.now_ns += second(10.0)
     integrity_monitor.judge(FIX)
@@ -347,7 +357,7 @@ def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock:
     integrity_monitor.turn()
     clock.now_ns += second(1.6)
     integrity_monitor.turn()
-    assert [text for _, text in bridge.said[2:]] == ["PiLoT: over: guardian failed"]
+    assert bridge.said[2:] == [cleared(AlertId.MONITOR_FAILED)]
 
 
 def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> None:
@@ -367,8 +377,8 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
         assert stuck.wait(30.0)
         clock.now_ns += second(2.5)
         assert integrity_monitor.judge(FIX) is None
-        assert integrity_monitor.reason == "withheld: guardian failed"
-        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+        assert integrity_monitor.reason == FAILED
+        assert bridge.said == [FAILED]
     finally:
         on.set()
         integrity_monitor.stop()
@@ -387,11 +397,12 @@ def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Ha
     for _ in range(112):
         clock.now_ns += second(0.1)
         integrity_monitor.turn()
-    assert [text for _, text in bridge.said] == [
-        "PiLoT: health stands 4 s", "PiLoT: health stands 14 s"
+    assert bridge.said == [
+        alert(AlertId.COMPONENT_STALLED, seconds=pytest.approx(s, abs=0.11), component="health")
+        for s in (4.0, 14.0)
     ]  # fmt: skip
     integrity_monitor.watch(lambda: {"health": clock.now_ns})
     for _ in range(32):
         clock.now_ns += second(0.1)
         integrity_monitor.turn()
-    assert [text for _, text in bridge.said[2:]] == ["PiLoT: over: part stands"]
+    assert bridge.said[2:] == [cleared(AlertId.COMPONENT_STALLED)]

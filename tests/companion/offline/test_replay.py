@@ -307,7 +307,7 @@ def test_each_frame_is_replayed_with_the_focal_length_that_it_had(record, tmp_pa
     seen = []
 
     class Localizer:
-        tracker = SimpleNamespace(standing=SimpleNamespace(wants_prior=False))
+        tracker = SimpleNamespace(track_status=SimpleNamespace(wants_prior=False))
 
         def track(self, frame):
             seen.append(frame.camera.fx)
@@ -328,7 +328,7 @@ def test_an_older_record_of_a_camera_that_zooms_is_replayed_by_its_log_or_told(
     model = loaded.config.camera.model
 
     class Localizer:
-        tracker = SimpleNamespace(standing=SimpleNamespace(wants_prior=False))
+        tracker = SimpleNamespace(track_status=SimpleNamespace(wants_prior=False))
 
         def track(self, frame):
             seen.append(frame.camera.fx / model.fx)

@@ -14,7 +14,7 @@ from localizer.tracking.pipeline import only_seen
 from localizer.types import RegistrationStatus
 from tests.localizer.registration.conftest import SyntheticPlace, camera_pose, perturbed
 
-CONFIG = IntegrityConfig(min_quality=0.0, max_sigma_m=100.0)
+CONFIG = IntegrityConfig()
 
 
 @pytest.fixture(scope="module")

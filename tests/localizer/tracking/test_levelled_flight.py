@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +15,12 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration.jngo import JNGO
-from localizer.registration.result import Registration, failure
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.tracking.attitude_bias import AttitudeBias, horizontal_axes
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import open_localizer
-from localizer.types import Frame, PosePrior, RegistrationStatus
+from localizer.types import Frame, PosePrior
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.assets import FlightAssets
@@ -93,7 +90,7 @@ def fly(
             estimate = localizer.track(frame)
             if estimate.accepted:  # a turn that the gimbal made up is refused at first
                 errors.append(estimate.world_from_camera.distance_to(true)[0])
-        bias = localizer.attitude_bias.bias
+        bias = localizer.attitude_bias
     assert bias is not None
     assert len(errors) > len(filmed) - 4
     return errors, bias
@@ -118,22 +115,3 @@ def test_nor_does_one_that_sinks_slowly(small_assets, filmed):
     """8 degrees, 0.5 in each frame, so that every one is nearly where the last one was."""
     errors, _ = fly(small_assets, filmed, lambda k: float(np.clip(0.5 * (k - KNOCKED), 0.0, 8.0)))
     assert max(errors) < 0.6
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_from_low_down_frames_are_not_registered_twice(small_assets, monkeypatch, fails):
-    """Once on 20 m of ground, whatever comes of it; every frame was, since nothing was learned."""
-    free: list[int] = []
-    register = JNGO.register
-
-    def counted(self: JNGO, *args: Any, **options: Any) -> Registration:
-        if options.get("motion") is not None:
-            return register(self, *args, **options)
-        free.append(options["seed"])
-        if fails and len(free) > 5:
-            return failure(args[3], RegistrationStatus.NO_TEXTURE)
-        return register(self, *args, **options)
-
-    monkeypatch.setattr(JNGO, "register", counted)
-    fly(small_assets, _filmed(small_assets, 15.0, 16), lambda _: 0.0)
-    assert 0 < len(free) <= 10  # 96 m, and the first frames

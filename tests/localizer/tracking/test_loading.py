@@ -24,7 +24,7 @@ def test_a_map_that_is_being_loaded_is_told_as_that() -> None:
     optimizer: Any = SimpleNamespace(on_gpu=True)
     loading = [True]
     localizer = Localizer(
-        renderer, None, optimizer, camera, LocalizerConfig(),  # type: ignore[arg-type]
+        renderer, None, optimizer, camera, LocalizerConfig(odometry=None),  # type: ignore[arg-type]
         is_loading=lambda: loading[0],
     )  # fmt: skip
     prior = PosePrior.around(Pose.identity())

@@ -11,6 +11,7 @@ import pytest
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
+from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.tracking.pipeline import Localizer
 from localizer.tracking.reference import lead_share, still_serves
@@ -120,7 +121,8 @@ class _Optimizer:
 
     def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
         pose = Pose(NADIR.rotation, NADIR.translation + np.array([self.east_m, 0.0, 0.0]))
-        return Registration(pose, np.eye(6) * 1e-4, 0.1, 0.9, 0.8, self.status, 1)
+        seen = PatchAgreement(patches=60, votes=58, peak=6.0)
+        return Registration(pose, np.eye(6) * 1e-4, 0.1, 0.9, 0.8, self.status, 1, seen)
 
 
 class _Flight:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.interlock import ShadowInterlock
@@ -380,20 +381,20 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
 ) -> None:
     """A calibration that was found wrong: no injection, no switch, until it is over."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
-    flight.end.inhibit("focal length looks 5.0 % long")
+    flight.end.inhibit(AlertId.FOCAL_LENGTH)
     flight.run(18.0)
     assert flight.vision() == []
-    assert told(flight, "not sent") == ["not sent: focal length looks 5.0 % long"]
+    assert told(flight, "not sent") == ["not sent: focal length"]
     flight.gnss_north_m = None
     flight.run(5.0)
     assert flight.vision() == []
     assert orders(flight) == []
     flight.gnss_north_m = 0.0
-    flight.end.inhibit("")
+    flight.end.clear(AlertId.FOCAL_LENGTH)
     flight.run(3.0)
     assert flight.vision()
     begun_ns = flight.now_ns
-    flight.end.inhibit("focal length looks 5.0 % long")
+    flight.end.inhibit(AlertId.FOCAL_LENGTH)
     flight.run(2.0)
     assert flight.vision(begun_ns)  # taking it back would leave the vehicle without a position
 

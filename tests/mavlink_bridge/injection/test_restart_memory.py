@@ -218,7 +218,7 @@ def _left_open(path: Path) -> None:
 
 def _bridge(path: Path, connection: str, told: list[str]) -> Bridge:
     config = BridgeConfig(connection=connection, mode="rc", state_file=path)
-    return Bridge(config, 0.0, on_text=lambda _, text: told.append(text))
+    return Bridge(config, 0.0, on_text=lambda _, text, _alert: told.append(text))
 
 
 def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(

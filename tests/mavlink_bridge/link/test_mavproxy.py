@@ -25,7 +25,7 @@ from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
 
 PROGRAM = shutil.which(os.environ.get("MAVPROXY", "mavproxy.py"))
 HOME = Location(47.397742, 8.545594, 488.0)
-TEXT = "PiLoT: withheld: no match"
+TEXT = "PiLoT: output held: no match"
 REAL = [
     pytest.mark.sitl,
     pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),

@@ -217,7 +217,7 @@ def test_what_the_operator_reads_is_logged_and_recorded_once(
 ) -> None:
     recorded: list[tuple[int, str]] = []
 
-    def record(severity: int, text: str) -> None:
+    def record(severity: int, text: str, _alert: object) -> None:
         recorded.append((severity, text))
 
     config = BridgeConfig(connection=f"udpout:127.0.0.1:{autopilot.port}")
@@ -240,7 +240,7 @@ def test_what_the_operator_reads_is_logged_and_recorded_once(
 def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
     """Well and ill by turns for a minute: each bad text once in 10 s, the end once it lasts."""
     told: list[str] = []
-    status = OperatorStatus(lambda *_: None, lambda _, text: told.append(text))
+    status = OperatorStatus(lambda *_: None, lambda _, text, _alert: told.append(text))
     second = 10**9
 
     def report(at_s: int, level: HealthLevel, text: str) -> None:
@@ -265,7 +265,7 @@ def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
 
 def test_a_worse_state_is_told_at_once_and_an_older_one_again_after_a_while() -> None:
     told: list[str] = []
-    status = OperatorStatus(lambda *_: None, lambda _, text: told.append(text))
+    status = OperatorStatus(lambda *_: None, lambda _, text, _alert: told.append(text))
     degraded, lost = (HealthLevel.DEGRADED, "bridging"), (HealthLevel.FAILED, "lost")
     steps = [(0, degraded), (1, lost), (2, degraded), (3, lost), (12, degraded), (13, lost)]
     for at_s, (level, text) in steps:

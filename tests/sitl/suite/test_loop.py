@@ -46,7 +46,7 @@ def test_a_bad_health_a_finding_or_a_silent_companion_tells_it(told: dict[str, A
 
 
 def record(samples: tuple[LoopSample, ...], errors: tuple[float, ...] = (0.2,)) -> LoopRecord:
-    text = LoopText(1.0, 191, 4, "PiLoT: withheld: video frozen 5 s")
+    text = LoopText(1.0, 191, 4, "PiLoT: output held: video frozen 5 s")
     return LoopRecord(samples, (text,), errors)
 
 
@@ -103,7 +103,9 @@ def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
     )
     found = tuple(replace(s, findings=("motion",)) for s in flight([0.5] * 4))
     assert len(false_alarms(replace(quiet, samples=found))) == 1  # told once, not at every sample
-    assert false_alarms(record(flight([0.5] * 4))) == ("1.0 s: PiLoT: withheld: video frozen 5 s",)
+    assert false_alarms(record(flight([0.5] * 4))) == (
+        "1.0 s: PiLoT: output held: video frozen 5 s",
+    )
 
 
 def row(alarms: tuple[str, ...] | None) -> LoopRow:

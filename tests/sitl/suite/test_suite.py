@@ -260,7 +260,7 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
     flown = record(0.20)
     flown.events.append((3.0, "silent=True"))
     flown.texts += [
-        Text(2.0, "bridge", "PiLoT: withheld: position jumped 7 m"),
+        Text(2.0, "bridge", "PiLoT: output held: position jumped 7 m"),
         Text(3.0, "bridge", "PiLoT: GNSS lost, injecting"),
     ]
     rows = [

@@ -1,31 +1,23 @@
 """Latches: time to alert, release, repetition, and what no evidence does."""
 
-import pytest
-
-from companion.integrity_monitor.alert_rules import (
-    PREFIX,
-    RULES,
-    AlertDebouncer,
-    AlertRule,
-    CheckResult,
-    OutputAction,
-)
+from companion.integrity_monitor.debouncer import AlertDebouncer, CheckResult
+from mavlink_bridge.alerts.alert import Alert, AlertSpec, Severity
+from mavlink_bridge.alerts.catalogue import cleared
+from mavlink_bridge.alerts.ids import AlertId
 
 SECOND = 1_000_000_000
 BAD, GOOD, UNKNOWN = CheckResult(True, 12.0), CheckResult(False), CheckResult(None)
 
 
-def rule(**changes: float) -> AlertRule:
-    """A rule that alerts after 1 s and is over after 2 s."""
-    return AlertRule(
-        "a_fault", "fault of {0:.0f} m", OutputAction.EXCLUDE_AND_RESET, 1.0, 2.0, **changes
-    )
+def rule(repeat_s: float = 0.0) -> AlertSpec:
+    """An alert that is raised after 1 s and cleared after 2 s."""
+    return AlertSpec(
+        AlertId.HEIGHT_MISMATCH, Severity.ERROR, "a fault", "fault of {metres:.0f} m",
+        {"metres": "m"}, raise_s=1.0, clear_s=2.0, repeat_s=repeat_s,
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("each", RULES, ids=lambda each: each.name)
-def test_every_text_fits_one_statustext(each: AlertRule) -> None:
-    """A chunked text may be cut by a lossy link just where it matters."""
-    assert len(each.line(999.0)) <= 50  # STATUSTEXT.text
+RAISED, OVER = Alert(AlertId.HEIGHT_MISMATCH, (12.0,)), cleared(AlertId.HEIGHT_MISMATCH)
 
 
 def test_it_alerts_once_after_its_time() -> None:
@@ -33,7 +25,7 @@ def test_it_alerts_once_after_its_time() -> None:
     debouncer = AlertDebouncer(rule())
     told = [debouncer.update(k * SECOND // 2, BAD) for k in range(6)]
     assert [text is not None for text in told] == [False, False, True, False, False, False]
-    assert told[2] == f"{PREFIX}withheld: fault of 12 m"
+    assert told[2] == RAISED
 
 
 def test_a_moment_is_no_finding() -> None:
@@ -54,7 +46,7 @@ def test_it_holds_until_good_evidence_lasts() -> None:
         debouncer.update(k * SECOND, (GOOD, BAD, UNKNOWN)[k % 3])
         assert debouncer.raised
     debouncer.update(20 * SECOND, GOOD)
-    assert debouncer.update(22 * SECOND, GOOD) == f"{PREFIX}over: a fault"
+    assert debouncer.update(22 * SECOND, GOOD) == OVER
     assert not debouncer.raised
 
 
@@ -68,7 +60,7 @@ def test_silence_is_no_good_evidence() -> None:
         debouncer.update(k * SECOND, UNKNOWN)
     assert debouncer.update(10 * SECOND, GOOD) is None
     assert debouncer.raised
-    assert debouncer.update(12 * SECOND, GOOD) == f"{PREFIX}over: a fault"
+    assert debouncer.update(12 * SECOND, GOOD) == OVER
 
 
 def test_silence_is_no_evidence_of_a_fault() -> None:

@@ -1,0 +1,71 @@
+"""The reference page of all alerts, made from the catalogue.
+
+python -m companion.alerts.page docs/reference/alerts.md
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
+from mavlink_bridge.alerts.catalogue import CATALOGUE, body, cleared
+
+_HEAD = f"""# Alerts
+
+Made from the catalogue by `python -m companion.alerts.page`; do not edit. Every text begins with
+`{PREFIX.strip()}`. The identifier stands in `events.csv` and `health.json`. *Output held*: nothing
+is sent. *Exclude and reset*: also, the next fix increments `reset_counter`. *Inhibit*: injection
+and the switch to vision do not start; injection that is running continues.
+
+| identifier | text | raised when | cleared when | severity, action |
+|---|---|---|---|---|
+"""
+_MEANING = """
+## What it means and what to do
+
+| identifier | meaning | what the operator does |
+|---|---|---|
+"""
+_ACTIONS = {
+    OutputAction.NONE: "",
+    OutputAction.HOLD: "hold",
+    OutputAction.EXCLUDE_AND_RESET: "exclude and reset",
+}
+
+
+def page() -> str:
+    """Its text, Markdown."""
+    rows = "".join(_row(spec) for spec in CATALOGUE.values())
+    meanings = "".join(
+        f"| `{spec.id.value}` | {spec.meaning} | {spec.operator} |\n" for spec in CATALOGUE.values()
+    )
+    return _HEAD + rows + _MEANING + meanings
+
+
+def _row(spec: AlertSpec) -> str:
+    shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
+    ended = body(cleared(spec.id))
+    inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
+    action = ", ".join(
+        [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]
+    )
+    text = shown.removeprefix(PREFIX)
+    return (
+        f"| `{spec.id.value}` | {text} | {spec.raised} | {spec.cleared} (`{ended}`) | {action} |\n"
+    )
+
+
+def _value(field: str, spec: AlertSpec) -> str:
+    name = field.strip("{}").partition(":")[0]
+    return "N" if spec.units[name] or name == "ratio" else name.upper()
+
+
+def main() -> None:
+    """Write the page."""
+    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

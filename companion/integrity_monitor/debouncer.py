@@ -1,0 +1,130 @@
+"""Alerts over time: raised and cleared after a while, so that they do not flap.
+
+Alerts that inhibit injection are kept over a restart: a turn or a climb showed them, and may in
+minutes again. Without that, a process that replaces a killed one would begin after two seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink_bridge.alerts.alert import Alert, AlertSpec, Inhibits
+from mavlink_bridge.alerts.catalogue import CATALOGUE, cleared
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.injection.restart_memory import RestartMemory
+
+_LARGEST = 1e4  # per cent, degrees, milliseconds; of what is kept
+_LONGEST = 10  # characters of a word that is
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """A check's answer. bad: None where there is no evidence, which changes nothing. figure, word:
+    the alert's values, as far as it has them.
+    """
+
+    bad: bool | None
+    figure: float = 0.0
+    word: str = ""
+
+
+class AlertDebouncer:
+    """Raises an alert after raise_s of bad evidence and clears it after clear_s of good evidence.
+
+    Time without evidence counts for neither, and nothing is repeated in it.
+    """
+
+    def __init__(self, spec: AlertSpec) -> None:
+        self.spec = spec
+        self.raised = False
+        self.figure = 0.0
+        self.word = ""
+        self._since_ns: int | None = None
+        self._updated_ns = 0
+        self._told_ns = 0
+
+    def update(self, now_ns: int, result: CheckResult) -> Alert | None:
+        """Take in a result; the alert to report, if there is news."""
+        silent_ns, self._updated_ns = now_ns - self._updated_ns, now_ns
+        if result.bad is None:
+            if not self.raised:
+                self._since_ns = None
+            elif self._since_ns is not None:
+                self._since_ns += silent_ns
+            return None
+        if result.bad:
+            self.figure, self.word = result.figure, result.word
+        if result.bad == self.raised:
+            self._since_ns = None
+            return self._again(now_ns)
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        wait_s = self.spec.clear_s if self.raised else self.spec.raise_s
+        if now_ns - self._since_ns < wait_s * 1e9:
+            return self._again(now_ns)
+        self._since_ns, self.raised, self._told_ns = None, not self.raised, now_ns
+        return self.alert() if self.raised else cleared(self.spec.id)
+
+    def restore(self, figure: float, word: str) -> None:
+        """It was active in a process before this one: evidence clears it, as any other."""
+        self.raised, self.figure, self.word = True, figure, word
+
+    def alert(self) -> Alert:
+        """The active alert with its newest values."""
+        return Alert(self.spec.id, (self.figure, self.word)[: len(self.spec.values)])
+
+    def _again(self, now_ns: int) -> Alert | None:
+        repeats = self.raised and self.spec.repeat_s > 0.0
+        if not repeats or now_ns - self._told_ns < self.spec.repeat_s * 1e9:
+            return None
+        self._told_ns = now_ns
+        return self.alert()
+
+
+ActiveAlerts = Mapping[AlertId, tuple[float, str]]
+"""Figure and word of active alerts."""
+
+
+class InhibitMemory:
+    """Of active alerts that inhibit injection; see `RestartMemory`."""
+
+    def __init__(self, memory: RestartMemory) -> None:
+        self._memory = memory
+        self._kept: frozenset[AlertId] = frozenset()
+
+    def recall(self) -> ActiveAlerts:
+        """What was active in the process before; empty for nothing."""
+        kept = self._memory.recall()
+        told = None if kept is None else kept[0].get("inhibits")
+        rows = told.items() if isinstance(told, dict) else ()
+        known = {spec.id.value: spec.id for spec in CATALOGUE.values()
+                 if Inhibits.INJECTION in spec.inhibits}  # fmt: skip
+        found = {known[name]: row for name, told in rows if name in known and (row := _row(told))}
+        self.note(found)
+        return found
+
+    def note(self, found: ActiveAlerts) -> None:
+        """What is active now."""
+        if found.keys() == self._kept:
+            return
+        self._kept = frozenset(found)
+        if found:
+            self._memory.keep({"inhibits": {of.value: row for of, row in found.items()}})
+        else:
+            self._memory.drop()
+
+    def stop(self, *, clean_shutdown: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(clean_shutdown=clean_shutdown)
+
+
+def _row(told: Any) -> tuple[float, str] | None:
+    if not isinstance(told, list) or len(told) != 2:
+        return None
+    figure, word = told
+    if not isinstance(figure, float) or not abs(figure) <= _LARGEST:
+        return None
+    known = isinstance(word, str) and len(word) <= _LONGEST and word.isprintable()
+    return (figure, word) if known else None

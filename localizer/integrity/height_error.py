@@ -1,0 +1,109 @@
+"""How wrong the map's heights are, learned from the images that register to it.
+
+A terrain or flat map lacks buildings and trees. Their parallax pulls a registered pose: the
+optimizer explains it by a tilt, a shift and a lower camera. How large these heights are shows in
+the same images: in the pattern in which the patches are displaced, and in how far the registered
+tilt and height are from what gravity and the barometer say. Each registration over new ground gives
+the likelihood of a few candidate values; their product over a flight is the posterior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose
+from localizer.integrity.patch_covariance import COMMON, LEAST_PATCHES, height_correlation
+from localizer.map.kind import MapKind
+from localizer.registration.agreement import PatchDisplacements
+from localizer.registration.priors import PoseConstraint, constraint_rows
+
+CANDIDATES_M = np.array([0.0, 0.3, 0.6, 1.2, 2.5, 5.0, 10.0])
+"""Spreads of the missing heights that are tried, m."""
+_NOISE_PX = np.array([0.1, 0.2, 0.4, 0.8, 1.2, 1.8, 2.6])  # of a patch, profiled
+_TEMPERED = 0.5  # of the log likelihood: patches are not wholly independent
+_KEPT = 0.9  # of what older ground said, at each new one: a village follows on fields
+_SURE_M = 0.1  # of a surface model: its prior falls by e at each
+
+
+def height_likelihood(
+    patches: PatchDisplacements, pose: Pose, constraint: PoseConstraint | None
+) -> Array | None:
+    """Log likelihood (K,) of each of `CANDIDATES_M`, up to a constant.
+
+    The pose is marginalised (restricted maximum likelihood), the patches' noise is profiled. pose:
+    at which the patches were measured; constraint: what other sensors know of it. None where the
+    patches are too few.
+    """
+    if len(patches.shift) < LEAST_PATCHES:
+        return None
+    y = patches.shift.reshape(-1)
+    rows = patches.motion.reshape(-1, 6)
+    rise = patches.rise.reshape(-1)
+    correlation = np.kron(height_correlation(patches.ground), np.ones((2, 2)))
+    values, basis = np.linalg.eigh(correlation * np.outer(rise, rise))
+    y, rows = basis.T @ y, basis.T @ rows
+    known, wanted = np.zeros((0, 6)), np.zeros(0)
+    if constraint is not None:
+        known, wanted = constraint_rows(constraint, pose)
+    unit = 1.0 / np.sqrt(np.maximum((rows**2).sum(axis=0), 1e-300))
+    rows, known = rows * unit, known * unit
+    result = np.empty(len(CANDIDATES_M))
+    for k, sigma_m in enumerate(CANDIDATES_M):
+        variance = _NOISE_PX[:, None] ** 2 + sigma_m**2 * np.maximum(values, 0.0)
+        result[k] = max(_marginal(y, rows, known, wanted, 1.0 / v) for v in variance)
+    relative: Array = result - result.max()
+    return relative
+
+
+def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array) -> float:
+    """Log likelihood of ``y = rows d + noise`` and ``wanted = known d + noise``, over all d."""
+    normal = rows.T @ (weight[:, None] * rows) + known.T @ known
+    right = rows.T @ (weight * y) + known.T @ wanted
+    sign, logdet = np.linalg.slogdet(normal)
+    if sign <= 0:
+        return -np.inf
+    explained = right @ np.linalg.solve(normal, right)
+    left = y @ (weight * y) + wanted @ wanted - explained
+    return float(0.5 * np.log(weight).sum() - 0.5 * logdet - 0.5 * left)
+
+
+@dataclass(frozen=True)
+class MapHeightError:
+    """Posterior of the spread of the heights that a map does not have. log_prior: (K,) by the map's
+    kind; evidence: (K,) log likelihood of the images so far, older ground counting less.
+    """
+
+    log_prior: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
+    evidence: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
+
+    @classmethod
+    def prior(cls, expected_m: float | None) -> MapHeightError:
+        """Before the first image. expected_m: by the map's kind; None: nothing is known."""
+        if expected_m is None:
+            return cls()
+        if expected_m <= _SURE_M:
+            return cls(-CANDIDATES_M / _SURE_M)
+        off = np.log2(np.maximum(CANDIDATES_M, 0.15) / expected_m)
+        return cls(-0.5 * off**2)
+
+    @classmethod
+    def of_kind(cls, kind: MapKind | None) -> MapHeightError:
+        """Before the first image over a map of a kind, None where that is not known."""
+        if kind is None:
+            return cls()
+        if kind.has_buildings:
+            return cls.prior(0.0)
+        return cls.prior(kind.unknown_height_sigma_m / np.hypot(1.0, COMMON))
+
+    @property
+    def sigma_m(self) -> float:
+        """The spread to reckon with: root mean square over the posterior."""
+        total = self.log_prior + self.evidence
+        weight = np.exp(total - total.max())
+        return float(np.sqrt((weight * CANDIDATES_M**2).sum() / weight.sum()))
+
+    def after(self, likelihood: Array) -> MapHeightError:
+        """With another image over new ground; likelihood: (K,) of `height_likelihood`."""
+        return replace(self, evidence=_KEPT * self.evidence + _TEMPERED * likelihood)

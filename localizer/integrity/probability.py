@@ -1,0 +1,82 @@
+"""How probable it is that a registration shows the right place.
+
+A wrong place can look right in one respect: low residuals where land of one kind is alike, a few
+patches that agree on equal roofs. It seldom does in all of them. So one logistic regression over
+all the evidence gives the probability. It is fitted on labelled registrations of many maps, real
+and generated, each map with the same weight (``python -m benchmarks.real --fit``); its numbers are
+`probability.json`, which says from what they were made and how each set fared that was left out.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from localizer.geometry.pose import Array
+from localizer.registration.result import Registration
+from localizer.types import RegistrationStatus
+
+MODEL = Path(__file__).with_name("probability.json")
+FEATURES = ("log_quality", "inlier_excess", "peak", "log_lead")
+_CHANCE = 0.1  # of the patches that match where they lie, at wrong places
+_LEAST_QUALITY, _LEAST_LEAD = 0.02, 0.003  # below, a logarithm says no more
+
+
+@dataclass(frozen=True)
+class PlaceModel:
+    """Logistic regression: log odds = bias + sum of weights times (feature - mean) / spread."""
+
+    mean: Array
+    spread: Array
+    weights: Array
+    bias: float
+
+    def log_odds(self, features: Array) -> float:
+        """Natural log odds of being right, where right and wrong places are equally frequent."""
+        return float(self.bias + self.weights @ ((features - self.mean) / self.spread))
+
+
+@cache
+def place_model(path: Path = MODEL) -> PlaceModel:
+    """The fitted model of a file."""
+    data = json.loads(path.read_text(encoding="utf-8"))
+    columns = [data["features"][name] for name in FEATURES]
+    mean, spread, weights = (
+        np.array([column[key] for column in columns]) for key in ("mean", "spread", "weight")
+    )
+    return PlaceModel(mean, spread, weights, float(data["bias"]))
+
+
+def place_features(result: Registration) -> Array | None:
+    """(4,) evidence of a registration, in the order of `FEATURES`; None where it has no patches.
+
+    Quality of the fit; how many patches match where they lie, beyond chance, in their sigmas; the
+    whole image's match there over its matches beside, likewise; lead over the best other mode of
+    the swarm.
+    """
+    votes = result.agreement
+    if result.status is not RegistrationStatus.OK or votes is None or votes.patches == 0:
+        return None
+    return evidence(result.quality, votes.patches, votes.share, votes.peak, result.lead)
+
+
+def evidence(quality: float, patches: int, share: float, peak: float, lead: float) -> Array:
+    """(4,) the features of these numbers of a `Registration` and its `PatchAgreement`."""
+    return np.array(
+        [
+            np.log(max(quality, _LEAST_QUALITY)),
+            np.sqrt(patches) * (share - _CHANCE),
+            peak,
+            np.log(np.clip(lead, _LEAST_LEAD, 1.0)),
+        ]
+    )
+
+
+def log_odds(result: Registration) -> float:
+    """Natural log odds that a registration shows the right place; -inf without evidence."""
+    features = place_features(result)
+    return -np.inf if features is None else place_model().log_odds(features)

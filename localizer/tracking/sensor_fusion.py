@@ -1,0 +1,143 @@
+"""Attitude and height beside the image: what other sensors add to a registered pose.
+
+The registration itself uses no other sensor. Its covariance says what the image cannot tell, such
+as a tilt against a shift over flat ground, or a tilt against roofs that the map does not have. So
+one Kalman update with roll, pitch and height, each with its own sigma, gives the pose that all of
+them support (docs/explanation/registration.md, section 9).
+
+The same registrations teach two things that no sensor reports: the constant error of the reported
+attitude (`attitude_bias`) and how wrong the map's heights are (`localizer.integrity.height_error`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose
+from localizer.integrity.height_error import MapHeightError, height_likelihood
+from localizer.integrity.patch_covariance import patch_covariance
+from localizer.map.kind import MapKind
+from localizer.registration.priors import PoseConstraint, combine, fused, height_constraint
+from localizer.registration.result import Registration
+from localizer.tracking.attitude_bias import (
+    AttitudeBiasEstimator,
+    AttitudeObservation,
+    AttitudePrior,
+)
+from localizer.tracking.dead_reckoning import fallen_m
+from localizer.tracking.motion import AuxiliarySensors
+from localizer.types import RegistrationStatus
+
+CONTRADICTS = 2.5
+"""Sigmas between the registered pose and a sensor from which one of them is wrong."""
+
+
+@dataclass(frozen=True)
+class FusedRegistration:
+    """A registration with what other sensors know. registration: its pose and covariance after the
+    update; contradicted: whether a sensor is so far off that it was left out.
+    """
+
+    registration: Registration
+    contradicted: bool = False
+
+
+class SensorFusion:
+    """Belongs to the localization thread.
+
+    attitude, height_sigma_m: how well roll and pitch, and the height, are known; None: not used.
+    map_kind: None where it is not known.
+    """
+
+    def __init__(
+        self,
+        attitude: AttitudePrior | None,
+        height_sigma_m: float | None,
+        sensors: AuxiliarySensors,
+        map_kind: MapKind | None = None,
+    ) -> None:
+        self._sensors, self._height_sigma_m = sensors, height_sigma_m
+        self.attitude_bias = AttitudeBiasEstimator(attitude, sensors.rotation_at)
+        self.height_error = MapHeightError.of_kind(map_kind)
+        self._is_surface = map_kind is not None and map_kind.has_buildings
+
+    def fuse(self, result: Registration, time_ns: int) -> FusedRegistration:
+        """The registration of a frame exposed at `time_ns`, with attitude and height."""
+        result = self.with_map_error(result)
+        if result.status is not RegistrationStatus.OK:
+            return FusedRegistration(result)
+        pose, covariance, contradicted = result.world_from_camera, result.covariance, False
+        for known in self._constraints(result.world_from_camera, time_ns):
+            found = fused(pose, covariance, known)
+            if found.innovation_squared > CONTRADICTS**2:
+                contradicted = True
+                continue
+            pose, covariance = found.world_from_camera, found.covariance
+        together = replace(result, world_from_camera=pose, covariance=covariance)
+        return FusedRegistration(together, contradicted)
+
+    def with_map_error(self, result: Registration) -> Registration:
+        """The registration with the covariance that its image's patches and the map's heights
+        give; unchanged where there are no patches.
+        """
+        votes = result.agreement
+        if result.status is not RegistrationStatus.OK or votes is None:
+            return result
+        if votes.displacements is None:
+            return result
+        covariance = patch_covariance(votes.displacements, self.height_error.sigma_m)
+        if covariance is None:
+            return replace(result, status=RegistrationStatus.NO_TEXTURE)
+        # The patches' displacements are the map's, alike from frame to frame. A motion filter that
+        # took them for noise of each frame would lag behind the camera.
+        whole = covariance + result.mode_covariance
+        return replace(result, covariance=whole, noise=result.covariance)
+
+    def learn(
+        self, result: Registration, place: Pose, unknown: Array, distance_m: float, time_ns: int
+    ) -> None:
+        """Learn from a frame that was accepted while tracking, if it shows new ground.
+
+        result: its registration before `fuse`; place: the pose that was accepted; unknown: (6, 6)
+        covariance of what map and camera model err by; distance_m: of what is seen.
+        """
+        if not self.attitude_bias.is_due(place.translation, distance_m):
+            return
+        votes = result.agreement
+        if votes is not None and votes.displacements is not None:
+            # A gimbal that sinks looks like missing buildings. Over a surface model it would make
+            # the pose less sure and pull it along, so there the image alone is heard.
+            known = [] if self._is_surface else self._constraints(place, time_ns)
+            likelihood = height_likelihood(
+                votes.displacements, result.world_from_camera, combine(*known) if known else None
+            )
+            if likelihood is not None:
+                self.height_error = self.height_error.after(likelihood)
+        seen = self.with_map_error(result)
+        if seen.status is not RegistrationStatus.OK:
+            self.attitude_bias.pass_by(place.translation, time_ns)
+            return
+        self.attitude_bias.learn(
+            AttitudeObservation(
+                seen.world_from_camera, seen.covariance + unknown, distance_m, time_ns
+            )
+        )
+
+    def _constraints(self, about: Pose, time_ns: int) -> list[PoseConstraint]:
+        """What attitude and height say of a camera that is `about` there."""
+        known = []
+        tilt = self.attitude_bias.constraint(time_ns)
+        if tilt is not None:
+            known.append(tilt)
+        height_m = self._sensors.height_at(time_ns)
+        if height_m is not None and self._height_sigma_m is not None:
+            world_z = height_m - fallen_m(about.translation)
+            known.append(height_constraint(world_z, self._height_sigma_m))
+        return known
+
+
+def distance_m(points_world: Array, place: Array) -> float:
+    """Of what is seen, points (N, 3), from a place (3,): at least 1 m."""
+    return max(float(np.linalg.norm(points_world.mean(axis=0) - place)), 1.0)

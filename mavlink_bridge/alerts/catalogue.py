@@ -1,0 +1,46 @@
+"""The catalogue: one row for each alert, from which every text and table is made."""
+
+from __future__ import annotations
+
+from mavlink_bridge.alerts.alert import PREFIX, Alert, AlertSpec, Severity, Value
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR
+
+CATALOGUE: dict[AlertId, AlertSpec] = {spec.id: spec for spec in (*INTEGRITY, *MONITOR)}
+TEXT_LENGTH = 50  # STATUSTEXT.text
+
+
+def spec_of(alert: Alert | AlertId) -> AlertSpec:
+    """Its row."""
+    return CATALOGUE[alert.id if isinstance(alert, Alert) else alert]
+
+
+def alert(of: AlertId, **values: Value) -> Alert:
+    """An active alert with its values by name; ValueError for others than the catalogue names."""
+    names = CATALOGUE[of].values
+    if set(values) != set(names):
+        raise ValueError(f"{of}: its values are {', '.join(names) or 'none'}, not {values}")
+    return Alert(of, tuple(values[name] for name in names))
+
+
+def cleared(of: AlertId) -> Alert:
+    """The same alert when it has ended."""
+    return Alert(of, active=False)
+
+
+def severity(of: Alert) -> Severity:
+    """Of its text: what has ended is a notice."""
+    return spec_of(of).severity if of.active else Severity.NOTICE
+
+
+def body(of: Alert) -> str:
+    """The text without the prefix, as a part of another line."""
+    return text(of).removeprefix(PREFIX)
+
+
+def text(of: Alert) -> str:
+    """The STATUSTEXT."""
+    spec = spec_of(of)
+    if of.active:
+        return spec.template.format(**dict(zip(spec.values, of.values, strict=True)))
+    return PREFIX + (f"cleared: {spec.title}" if spec.cleared_text is None else spec.cleared_text)
