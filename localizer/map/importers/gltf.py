@@ -115,6 +115,35 @@ class _Picture:
     wraps: bool
 
 
+class _Pictures:
+    """A document's textures, each image decoded once."""
+
+    def __init__(self, data: GltfData, rules: ImportRules) -> None:
+        self._data, self._json, self._rules = data, data.json, rules
+        self._images: dict[int, tuple[Image, bytes | None, NDArray[np.uint8] | None]] = {}
+
+    def of(self, index: int) -> _Picture:
+        """The texture of a number; `MapSourceError` for one that cannot be read."""
+        texture = item(self._json.get("textures", []), index, "texture")
+        extensions = texture.get("extensions", {})
+        if "source" in texture or "EXT_texture_webp" in extensions:
+            source = extensions.get("EXT_texture_webp", texture).get(
+                "source", texture.get("source")
+            )
+        elif extensions:
+            raise MapSourceError(f"texture needs {', '.join(extensions)}, not supported")
+        else:
+            raise MapSourceError("a texture has no image")
+        sampler = {}
+        if "sampler" in texture:
+            sampler = item(self._json.get("samplers", []), texture["sampler"], "sampler")
+        wraps = sampler.get("wrapS", _WRAP_REPEAT) == _WRAP_REPEAT
+        if source not in self._images:
+            data = self._data.picture(source)
+            self._images[source] = (*decode_image(data, self._rules), decode_alpha(data))
+        return _Picture(*self._images[source], wraps)
+
+
 class _Document:
     """The nodes of a document, and the meshes and materials that they show.
 
@@ -127,7 +156,7 @@ class _Document:
         self._rules = rules
         self._walked: set[int] = set()
         self._vertices = 0
-        self._images: dict[int, tuple[Image, bytes | None, NDArray[np.uint8] | None]] = {}
+        self._pictures = _Pictures(self._data, rules)
         unknown = sorted(set(self._json.get("extensionsRequired", [])) - _READABLE)
         if unknown:
             raise MapSourceError(f"needs the glTF extensions {', '.join(unknown)}, not supported")
@@ -289,7 +318,7 @@ class _Document:
             name = f"TEXCOORD_{transform.get('texCoord', look.texture.get('texCoord', 0))}"
             if name in attributes:
                 uvs = _transformed_uvs(attributes[name].astype(np.float64), transform)
-                picture = self._texture(look.texture.get("index", -1))
+                picture = self._pictures.of(look.texture.get("index", -1))
                 image, jpeg = picture.image, picture.jpeg
                 if not np.allclose(look.factor, 1.0, atol=1e-3):
                     image, jpeg = tinted(image, look.factor), None
@@ -308,26 +337,6 @@ class _Document:
         else:
             linear = np.broadcast_to(look.factor, (len(faces), 3))
         return palette_mesh(positions, faces, srgb(linear))
-
-    def _texture(self, index: int) -> _Picture:
-        texture = item(self._json.get("textures", []), index, "texture")
-        extensions = texture.get("extensions", {})
-        if "source" in texture or "EXT_texture_webp" in extensions:
-            source = extensions.get("EXT_texture_webp", texture).get(
-                "source", texture.get("source")
-            )
-        elif extensions:
-            raise MapSourceError(f"texture needs {', '.join(extensions)}, not supported")
-        else:
-            raise MapSourceError("a texture has no image")
-        sampler = {}
-        if "sampler" in texture:
-            sampler = item(self._json.get("samplers", []), texture["sampler"], "sampler")
-        wraps = sampler.get("wrapS", _WRAP_REPEAT) == _WRAP_REPEAT
-        if source not in self._images:
-            data = self._data.picture(source)
-            self._images[source] = (*decode_image(data, self._rules), decode_alpha(data))
-        return _Picture(*self._images[source], wraps)
 
 
 def _node_matrix(node: dict[str, Any]) -> Array:
