@@ -20,6 +20,7 @@ from localizer.registration.agreement import PatchDisplacements
 
 LEAST_PATCHES = 8  # six numbers are fitted
 _LEAST_PX = 0.05  # of the scatter: a perfect fit is no perfect knowledge
+# Both were chosen on fengyuan, with a look at NEON and caliterra; no other town has checked them.
 BLOCK_M = 20.0  # over which an unknown height is the same: a building, a row of trees
 COMMON = 2.0  # mean of the unknown heights over their spread: buildings stand on the ground
 _SINGULAR = 1e-9

@@ -2,9 +2,9 @@
 
 A wrong place can look right in one respect: low residuals where land of one kind is alike, a few
 patches that agree on equal roofs. It seldom does in all of them. So one logistic regression over
-all the evidence gives the probability. It is fitted on labelled registrations of many maps, real
-and generated, each map with the same weight (``python -m benchmarks.real --fit``); its numbers are
-`probability.json`, which says from what they were made and how each set fared that was left out.
+all the evidence gives the probability. It is fitted on labelled registrations of several maps, each
+with the same weight. `probability.json` holds its numbers, from what they were made and how each
+set fared that was left out. No command of the project repeats the fit yet.
 """
 
 from __future__ import annotations
