@@ -109,15 +109,28 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
-    """The pose after an independent measurement: Kalman's update. covariance: (6, 6)."""
+    """The pose after another sensor's knowledge of it. covariance: (6, 6).
+
+    Such a sensor's error (mounting, gimbal, air pressure) stays from frame to frame and does not
+    average out. So it is used only where less is known than it knows, and then no better is known
+    than it knows: along each principal direction a variance P > R becomes R, with the noise
+    ``R P / (P - R)``. The odometry follows the same rule, axis by axis (`odometry.growth.fused`).
+    """
     rows, values = constraint_rows(constraint, pose)
-    spread = rows @ covariance @ rows.T + np.eye(len(rows))
-    gain = np.linalg.solve(spread, rows @ covariance).T
+    known = rows @ covariance @ rows.T
+    squared = float(values @ np.linalg.solve(known + np.eye(len(rows)), values))
+    variance, axes = np.linalg.eigh(known)  # in units of the sensor's own
+    heard = variance > 1.0
+    if not heard.any():
+        return FusedPose(pose, covariance, squared, len(values))
+    rows, values, variance = (axes.T @ rows)[heard], (axes.T @ values)[heard], variance[heard]
+    # The directions are uncorrelated, so P + R P / (P - R) = P² / (P - R) is the spread of each.
+    gain = (rows @ covariance).T * ((variance - 1.0) / variance**2)
     step = gain @ values
     after = covariance - gain @ rows @ covariance
     return FusedPose(
         Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]),
         0.5 * (after + after.T),
-        float(values @ np.linalg.solve(spread, values)),
+        squared,
         len(values),
     )

@@ -30,12 +30,8 @@ from localizer.tracking.dead_reckoning import fallen_m
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import RegistrationStatus
 
-CONTRADICTS = 2.5
-"""Sigmas between the registered pose and a sensor from which one of them is wrong.
-
-Of 4, 3 and 2.5 the first that keeps a gimbal that sinks by 8 degrees from taking a generated flight
-along. Honest roll and pitch exceed it in 4 % of the frames by theory; that rate was not measured.
-"""
+CONTRADICTS = 4.0
+"""Sigmas between the registered pose and a sensor from which one of them is wrong."""
 
 
 @dataclass(frozen=True)
