@@ -28,8 +28,6 @@ from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import (
     Endpoint,
-    Transport,
-    open_transport,
     parse_sender,
 )
 from mavlink_bridge.messages import (
@@ -70,7 +68,6 @@ class Bridge:
     on_text: called likewise with every line for the operator (severity, text, its alert).
     on_vehicle_text: called likewise with every STATUSTEXT of the autopilot (severity, text, sender
     as "system/component"), long ones in their parts.
-    opener: opens the links' transports; raises OSError or EndpointError while it cannot.
     clock: CLOCK_MONOTONIC, ns; for a recorded flight, which `play` and `tick` go through instead of
     `start`, the time in the record.
     Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
@@ -85,7 +82,6 @@ class Bridge:
         on_hint: Callable[[PlaceHint], bool] | None = None,
         on_text: Callable[[int, str, Alert | None], None] = lambda _severity, _text, _alert: None,
         on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None,
-        opener: Callable[[Endpoint], Transport] = open_transport,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._config, self._clock = config, clock
@@ -122,7 +118,7 @@ class Bridge:
             clock,
         )
         self._fc = FlightControllerEnd(shared)
-        make = _LinkMaker(config, self._recorder, opener)
+        make = _LinkMaker(config, self._recorder)
         self._fc_link = make(config.connection, self._fc, "fc", FC_WANTED, config.signing)
         # Without a ground link of its own, what is for the ground is routed by the autopilot.
         self._ground: Components = self._fc.components
@@ -393,7 +389,6 @@ class _LinkMaker:
 
     config: BridgeConfig
     recorder: TlogRecorder | None
-    opener: Callable[[Endpoint], Transport]
 
     def __call__(
         self,
@@ -417,7 +412,6 @@ class _LinkMaker:
             signing_link_id=1 if signing is None else signing.link_id,
             recorder=self.recorder,
             timeout_s=config.link_timeout_s,
-            opener=self.opener,
         )
         return Link(Endpoint.parse(connection), handler, options)
 

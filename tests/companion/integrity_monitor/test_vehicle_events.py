@@ -182,14 +182,12 @@ class Faulty:
 
 
 @pytest.fixture
-def faulty(monkeypatch: pytest.MonkeyPatch) -> tuple[IntegrityMonitor, Any]:
+def faulty() -> tuple[IntegrityMonitor, Any]:
     """A monitor whose clock goes on by its period at each turn, and its bridge."""
-    clock = iter(range(second(10.0), second(100.0), second(0.1)))
-    monkeypatch.setattr(
-        "companion.integrity_monitor.integrity_monitor.monotonic_ns", lambda: next(clock)
-    )
+    times = iter(range(second(10.0), second(100.0), second(0.1)))
     bridge: Any = Faulty(Flight(monitor()))
-    return IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge), bridge
+    config, limits = IntegrityMonitorConfig(), IntegrityLimits()
+    return IntegrityMonitor(config, limits, bridge, clock=lambda: next(times)), bridge
 
 
 FIX = VisionFix(second(1.0), 47.0, 8.0, 500.0)
