@@ -12,6 +12,7 @@ from tests.house import (
     folder_circles,
     large_classes,
     long_signatures,
+    module_circles,
     private_reaches,
     sources,
     wrong_imports,
@@ -23,6 +24,7 @@ RULES = (
     long_signatures,
     wrong_imports,
     folder_circles,
+    module_circles,
     private_reaches,
     endless_waits,
 )
