@@ -102,6 +102,7 @@ def _bridge(making: BuildContext) -> Bridge:
         on_hint=lambda hint: search().hint_at(hint),
         on_text=making.channels.texts.send,
         on_vehicle_text=making.channels.vehicle_texts.send,
+        clock=making.clock,
     )
     bridge.set_map_id(readable_map_hash(making.config.map) or "")
     return bridge
@@ -361,7 +362,9 @@ def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
     calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
     protection = config.integrity_monitor.protection.of_camera(calibrated=calibrated)
     watched = config.integrity_monitor.model_copy(update={"protection": protection})
-    integrity_monitor = IntegrityMonitor(watched, limits, making[Bridge], _forbid_memory(config))
+    integrity_monitor = IntegrityMonitor(
+        watched, limits, making[Bridge], _forbid_memory(config), making.clock
+    )
     making[FixInjection].add_judge(lambda _, fix: integrity_monitor.judge(fix))
     making.channels.frames.subscribe(lambda f: integrity_monitor.see(f.exposure_time_ns, f.image))
     sightings = CalibrationObserver(
