@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain, count
 
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.injection_enable import InjectionEnable
@@ -26,7 +27,7 @@ def clicked_numbers() -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Shared:
-    """What the bridge lends to its ends. say: tell the operator (severity, text).
+    """What the bridge lends to its ends. report: tell the operator.
 
     gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
     """
@@ -37,7 +38,7 @@ class Shared:
     tracker: VehicleTracker
     begun_ns: int
     health: Callable[[], HealthLevel]
-    say: Callable[[int, str], None]
+    report: Callable[[Alert], None]
     on_track: Callable[[TrackRequest], None] | None
     on_hint: Callable[[PlaceHint], bool] | None
     watch: VehicleWatch

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import alert_of
 from mavlink_bridge.messages import Figures
 
 Array = NDArray[np.float64]
@@ -23,6 +25,12 @@ class Text:
     at_s: float
     sender: str
     text: str
+
+    @property
+    def alert(self) -> AlertId | None:
+        """The active alert of our bridge that it tells; None for others."""
+        read = alert_of(self.text) if self.sender == "bridge" else None
+        return read[0] if read is not None and read[1] else None
 
 
 @dataclass(frozen=True)
