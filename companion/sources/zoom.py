@@ -8,8 +8,6 @@ corrects it slowly, and never beyond a bound.
 
 from __future__ import annotations
 
-from mavlink_bridge.alerts.alert import Alert
-
 import math
 import threading
 from collections import deque
@@ -23,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, PoseEstimate
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 

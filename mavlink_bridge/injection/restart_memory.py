@@ -173,7 +173,9 @@ class ShadowFailureMemory:
     def recall(self) -> bool:
         """Whether it spoke against the map in the process before."""
         found = self._memory.recall()
-        against = found is not None and bool(found[0].get("against"))
+        told = None if found is None else found[0].get("against")
+        of_0_1 = isinstance(told, str) and bool(told) and told.isprintable()  # the reason
+        against = told is True or of_0_1
         self.note(against)
         return against
 

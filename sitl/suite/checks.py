@@ -345,6 +345,8 @@ Check = (
     | Jumps
     | Lags
     | Says
+    | Reports
+    | Reports
     | Alerted
     | Silent
     | InMode
