@@ -358,8 +358,8 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
     elif track is None and facts.has_dji_track:
         notes.append(
             "the telemetry inside DJI's video is not read: give its .SRT (the camera's setting "
-            "'video subtitles' writes it), or the aircraft's log (--log); every frame is searched on "
-            "the whole map"
+            "'video subtitles' writes it), or the aircraft's log (--log); every frame is searched "
+            "on the whole map"
         )
     elif track is None:
         notes.append(
