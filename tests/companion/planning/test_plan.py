@@ -289,17 +289,18 @@ def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
     assert not stretches(verdict((0, 1)), 5.0, strict)[0].can_bridge
 
 
-def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg, tmp_path):
-    def drift_m(share, odometry):
+def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg):
+    def drift_m(share, terrain=False):
         off = forecast(risk=0.9, share=share, ground=0.0 if share == 0.0 else 0.3)
         judged = tuple(judge(s, [off], MissionLimits()) for s in leg.samples)
-        return stretches([LegVerdict(leg, judged)], 5.0, odometry)[0].drift_m
+        return stretches([LegVerdict(leg, judged)], 5.0, OdometryConfig(), terrain=terrain)[
+            0
+        ].drift_m
 
-    level, terrain = OdometryConfig(), OdometryConfig(terrain=tmp_path / "terrain.tif")
-    mapped, off = drift_m(1.0, level), drift_m(0.0, level)
+    mapped, off = drift_m(1.0), drift_m(0.0)
     assert off == pytest.approx(0.1 * leg.length_m, rel=0.1)
-    assert mapped < drift_m(0.0, terrain) < 0.2 * off
-    assert drift_m(0.3, level) == off
+    assert mapped < drift_m(0.0, terrain=True) < 0.2 * off
+    assert drift_m(0.3) == off
 
 
 def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
