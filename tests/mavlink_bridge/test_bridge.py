@@ -246,8 +246,6 @@ def test_command_gates_injection(
     assert told == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
 
 
-
-
 def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
     autopilot: Any, run: Callable[..., Bridge]
 ) -> None:
@@ -287,12 +285,6 @@ def test_streams_are_asked_for_until_they_come(autopilot: Any, run: Callable[...
         return {int(m.param1) for m in commands if m.command == wanted}
 
     assert sleep_until(lambda: asked() >= {30, 32, 33, 24, 193, 285}, 30.0), asked()
-
-
-
-
-
-
 
 
 def test_timesync_requests_are_answered_on_our_clock(
