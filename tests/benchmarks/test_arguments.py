@@ -17,7 +17,8 @@ def refused(
     """What the command line writes before it ends with exit code 2."""
     name, *arguments = command.split()
     monkeypatch.setattr(sys, "argv", [name, *arguments])
-    monkeypatch.delitem(sys.modules, f"benchmarks.{name}", raising=False)  # runpy would warn
+    for loaded in (f"benchmarks.{name}", f"benchmarks.{name}.__main__"):  # runpy would warn
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"benchmarks.{name}", run_name="__main__")
     assert ended.value.code == 2
@@ -76,7 +77,8 @@ def test_every_option_is_explained(
     if name == "pairs":
         pytest.importorskip("torch")
     monkeypatch.setattr(sys, "argv", [name, "--help"])
-    monkeypatch.delitem(sys.modules, f"benchmarks.{name}", raising=False)  # runpy would warn
+    for loaded in (f"benchmarks.{name}", f"benchmarks.{name}.__main__"):  # runpy would warn
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"benchmarks.{name}", run_name="__main__")
     assert ended.value.code == 0
