@@ -135,9 +135,7 @@ def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list
 def _notes(
     mission: PlannedMission, deployment: CompanionConfig, aim: Aim, spacing_m: float
 ) -> tuple[str, ...]:
-    notes = [
-        f"A place every {spacing_m:.0f} m; legs are flown straight, turns and circles are left out."
-    ]
+    notes = [f"A place every {spacing_m:.0f} m; turns are left out."]
     if aim.fixed:
         notes.append("The camera is screwed on and the vehicle flown level: it leans in flight.")
     elif all(w.gimbal.pitch_deg is None and w.gimbal.roi is None for w in mission.path):
