@@ -249,11 +249,13 @@ def gnss_rules(source_set: int, read: Read) -> list[ParameterRule]:
     """ArduPilot with GNSS and vision: what lets it use GNSS by itself while vision is selected."""
     if not (read("GPS1_TYPE") or read("GPS_TYPE")):
         return []
-    why = "bit 0 fuses GNSS velocity in the vision set; bit 3 gives each EKF core a source set, "
-    why += "and a core that fails brings GNSS back"
-    options = int(read("EK3_SRC_OPTIONS") or 0)
-    allowed = (float(options & ~_OWN_SOURCES),)
-    rules = [ParameterRule(("EK3_SRC_OPTIONS",), allowed, why)]
+    rules = []
+    options = read("EK3_SRC_OPTIONS")
+    if options is not None:
+        why = "bit 0 fuses GNSS velocity in the vision set; bit 3 gives each EKF core a source "
+        why += "set, and a core that fails brings GNSS back"
+        kept = int(options) & ~_OWN_SOURCES if math.isfinite(options) else 0
+        rules.append(ParameterRule(("EK3_SRC_OPTIONS",), (float(kept),), why))
     if read(f"EK3_SRC{source_set}_POSZ") == _GNSS_SOURCE:
         why = "heights from GNSS in the vision set: a wrong receiver moves the vehicle up or down"
         rules.append(ParameterRule((f"EK3_SRC{source_set}_POSZ",), (1.0,), why))

@@ -180,12 +180,13 @@ def test_odometry_wants_velocity_noise_that_is_true() -> None:
         ({"GPS1_TYPE": 0.0, "EK3_SRC_OPTIONS": 9.0}, {}),  # no receiver
     ],
 )
-def test_what_lets_the_autopilot_take_gnss_by_itself_is_found(
+def test_what_lets_the_autopilot_use_gnss_by_itself_is_found(
     more: dict[str, float], fixes: dict[str, float]
 ) -> None:
     parameters = {"GPS1_TYPE": 1.0, "EK3_SRC_OPTIONS": 0.0, "EK3_SRC2_POSZ": 1.0} | more
     found = check_parameters(gnss_rules(2, parameters.get), parameters.get)
     assert {f.name: f.fix for f in found if not f.ok} == fixes
+    assert gnss_rules(2, {"GPS1_TYPE": 1.0}.get) == []  # firmware that has no options
 
 
 @pytest.mark.parametrize(
