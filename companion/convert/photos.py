@@ -75,7 +75,9 @@ def read_photos(
     _require_one_datum(path, tags, tell)
     stated = next(iter(tags.values())).get("AltitudeType", "")
     if _DATUMS.get(stated.lower(), known.datum) != known.datum:
-        tell(f"AltitudeType {stated}: such heights are {_DATUMS[stated.lower()]}, not {known.datum}")
+        tell(
+            f"AltitudeType {stated}: such heights are {_DATUMS[stated.lower()]}, not {known.datum}"
+        )
     lift = known.lift_m
     return tuple(_read_photo(photo, tags[photo.name], frame, lift) for photo in photos)
 
