@@ -18,16 +18,22 @@ RENAMED = {
     "localizer.integrity.distinct_from_m": "localizer.integrity.ambiguity_sigma_m",
     "localizer.integrity.gate": "localizer.integrity.chi2_threshold",
     "localizer.odometry.gate": "localizer.odometry.chi2_threshold",
-    "localizer.relocalization.min_agreement": "localizer.relocalization.min_patch_inlier_ratio",
 }
 """Old path: new path, both in the same section; a section's own rename comes before its keys'."""
 
 REMOVED = tuple(
-    f"localizer.integrity.{key}"
-    for key in (
-        "min_quality", "max_sigma_m", "min_agreement", "min_parts", "min_peak",
-        "min_patch_inlier_ratio", "min_patches", "peak_to_sidelobe_min",
-    )
+    f"localizer.{section}.{key}"
+    for section, keys in {
+        "integrity": (
+            "min_quality", "max_sigma_m", "min_agreement", "min_parts", "min_peak",
+            "min_patch_inlier_ratio", "min_patches", "peak_to_sidelobe_min",
+        ),
+        "relocalization": (
+            "min_quality", "max_sigma_m", "min_agreement", "min_patch_inlier_ratio",
+            "max_focal_gain", "tilt_gate_deg", "height_gate_m", "decisive_agreement", "margin",
+        ),
+    }.items()
+    for key in keys
 )  # fmt: skip
 """Thresholds that `localizer.integrity.min_log_odds` replaces: left out, with a warning."""
 
