@@ -33,6 +33,7 @@ FindPlace = Callable[[Frame, Pose, int], PosePrior | None]
 
 # Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
 _FRAME_INTERVAL_NS = 33_333_333
+_TIMESTAMPS = "timestamps.txt"
 
 CSV_COLUMNS = (
     "name", "latitude_deg", "longitude_deg", "height_m", "translation_error_m",
@@ -42,12 +43,15 @@ CSV_COLUMNS = (
 
 @dataclass(frozen=True)
 class Sequence:
-    """A recorded sequence: image paths in order, and the true pose of each."""
+    """A recorded sequence: image paths in order, and the true pose of each. is_timed: whether the
+    exposure times were given; else 30 frames a second are assumed.
+    """
 
     images: tuple[Path, ...]
     times_ns: tuple[int, ...]
     truth: tuple[Pose, ...]
     camera: Camera
+    is_timed: bool = True
 
     def frame(self, index: int) -> Frame:
         """Decode one frame."""
@@ -130,14 +134,15 @@ def load_sequence(path: Path, frame: LocalFrame, name: str | None = None) -> Seq
             f"first {missing[0]}"
         )
     truth = tuple(world_from_camera(row, frame) for row in rows)
-    return Sequence(paths, _times(images, paths), truth, Camera.from_json(camera))
+    times = _times(images / _TIMESTAMPS, paths)
+    assumed = tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
+    return Sequence(paths, times or assumed, truth, Camera.from_json(camera), times is not None)
 
 
-def _times(images: Path, paths: tuple[Path, ...]) -> tuple[int, ...]:
-    """Exposure times from ``timestamps.txt`` (name and ns per line); else 30 frames a second."""
-    file = images / "timestamps.txt"
+def _times(file: Path, paths: tuple[Path, ...]) -> tuple[int, ...] | None:
+    """Exposure times from ``timestamps.txt`` (name and ns per line); None without the file."""
     if not file.is_file():
-        return tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
+        return None
     try:
         stamps = {
             name: int(time_ns)
@@ -177,6 +182,7 @@ def evaluate(
     passes: int = 3,
     progress: Callable[[int], None] = lambda _: None,
     find: FindPlace | None = None,
+    in_prior: Callable[[PosePrior, Pose, int], PosePrior] = lambda prior, _truth, _index: prior,
 ) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
     """Localize every frame and measure it.
 
@@ -185,7 +191,8 @@ def evaluate(
     prior is rendered and registered, each time from the last result. A frame that is predicted
     outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
     `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
-    whenever it is lost or led nowhere, instead of the perturbed truth.
+    whenever it is lost or led nowhere, instead of the perturbed truth. in_prior: puts into a
+    perturbed prior what other sensors report (`DrawnSensors.in_prior`).
     """
     frames: list[EvaluatedFrame] = []
     errors: list[LocalizerError] = []
@@ -206,7 +213,8 @@ def evaluate(
             if fresh:
                 truth = sequence.truth[index]
                 if find is None:
-                    prior = perturbation.prior(truth, index, frame.exposure_time_ns)
+                    perturbed = perturbation.prior(truth, index, frame.exposure_time_ns)
+                    prior = in_prior(perturbed, truth, index)
                 else:
                     found = find(frame, truth, index)
                     if found is None:
