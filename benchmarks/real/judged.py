@@ -21,9 +21,12 @@ from localizer.errors import OutsideMapError
 from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.sequences import Sequence as Recorded
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.relocalization.patch import turned
+from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.opening import open_localizer
-from localizer.tracking.pipeline import Localizer
+from localizer.tracking.pipeline import Localizer, working_camera
 from localizer.types import Frame, PoseEstimate, PosePrior
 
 ATTITUDES: tuple[float | None, ...] = (0.3, 1.0, 3.0, None)
@@ -32,6 +35,7 @@ OFF_M, OFF_HEADING_DEG = 10.0, 3.0  # of the prior: largest east and north, sigm
 _UNKNOWN_TILT_DEG = 2.0  # sigma of the prior where no attitude is reported
 _INSIDE_3, _INSIDE_2 = 7.815, 5.991  # chi square, 95 %
 _PASSES = 3
+_USUAL_M = 100.0  # to the ground, where the map has none in the middle of the view
 
 
 @dataclass(frozen=True)
@@ -79,15 +83,20 @@ def judged_images(
     for _, group in itertools.groupby(numbered, key=lambda kv: (kv[1].map_cache, kv[1].camera)):
         mine = list(group)
         view = mine[0][1]
-        with open_localizer(
-            view.map_cache, view.camera, config, sensors.auxiliary(recorded)
-        ) as localizer:
+        with (
+            open_localizer(
+                view.map_cache, view.camera, config, sensors.auxiliary(recorded)
+            ) as localizer,
+            TileStreamer(TileCache.open(view.map_cache)) as streamer,
+        ):
+            renderer = NumbaRenderer(streamer, 1)
             for k, view in mine:
                 frame = Frame(view.image(), times[k], view.camera, k)
                 estimate = _localized(localizer, frame, view.truth, sensors, k)
                 progress()
                 if estimate is not None:
-                    yield _judged(name, k, attitude_deg, described, localizer, view.truth, estimate)
+                    away_m = distance_to_ground(renderer, view)
+                    yield _judged(name, k, attitude_deg, described, view.truth, estimate, away_m)
 
 
 def prior_of(truth: Pose, sensors: DrawnSensors, index: int, time_ns: int) -> PosePrior:
@@ -115,20 +124,20 @@ def _localized(
 
 def _judged(
     name: str, index: int, attitude_deg: float | None, described: SetDescription,
-    localizer: Localizer, truth: Pose, estimate: PoseEstimate,
+    truth: Pose, estimate: PoseEstimate, away_m: float,
 ) -> JudgedImage:  # fmt: skip
     pose = estimate.world_from_camera
     error = pose.translation - truth.translation
     turn = so3_log(pose.rotation @ truth.rotation.T)
     place = estimate.covariance[:3, :3] + np.eye(3) * described.position_sigma_m**2
-    rotation = estimate.covariance[3:, 3:] + np.eye(3) * max(
-        np.radians(described.rotation_sigma_deg), 1e-4
-    ) ** 2
+    rotation = (
+        estimate.covariance[3:, 3:]
+        + np.eye(3) * max(np.radians(described.rotation_sigma_deg), 1e-4) ** 2
+    )
     squared = _squared(error, place)
-    above_m = distance_to_ground(localizer, truth)
-    centre = ground_centre(pose, truth, above_m)
+    centre = ground_centre(pose, truth, away_m)
     sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
-    level, _ = budget((sigma, 0.0), above_m, (0.0, 0.0), ProtectionConfig())
+    level, _ = budget((sigma, 0.0), away_m, (0.0, 0.0), ProtectionConfig())
     horizontal = float(np.hypot(*error[:2]))
     return JudgedImage(
         name, index, attitude_deg, centre, centre <= described.right_m, estimate.accepted,
@@ -144,13 +153,13 @@ def _squared(error: Array, covariance: Array) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def distance_to_ground(localizer: Localizer, truth: Pose) -> float:
+def distance_to_ground(renderer: NumbaRenderer, view: RealView) -> float:
     """Along the axis of the true camera, m: the depth in the middle of its rendered view."""
-    view = localizer.render(truth)
-    h, w = view.depth.shape
-    middle = view.depth[h // 4 : 3 * h // 4, w // 4 : 3 * w // 4]
+    depth = renderer.render(view.truth, working_camera(view.camera, 64), wait=True).depth
+    h, w = depth.shape
+    middle = depth[h // 4 : 3 * h // 4, w // 4 : 3 * w // 4]
     seen = middle[middle > 0]
-    return float(np.median(seen)) if len(seen) else 100.0
+    return float(np.median(seen)) if len(seen) else _USUAL_M
 
 
 def ground_centre(pose: Pose, truth: Pose, away_m: float) -> float:
