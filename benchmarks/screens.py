@@ -4,7 +4,7 @@
 
 URL: of a console that shows a flight or a record (`make demo` and `companion replay --console`
 print it). --wait: seconds for the map's tiles; --report: a report, too, or alone. Needs Chromium
-and playwright (the extra `dev`). Screens of a flight: `python -m benchmarks.console.browser`.
+and playwright (the extra `dev`).
 """
 
 from __future__ import annotations

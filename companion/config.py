@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -167,33 +168,22 @@ class TargetConfig(_Model):
     detections: str | None = Field(None, description="host:port for pixel detections")
     detector: DetectorConfig | None = Field(None, description="detection network; null: none")
     rate_hz: float = Field(5.0, ge=0.01, le=30, description="reports per second and target")
-    pixel_sigma: float = Field(1.5, ge=0.01, le=1000, description="error of a detection, pixels")
-    map_sigma_m: float = Field(
-        0.3, ge=0.001, le=100, description="error of the map's surface, metres"
-    )
-    outline_sigma_m: float = Field(
-        0.5, ge=0.0, le=100, description="error of roof and crown outlines, m"
-    )
-    bias_sigma_m: float = Field(
-        0.2, ge=0.0, le=100, description="common error of all targets of a flight, m"
-    )
-    max_sigma_m: float = Field(50.0, ge=0.1, le=10_000, description="largest reported sigma, m")
-    confirm_s: float = Field(
-        0.5, ge=0.0, le=60, description="time that detections must agree before the first report"
-    )
+    pixel_sigma: float = Field(1.5, exclude=True)  # error of a detection, pixels
+    map_sigma_m: float = Field(0.3, exclude=True)  # error of the map's surface, metres
+    outline_sigma_m: float = Field(0.5, exclude=True)  # error of roof and crown outlines, m
+    bias_sigma_m: float = Field(0.2, exclude=True)  # common error of all targets of a flight, m
+    max_sigma_m: float = Field(50.0, exclude=True)  # largest reported sigma, m
+    # time that detections must agree before the first report
+    confirm_s: float = Field(0.5, exclude=True)
     operator_delay_ms: float = Field(
         250.0,
         ge=0,
         le=5000,
         description="exposure to the operator's click, with the video link",
     )
-    operator_delay_sigma_ms: float = Field(100.0, ge=0, le=5000, description="its error, 1 sigma")
-    timeout_s: float = Field(
-        300.0,
-        ge=1,
-        le=86400,
-        description="time outside the image after which a clicked target ends",
-    )
+    operator_delay_sigma_ms: float = Field(100.0, exclude=True)  # its error, 1 sigma
+    # time outside the image after which a clicked target ends
+    timeout_s: float = Field(300.0, exclude=True)
 
     @field_validator("detections")
     @classmethod
@@ -206,17 +196,13 @@ class TargetConfig(_Model):
         return value
 
 
-class PriorConfig(_Model):
+@dataclass(frozen=True)
+class PriorConfig:
     """How well the autopilot's own position is believed when tracking (re)starts from it."""
 
-    position_sigma_m: float = Field(5.0, ge=0.01, le=1000)
-    rotation_sigma_deg: float = Field(4.0, ge=0.01, le=180)
-    recall_s: float = Field(
-        20.0, ge=0.0, le=120.0, description="oldest confirmed position that a restart uses"
-    )
-    state_file: Path | None = Field(
-        None, description="file for it; null: last-fix.json beside the record"
-    )
+    position_sigma_m: float = 5.0
+    rotation_sigma_deg: float = 4.0
+    recall_s: float = 20.0  # oldest confirmed position that a restart uses
 
 
 class RecordConfig(_Model):
@@ -236,9 +222,7 @@ class KlvConfig(_Model):
         pattern=r"^udp://[^\s/@?]+:[0-9]{1,5}(\?.*)?$", description="udp://HOST:PORT, MPEG-TS"
     )
     mission: str = Field("", max_length=127, description="mission name in each packet")
-    hold_ms: float = Field(
-        200.0, ge=0, le=2000, description="longest time that a frame waits for its pose"
-    )
+    hold_ms: float = Field(200.0, exclude=True)  # longest time that a frame waits for its pose
 
 
 class CompanionConfig(_Model):
@@ -254,9 +238,14 @@ class CompanionConfig(_Model):
     localizer: LocalizerConfig = LocalizerConfig()
     bridge: BridgeConfig = BridgeConfig()
     targets: TargetConfig = TargetConfig()
-    prior: PriorConfig = PriorConfig()
+    prior: PriorConfig = Field(PriorConfig(), exclude=True)
     integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
     record: RecordConfig | None = None
+    state_dir: Path | None = Field(
+        None,
+        description="folder of what a restart reads: enabled injection, last position, MAVLink "
+        "time stamps; null: beside the record's folder, and beside the keys",
+    )
     klv: KlvConfig | None = Field(
         None, description="forward the video with KLV metadata; null: off"
     )
@@ -264,12 +253,19 @@ class CompanionConfig(_Model):
         None, description="operator's page (extra `console`); null: none"
     )
 
+    @property
+    def state_folder(self) -> Path | None:
+        """Where enabled injection and the last position are kept; None: nowhere."""
+        if self.state_dir is not None or self.record is None:
+            return self.state_dir
+        return self.record.folder.parent
+
 
 def load_config(path: Path) -> CompanionConfig:
     """Read and check a configuration file; relative paths are relative to that file."""
     config = parse_config(read_settings(path, ConfigError), str(path))
     try:
-        return _resolve(config, path.parent)
+        return resolved(config, path.parent)
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from error
 
@@ -277,7 +273,7 @@ def load_config(path: Path) -> CompanionConfig:
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
     """Check a configuration given as plain data; `where` names it in errors."""
     try:
-        config = validated(CompanionConfig, with_current_keys(data, where))
+        config = validated(CompanionConfig, with_current_keys(CompanionConfig, data, where))
         config.camera.model.camera()
     except SettingsError as error:
         count = len(str(error).splitlines())
@@ -287,16 +283,15 @@ def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
     return config
 
 
-def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
+def resolved(config: CompanionConfig, folder: Path) -> CompanionConfig:
+    """With paths relative to `folder`; ValueError for a path that names nothing."""
     localizer = config.localizer
     if localizer.model is not None:
         model = _path(folder, localizer.model, "localizer.model")
         localizer = localizer.model_copy(update={"model": model})
-    odometry = localizer.odometry
-    if odometry is not None and odometry.terrain is not None:
-        terrain = _path(folder, odometry.terrain, "localizer.odometry.terrain")
-        odometry = odometry.model_copy(update={"terrain": terrain})
-        localizer = localizer.model_copy(update={"odometry": odometry})
+    if localizer.terrain is not None:
+        terrain = _path(folder, localizer.terrain, "localizer.terrain")
+        localizer = localizer.model_copy(update={"terrain": terrain})
     record = config.record
     if record is not None:
         place = _path(folder, record.folder, "record.folder")
@@ -305,23 +300,17 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
     if "://" not in camera.source:  # a device, a file or a folder
         source = _path(folder, Path(camera.source), "camera.source")
         camera = camera.model_copy(update={"source": str(source)})
+    state_dir = config.state_dir and _path(folder, config.state_dir, "state_dir")
     update = {
         "map": _path(folder, config.map, "map"),
         "camera": camera,
         "localizer": localizer,
-        "bridge": _resolve_bridge(config.bridge, folder),
-        "prior": _resolve_prior(config.prior, folder),
+        "bridge": _resolve_bridge(config.bridge, folder, state_dir),
+        "state_dir": state_dir,
         "record": record,
         "console": _resolve_console(config.console, folder),
     }
     return config.model_copy(update=update)
-
-
-def _resolve_prior(prior: PriorConfig, folder: Path) -> PriorConfig:
-    if prior.state_file is None:
-        return prior
-    path = _path(folder, prior.state_file, "prior.state_file")
-    return prior.model_copy(update={"state_file": path})
 
 
 def _resolve_console(console: ConsoleConfig | None, folder: Path) -> ConsoleConfig | None:
@@ -332,21 +321,16 @@ def _resolve_console(console: ConsoleConfig | None, folder: Path) -> ConsoleConf
     return console.model_copy(update=update)
 
 
-def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:
+def _resolve_bridge(bridge: BridgeConfig, folder: Path, state_dir: Path | None) -> BridgeConfig:
     update: dict[str, Any] = {}
     if bridge.tlog is not None:
         update["tlog"] = _path(folder, bridge.tlog, "bridge.tlog")
-    if bridge.state_file is not None:
-        update["state_file"] = _path(folder, bridge.state_file, "bridge.state_file")
-    for name in ("signing", "ground_signing"):
+    for name, link in (("signing", "fc"), ("ground_signing", "ground")):
         signing = getattr(bridge, name)
         if signing is not None:
             key_file = _path(folder, signing.key_file, f"bridge.{name}.key_file")
-            paths = {"key_file": key_file}
-            if signing.state_file is not None:
-                where = f"bridge.{name}.state_file"
-                paths["state_file"] = _path(folder, signing.state_file, where)
-            update[name] = signing.model_copy(update=paths)
+            seen = state_dir and state_dir / f"{key_file.name}.{link}.seen"
+            update[name] = signing.model_copy(update={"key_file": key_file, "state_file": seen})
     return bridge.model_copy(update=update)
 
 

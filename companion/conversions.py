@@ -139,6 +139,9 @@ def vehicle_prior(
     place = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
     if place[0] is None or place[1] is None or place[2] is None:
         return None
+    numbers = (*place, *attitude.quaternion, *gimbal.quaternion, *(state.local_velocity_ned or ()))
+    if not np.abs(numbers).max() < _FARTHEST_M:  # NaN is below nothing
+        return None
     frame = extrinsics.frame
     try:
         position = Geodetic(place[0], place[1], place[2] + extrinsics.geoid_separation_m)
@@ -154,8 +157,7 @@ def vehicle_prior(
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     arm = extrinsics.lever_arm_m
     camera = world_from_camera(body, ned_from_body, ned_from_camera, arm, to_ned)
-    numbers = np.concatenate((camera.rotation.ravel(), camera.translation))
-    if not np.abs(numbers).max() < _FARTHEST_M:  # NaN is below nothing
+    if not np.abs(camera.translation).max() < _FARTHEST_M:
         return None
     covariance = np.diag(np.repeat(np.square(sigma), 3))
     return PosePrior(camera, covariance, time_ns, velocity)

@@ -1,77 +1,98 @@
-"""Settings that had another name in version 0.1: 0.2 reads them and warns, 0.3 will refuse them.
+"""Settings of earlier versions that have another name or none: read, with a warning.
 
 The one place that knows old names. It serves deployments, the deployment in a flight's record, and
-scenario files.
+scenario files. A field with `exclude=True` is a constant of the program: code may give it another
+value, a deployment may not.
 """
 
 from __future__ import annotations
 
+import copy
 import logging
+from collections.abc import Iterator
 from typing import Any
+
+from pydantic import BaseModel
+
+from companion.settings_file import nested_models
 
 _log = logging.getLogger(__name__)
 
 RENAMED = {
     "guardian": "integrity_monitor",
-    "integrity_monitor.untold_jump_m": "integrity_monitor.unreported_jump_m",
     "camera.settings.stamps_late_ms": "camera.settings.time_offset_ms",
-    "localizer.integrity.distinct_from_m": "localizer.integrity.ambiguity_sigma_m",
-    "localizer.integrity.gate": "localizer.integrity.chi2_threshold",
-    "localizer.odometry.gate": "localizer.odometry.chi2_threshold",
+    "localizer.odometry.terrain": "localizer.terrain",
 }
-"""Old path: new path, both in the same section; a section's own rename comes before its keys'."""
+"""Old path: new path."""
 
-REMOVED = tuple(
-    f"localizer.{section}.{key}"
-    for section, keys in {
-        "integrity": (
-            "min_quality", "max_sigma_m", "min_agreement", "min_parts", "min_peak",
-            "min_patch_inlier_ratio", "min_patches", "peak_to_sidelobe_min",
-        ),
-        "relocalization": (
-            "min_quality", "max_sigma_m", "min_agreement", "min_patch_inlier_ratio",
-            "max_focal_gain", "tilt_gate_deg", "height_gate_m", "decisive_agreement", "margin",
-        ),
-    }.items()
-    for key in keys
-)  # fmt: skip
-"""Thresholds that `localizer.integrity.min_log_odds` replaces: left out, with a warning."""
+REMOVED = {
+    "integrity_monitor.untold_jump_m": "it is a constant of the program",
+    "bridge.state_file": "state_dir is the folder of all that a restart reads",
+    "bridge.signing.state_file": "state_dir is the folder of all that a restart reads",
+    "bridge.ground_signing.state_file": "state_dir is the folder of all that a restart reads",
+    "prior.state_file": "state_dir is the folder of all that a restart reads",
+    "bridge.camera.width_px": "it is camera.model.width",
+    "bridge.camera.height_px": "it is camera.model.height",
+    "bridge.camera.horizontal_fov_deg": "it follows from camera.model",
+    "bridge.camera.zoom_rate_hz": "it follows from camera.zoom",
+    "bridge.targets.rate_hz": "it is targets.rate_hz",
+    "localizer.feature_threads": "it follows from localizer.threads",
+}
+"""Path: why it has no effect any more. Constants of the program (see above) need no entry."""
 
 
-def with_current_keys(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """The settings under today's names; `where` names the file in the warnings.
+def with_current_keys(model: type[BaseModel], data: dict[str, Any], where: str) -> dict[str, Any]:
+    """The settings of `model` under today's names; `where` names the file in the warnings.
 
     A key that is given under both names keeps both: the model then refuses the old one.
     """
+    data = copy.deepcopy(data)
     for old, new in RENAMED.items():
-        *path, key = old.split(".")
-        section: Any = data
-        for name in path:
-            section = section.get(name) if isinstance(section, dict) else None
-        today = new.rpartition(".")[2]
-        if isinstance(section, dict) and key in section and today not in section:
+        if _holds(data, old) and not _holds(data, new):
             _log.warning("%s: %s is called %s since 0.2: rename it", where, old, new)
-            data = _renamed(data, path, key, today)
-    for old in REMOVED:
-        *path, key = old.split(".")
-        section = data
-        for name in path:
-            section = section.get(name) if isinstance(section, dict) else None
-        if isinstance(section, dict) and key in section:
-            _log.warning("%s: %s has no effect since 0.2: remove it", where, old)
-            data = _without(data, path, key)
+            _put(data, new, _taken(data, old))
+    reasons = {key: why for key, why in REMOVED.items() if _holds(data, key)}
+    for key in [*reasons, *_constants(model, data, "")]:
+        if _holds(data, key):
+            why = reasons.get(key, "it is a constant of the program")
+            _log.warning("%s: %s has no effect since 0.2 (%s): remove it", where, key, why)
+            _taken(data, key)
     return data
 
 
-def _without(data: dict[str, Any], path: list[str], key: str) -> dict[str, Any]:
-    """A copy in which one key of a section is missing."""
-    if not path:
-        return {name: value for name, value in data.items() if name != key}
-    return {**data, path[0]: _without(data[path[0]], path[1:], key)}
+def _constants(model: type[BaseModel], data: dict[str, Any], at: str) -> Iterator[str]:
+    """Paths of the given keys that no deployment can set."""
+    for name, value in data.items():
+        field = model.model_fields.get(str(name))
+        if field is None:
+            continue
+        if field.exclude:
+            yield f"{at}{name}"
+        elif isinstance(value, dict):
+            for inner in nested_models(field.annotation):
+                yield from _constants(inner, value, f"{at}{name}.")
 
 
-def _renamed(data: dict[str, Any], path: list[str], key: str, today: str) -> dict[str, Any]:
-    """A copy in which one key of a section has its new name, in its old place."""
-    if not path:
-        return {today if name == key else name: value for name, value in data.items()}
-    return {**data, path[0]: _renamed(data[path[0]], path[1:], key, today)}
+def _section(data: dict[str, Any], path: str) -> tuple[dict[str, Any] | None, str]:
+    """The mapping that holds a path's last key, None without one, and that key."""
+    *names, key = path.split(".")
+    section: Any = data
+    for name in names:
+        section = section.get(name) if isinstance(section, dict) else None
+    return section if isinstance(section, dict) else None, key
+
+
+def _holds(data: dict[str, Any], path: str) -> bool:
+    section, key = _section(data, path)
+    return section is not None and key in section
+
+
+def _taken(data: dict[str, Any], path: str) -> Any:
+    section, key = _section(data, path)
+    return None if section is None else section.pop(key)
+
+
+def _put(data: dict[str, Any], path: str, value: Any) -> None:
+    section, key = _section(data, path)
+    if section is not None:
+        section[key] = value

@@ -6,10 +6,11 @@ import difflib
 import reprlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from localizer.plain_files import plain_text
 from localizer.strict_yaml import load_yaml, misread_booleans
@@ -42,14 +43,26 @@ def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
 def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
     """The settings as their model; SettingsError lists where, what, and what was given."""
     try:
-        settings = model.model_validate(data)
+        read = model.model_validate(data)
     except ValidationError as error:
         lines = [_line(e["loc"], _reason(model, dict(e)), e["input"]) for e in error.errors()]
         raise SettingsError("\n".join(lines)) from error
     if lines := [_line(where, "must not be a boolean", value)
-                 for where, value in misread_booleans(data, settings)]:  # fmt: skip
+                 for where, value in misread_booleans(data, read)]:  # fmt: skip
         raise SettingsError("\n".join(lines))
-    return settings
+    return read
+
+
+def settings(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of a model that a file can set: all but the program's constants (`exclude`)."""
+    return {name: field for name, field in model.model_fields.items() if not field.exclude}
+
+
+def nested_models(annotation: object) -> list[type[BaseModel]]:
+    """The models in a field's annotation, such as that of an optional section."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in nested_models(part)]
 
 
 def _line(where: Iterable[str | int], what: str, given: object) -> str:
@@ -77,7 +90,7 @@ def _meant(model: type[BaseModel], where: Sequence[str | int]) -> str:
         if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
             return ""
         model = kind
-    close = difflib.get_close_matches(str(where[-1]), model.model_fields, n=1)
+    close = difflib.get_close_matches(str(where[-1]), settings(model), n=1)
     return f", did you mean {close[0]}?" if close else ""
 
 

@@ -28,8 +28,6 @@ from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import (
     Endpoint,
-    Transport,
-    open_transport,
     parse_sender,
 )
 from mavlink_bridge.messages import (
@@ -70,7 +68,8 @@ class Bridge:
     on_text: called likewise with every line for the operator (severity, text, its alert).
     on_vehicle_text: called likewise with every STATUSTEXT of the autopilot (severity, text, sender
     as "system/component"), long ones in their parts.
-    opener: opens the links' transports; raises OSError or EndpointError while it cannot.
+    clock: CLOCK_MONOTONIC, ns; for a recorded flight, which `play` and `tick` go through instead of
+    `start`, the time in the record.
     Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
     """
 
@@ -83,12 +82,12 @@ class Bridge:
         on_hint: Callable[[PlaceHint], bool] | None = None,
         on_text: Callable[[int, str, Alert | None], None] = lambda _severity, _text, _alert: None,
         on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None,
-        opener: Callable[[Endpoint], Transport] = open_transport,
+        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
-        self._config = config
+        self._config, self._clock = config, clock
         self._started = self._stopped = False
         self._utc = SteadyUtc()
-        self._status = OperatorStatus(self._tell_text, on_text)
+        self._status = OperatorStatus(self._tell_text, on_text, clock)
         teller = StatusNotifier(self.say)
         self._recorder = None
         if config.tlog is not None:
@@ -107,18 +106,19 @@ class Bridge:
             geoid_separation_m,
             self._utc,
             self._tracker,
-            monotonic_ns(),
+            self._clock(),
             lambda: self._status.level,
             self.say,
             on_track,
             on_hint,
-            VehicleWatch(self.say, enable.announce if enable is not None else lambda: None),
+            VehicleWatch(self.say, enable.announce if enable is not None else lambda: None, clock),
             enable,
             LookAt(config, geoid_separation_m, self.say),
             on_vehicle_text,
+            clock,
         )
         self._fc = FlightControllerEnd(shared)
-        make = _LinkMaker(config, self._recorder, opener)
+        make = _LinkMaker(config, self._recorder)
         self._fc_link = make(config.connection, self._fc, "fc", FC_WANTED, config.signing)
         # Without a ground link of its own, what is for the ground is routed by the autopilot.
         self._ground: Components = self._fc.components
@@ -154,6 +154,14 @@ class Bridge:
         self._fc.recall()
         for link in self._links:
             link.start()
+
+    def play(self, message: Any) -> None:
+        """A recorded message of the flight controller, at the clock's time, without `start`."""
+        self._fc.on_message(self._fc_link, message, self._clock())
+
+    def tick(self) -> None:
+        """Do what is due at the clock's time, as the link's thread does after `start`."""
+        self._fc.on_tick(self._fc_link, self._clock())
 
     def hand_over(self) -> None:
         """What follows is no end in order: what is remembered over a restart stays so."""
@@ -250,7 +258,7 @@ class Bridge:
         `named_values` has them; never blocks.
         """
         if self._config.named_values:
-            uptime_ms = self._shared.uptime_ms(monotonic_ns())
+            uptime_ms = self._shared.uptime_ms(self._clock())
             for message in named_values(figures, uptime_ms):
                 self._ground_link.send(message, self._config.companion_component)
 
@@ -264,7 +272,7 @@ class Bridge:
 
     def state(self) -> VehicleState:
         """What the vehicle says about itself."""
-        return self._tracker.snapshot(monotonic_ns())
+        return self._tracker.snapshot(self._clock())
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
         """The vehicle's attitude at a CLOCK_MONOTONIC time; None when the buffer has none."""
@@ -288,7 +296,7 @@ class Bridge:
         """The EKF's (latitude, longitude, altitude AMSL) at a time; None while it does not follow a
         healthy GNSS, or where that is not known.
         """
-        if not self.on_gnss or not gnss_healthy(self.state(), monotonic_ns()):
+        if not self.on_gnss or not gnss_healthy(self.state(), self._clock()):
             return None
         return self._tracker.global_at(time_ns)
 
@@ -297,7 +305,7 @@ class Bridge:
         """Whether GNSS makes the EKF's position, healthy or not: by its source set, and not where
         the receiver is fed by us; None where the set is not known.
         """
-        return self._fc.on_gnss(monotonic_ns())
+        return self._fc.on_gnss(self._clock())
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""
@@ -336,7 +344,7 @@ class Bridge:
     @property
     def reaches_ekf(self) -> bool:
         """Whether positions went to the flight controller in the last second."""
-        return self._fc.sender.reaches_ekf(monotonic_ns())
+        return self._fc.sender.reaches_ekf(self._clock())
 
     @property
     def injection_fault(self) -> str:
@@ -347,7 +355,7 @@ class Bridge:
 
     def shadow_score(self) -> ShadowScore:
         """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
-        return self._fc.shadow_score(monotonic_ns())
+        return self._fc.shadow_score(self._clock())
 
     def loop_verdict(self) -> LoopVerdict | None:
         """Whether the EKF follows what is sent; None while nothing is sent or it is too early."""
@@ -381,7 +389,6 @@ class _LinkMaker:
 
     config: BridgeConfig
     recorder: TlogRecorder | None
-    opener: Callable[[Endpoint], Transport]
 
     def __call__(
         self,
@@ -405,7 +412,6 @@ class _LinkMaker:
             signing_link_id=1 if signing is None else signing.link_id,
             recorder=self.recorder,
             timeout_s=config.link_timeout_s,
-            opener=self.opener,
         )
         return Link(Endpoint.parse(connection), handler, options)
 

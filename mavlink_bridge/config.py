@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,34 +31,18 @@ class OriginConfig(_Model):
     altitude_amsl_m: float = Field(ge=-500.0, le=9000.0)
 
 
-class YawGuardConfig(_Model):
+@dataclass(frozen=True)
+class YawGuardConfig:
     """Cross-check of the vision yaw against the autopilot's.
 
     A vision frame rotated by 5 deg costs 25 m and raises no warning in ArduPilot.
     """
 
     enabled: bool = True
-    limit_deg: float = Field(
-        default=3.5,
-        ge=0.1,
-        le=45.0,
-        description="against the autopilot's yaw, or its gyros since earlier fixes",
-    )
-    gross_deg: float = Field(
-        default=20.0, gt=0.0, le=90.0, description="largest difference in any case"
-    )
-    memory_s: float = Field(
-        default=60.0, ge=0.1, le=600.0, description="time for which the gyros are used"
-    )
-    minimum_samples: int = Field(
-        default=5, ge=1, le=100, description="fixes compared: the majority blocks, all release"
-    )
-
-    @model_validator(mode="after")
-    def _gross_is_more(self) -> YawGuardConfig:
-        if self.gross_deg < self.limit_deg:
-            raise ValueError("gross_deg must be at least limit_deg")
-        return self
+    limit_deg: float = 3.5  # against the autopilot's yaw, or its gyros since earlier fixes
+    gross_deg: float = 20.0  # largest difference in any case
+    memory_s: float = 60.0  # time for which the gyros are used
+    minimum_samples: int = 5  # fixes compared: the majority blocks, all release
 
 
 class InjectionConfig(_Model):
@@ -71,10 +56,8 @@ class InjectionConfig(_Model):
         le=250.0,
         description="age at which a fix is sent: VISO_DELAY_MS or GPSn_DELAY_MS, n = gps_id + 1",
     )
-    sigma_floor_m: float = Field(default=0.1, ge=1e-6, le=100.0)
-    max_sigma_m: float = Field(
-        default=10.0, gt=0.0, le=100.0, description="largest sigma that is sent"
-    )
+    sigma_floor_m: float = Field(0.1, exclude=True)
+    max_sigma_m: float = Field(10.0, exclude=True)  # largest sigma that is sent
     alert_limit_m: float = Field(
         default=10.0,
         gt=0.0,
@@ -84,19 +67,10 @@ class InjectionConfig(_Model):
     time_to_alert_s: float = Field(
         default=3.0, ge=0.2, le=60.0, description="time within which output stops"
     )
-    max_extrapolation_s: float = Field(
-        default=0.5,
-        gt=0.0,
-        le=10.0,
-        description="longest propagation over a gap",
-    )
-    overdue_intervals: float = Field(
-        default=2.0,
-        ge=1.0,
-        le=1000.0,
-        description="missing fix intervals after which nothing is sent",
-    )
-    acceleration_sigma_mps2: float = Field(default=2.0, ge=0.001, le=50.0)
+    max_extrapolation_s: float = Field(0.5, exclude=True)  # longest propagation over a gap
+    # missing fix intervals after which nothing is sent
+    overdue_intervals: float = Field(2.0, exclude=True)
+    acceleration_sigma_mps2: float = Field(2.0, exclude=True)
     force: bool = Field(
         default=False,
         description="inject and switch without a passed shadow check, with a warning",
@@ -106,16 +80,14 @@ class InjectionConfig(_Model):
         description="map offset against GNSS; apply: fixes are corrected by it",
     )
     send_attitude: bool = True
-    covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
+    covariance: Literal["profile", "cbrt", "sqrt", "variance"] = Field("profile", exclude=True)
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
     gps_velocity: bool = True
     gps_yaw: bool = False
-    yaw_guard: YawGuardConfig = YawGuardConfig()
+    yaw_guard: YawGuardConfig = Field(YawGuardConfig(), exclude=True)
 
     @model_validator(mode="after")
     def _rate_suits_message(self) -> InjectionConfig:
-        if self.sigma_floor_m >= self.max_sigma_m:
-            raise ValueError("sigma_floor_m must be below max_sigma_m, or nothing is ever sent")
         if self.message == "gps_input" and self.rate_hz < 5.0:
             raise ValueError("gps_input needs rate_hz >= 5 (ArduPilot: GPS not healthy below)")
         return self
@@ -127,10 +99,10 @@ class SourceSwitchConfig(_Model):
     enabled: bool = False
     gnss_set: int = Field(default=1, ge=1, le=3)
     vision_set: int = Field(default=2, ge=1, le=3)
-    bad_after_s: float = Field(default=1.5, ge=0.1, le=60.0)
-    good_after_s: float = Field(default=20.0, ge=0.1, le=3600.0)
+    bad_after_s: float = Field(1.5, exclude=True)
+    good_after_s: float = Field(20.0, exclude=True)
     return_to_gnss: bool = False
-    inconsistency_sigmas: float = Field(default=5.0, ge=1.0, le=100.0)
+    inconsistency_sigmas: float = Field(5.0, exclude=True)
 
     @model_validator(mode="after")
     def _sets_differ(self) -> SourceSwitchConfig:
@@ -156,9 +128,9 @@ class CameraConfig(_Model):
     announce: bool = True
     vendor: str = Field(default="PiLoT companion", max_length=31)
     model: str = Field(default="map camera", max_length=31)
-    width_px: int = Field(default=1280, ge=1, le=65535)
-    height_px: int = Field(default=720, ge=1, le=65535)
-    horizontal_fov_deg: float = Field(default=60.0, ge=0.1, lt=180.0)
+    width_px: int = Field(1280, exclude=True)
+    height_px: int = Field(720, exclude=True)
+    horizontal_fov_deg: float = Field(60.0, exclude=True)
     stream_uri: str = Field(
         default="",
         max_length=159,
@@ -171,12 +143,8 @@ class CameraConfig(_Model):
     gimbal_device: int = Field(
         default=0, ge=0, le=255, description="its gimbal_device_id; 0: the first"
     )
-    zoom_rate_hz: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=50.0,
-        description="rate at which CAMERA_SETTINGS is requested; 0: none",
-    )
+    # rate at which CAMERA_SETTINGS is requested; 0: none
+    zoom_rate_hz: float = Field(0.0, exclude=True)
     mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_pitch_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_yaw_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
@@ -191,20 +159,15 @@ class CameraConfig(_Model):
 class TargetsConfig(_Model):
     """How targets are reported."""
 
-    rate_hz: float = Field(default=5.0, ge=0.01, le=30.0)
+    rate_hz: float = Field(5.0, exclude=True)
     adsb: bool = Field(default=False, description="ADSB_VEHICLE, on the ground link only")
     captured: bool = Field(
         default=False,
         description="CAMERA_IMAGE_CAPTURED once for each confirmed target: a mark on QGC's map",
     )
-    confirmed_sigma_m: float = Field(
-        default=3.0,
-        ge=0.01,
-        le=1000.0,
-        description="horizontal sigma of a confirmed target",
-    )
+    confirmed_sigma_m: float = Field(3.0, exclude=True)  # horizontal sigma of a confirmed target
     cot_endpoint: str = Field(default="", description="host:port of a Cursor-on-Target listener")
-    cot_stale_s: float = Field(default=30.0, ge=0.1, le=86400.0)
+    cot_stale_s: float = Field(30.0, exclude=True)
     cot_aircraft: bool = Field(
         default=False,
         description="Cursor-on-Target of the aircraft too, with the camera's wedge and its video",
@@ -230,10 +193,8 @@ class SigningConfig(_Model):
 
     key_file: Path
     link_id: int = Field(default=1, ge=0, le=255)
-    state_file: Path | None = Field(
-        default=None,
-        description="file for the newest stamps; null: FILE.LINK.seen beside the key",
-    )
+    # file for the newest stamps; null: FILE.LINK.seen beside the key
+    state_file: Path | None = Field(None, exclude=True)
 
     def state_path(self, link: str) -> Path:
         """Where the replay window of the link of this name is kept."""
@@ -279,7 +240,7 @@ class BridgeConfig(_Model):
         default=False,
         description="send warnings as the autopilot's component, for MAVProxy",
     )
-    attitude_rate_hz: float = Field(default=50.0, ge=5.0, le=200.0)
+    attitude_rate_hz: float = Field(50.0, exclude=True)
     injection: InjectionConfig = InjectionConfig()
     origin: OriginConfig | None = None
     switch: SourceSwitchConfig = SourceSwitchConfig()
@@ -289,11 +250,9 @@ class BridgeConfig(_Model):
     signing: SigningConfig | None = None
     ground_signing: SigningConfig | None = None
     tlog: Path | None = None
-    state_file: Path | None = Field(
-        default=None,
-        description="file that keeps enabled injection and a failed shadow check over a restart",
-    )
-    link_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
+    # file that keeps enabled injection and a failed shadow check over a restart
+    state_file: Path | None = Field(None, exclude=True)
+    link_timeout_s: float = Field(5.0, exclude=True)
 
     @field_validator("mode", mode="before")
     @classmethod

@@ -79,7 +79,7 @@ class FlightControllerEnd:
         )
         self._commander = commander = Commander(config.companion_component)
         self.requests = VehicleRequests(config, commander)
-        self.time_sync = TimeSync(shared.tracker, config.companion_component, teller)
+        self.time_sync = TimeSync(shared.tracker, config.companion_component, teller, shared.clock)
         self.origin = OriginExchange(config, shared.tracker, commander, teller, self.counters)
         self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)

@@ -9,7 +9,7 @@ from itertools import chain, count
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.injection_enable import InjectionEnable
-from mavlink_bridge.link.clock import SteadyUtc
+from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.messages import HealthLevel, PlaceHint, TrackRequest
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
@@ -28,7 +28,7 @@ def clicked_numbers() -> Iterator[int]:
 class Shared:
     """What the bridge lends to its ends. say: tell the operator (severity, text).
 
-    gate: None unless the mode is ``rc``.
+    gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
     """
 
     config: BridgeConfig
@@ -44,6 +44,7 @@ class Shared:
     enable: InjectionEnable | None
     look: LookAt
     on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
+    clock: Callable[[], int] = monotonic_ns
     target_numbers: Iterator[int] = field(default_factory=clicked_numbers)
     """Of clicked targets, over all links; none is given twice."""
 

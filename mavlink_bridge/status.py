@@ -45,8 +45,9 @@ class OperatorStatus:
         self,
         send: Callable[[int, Any], None],
         on_text: Callable[[int, str, Alert | None], None],
+        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
-        self._send = send
+        self._send, self._clock = send, clock
         self._on_text = on_text
         self._health_lock = threading.Lock()
         self._text_lock = threading.Lock()
@@ -72,7 +73,7 @@ class OperatorStatus:
         What comes and goes by turns is told once in 10 s, and its end once it has lasted: an
         overloaded computer is well and ill every other second. now_ns: CLOCK_MONOTONIC.
         """
-        now_ns = monotonic_ns() if now_ns is None else now_ns
+        now_ns = self._clock() if now_ns is None else now_ns
         key = (level, without_figures(text))
         bad = level in (HealthLevel.DEGRADED, HealthLevel.FAILED)
         with self._health_lock:
@@ -96,7 +97,7 @@ class OperatorStatus:
         of orders that are refused would hide every other, and wear out the link and the record. One
         after another line is no repetition: "on" after "off" tells how it stands.
         """
-        if self._was_said(severity, text, monotonic_ns() if now_ns is None else now_ns):
+        if self._was_said(severity, text, self._clock() if now_ns is None else now_ns):
             return
         self._texts.append((severity, text))
         grave = severity <= mavlink.MAV_SEVERITY_WARNING

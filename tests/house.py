@@ -19,7 +19,6 @@ MOST_MODULES, MOST_LINES, MOST_METHODS, MOST_PARAMETERS = 15, 200, 15, 7
 _MANY_PARAMETERS = {
     # One registration's inputs, as the paper and the reference name them; the CPU and the GPU take
     # the same, so that they can be exchanged.
-    "localizer/registration/device_registration.py:register",
     "localizer/registration/cuda/registration.py:register",
     "localizer/registration/cuda/schedule.py:run",
     "localizer/registration/cuda/schedule.py:_upload",
@@ -157,9 +156,23 @@ def folder_circles(files: Mapping[str, str]) -> list[str]:
             nested = f"{there}/".startswith(f"{here}/") or f"{here}/".startswith(f"{there}/")
             if there.count("/") and here.count("/") and not nested:
                 graph[here].add(there)
-    while leaves := {f for f in graph if not graph[f] & graph.keys()}:
-        for folder in leaves:
-            del graph[folder]
+    return _circles(graph)
+
+
+def module_circles(files: Mapping[str, str]) -> list[str]:
+    """Modules of packages that import each other, in functions and for types, too."""
+    graph: dict[str, set[str]] = defaultdict(set)
+    for path, text in files.items():
+        here = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        if path.split("/")[0] in PACKAGES:
+            graph[here] = set(_imported(path, text, files)) - {here}
+    return _circles(graph)
+
+
+def _circles(graph: dict[str, set[str]]) -> list[str]:
+    while leaves := {one for one in graph if not graph[one] & graph.keys()}:
+        for one in leaves:
+            del graph[one]
     return [f"{here} -> {', '.join(sorted(graph[here] & graph.keys()))}" for here in sorted(graph)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -54,8 +55,8 @@ def axis_variants() -> list[Variant]:
     """
     one = JNGOConfig(hypotheses=1)
     return [
-        Variant("one hypothesis, fine level", one.model_copy(update={"iterations": (0, 0, 15)})),
-        Variant("one, mid and fine", one.model_copy(update={"iterations": (0, 5, 10)})),
+        Variant("one hypothesis, fine level", replace(one, iterations=(0, 0, 15))),
+        Variant("one, mid and fine", replace(one, iterations=(0, 5, 10))),
         Variant("one, coarse to fine", one),
         Variant(FULL),
     ]

@@ -111,7 +111,7 @@ def paper_rows() -> list[Variant]:
         hypotheses=1, keep=(144, 144), iterations=(2, 3, 4), sharpen=0,
         swarm_anchors=(500, 500, 500), distinct_px=0.0, preselected=0,
     )  # fmt: skip
-    swarm = paper.model_copy(update={"hypotheses": 144})
+    swarm = replace(paper, hypotheses=144)
 
     def row(name: str, config: JNGOConfig, *, motion: bool) -> Variant:
         return Variant(name, config, 500, motion, detail=False, patches=_VERTICAL_TURNS)
@@ -123,9 +123,9 @@ def paper_rows() -> list[Variant]:
     ]
 
 
-def changed(name: str, **values: object) -> Variant:
+def changed(name: str, **values: Any) -> Variant:
     """The default configuration with other values."""
-    return Variant(name, JNGOConfig().model_copy(update=values))
+    return Variant(name, replace(JNGOConfig(), **values))
 
 
 def our_rows() -> list[Variant]:

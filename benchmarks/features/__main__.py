@@ -7,7 +7,6 @@
     python -m benchmarks.features --real ../shared/data/quito --pairs 280       (real mesh)
     python -m benchmarks.features --real ../shared/data/textures/neon_sjer_pairs --pairs 80
     python -m benchmarks.features --widths 320 640 --baselines --models shipped NEW.onnx
-    python -m benchmarks.features --thermal --pairs 120 (a thermal camera over a map of colours)
     python -m benchmarks.features --swarm-alone --baselines     (what draws of the prior add)
     python -m benchmarks.features --tilts 0.5 --baselines       (what roll and pitch add)
     python -m benchmarks.features --speed
@@ -182,7 +181,6 @@ def parser() -> Parser:
     )
     kind = p.add_mutually_exclusive_group()
     kind.add_argument("--real", type=existing, help="folder of a real set, instead of made places")
-    kind.add_argument("--thermal", action="store_true", help="thermal queries on made places")
     kind.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
     p.add_argument("--out", type=output, help="CSV of every outcome")
     p.add_argument("--report", type=existing, nargs="+", help="tables of earlier CSVs, no run")
@@ -215,10 +213,8 @@ def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
     textures = args.textures if args.textures.is_dir() else None
     if textures is None:
         _log.warning("%s is absent: places without real textures", args.textures)
-    which = MadePlaces(
-        args.split, args.seed, args.shared_detail, textures, size, thermal=args.thermal
-    )
-    return "thermal" if args.thermal else "generated", made_pairs(args.pairs, which, args.cache)
+    which = MadePlaces(args.split, args.seed, args.shared_detail, textures, size)
+    return "generated", made_pairs(args.pairs, which, args.cache)
 
 
 def main() -> None:

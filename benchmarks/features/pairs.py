@@ -15,12 +15,6 @@ import numpy as np
 
 from localizer.geometry.pose import Pose
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
-from localizer.synth.appearance.thermal import (
-    SPAN_K,
-    THERMAL_CONDITIONS,
-    draw_microbolometer,
-    film_thermal,
-)
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
 from localizer.training.data.shards import PhotoSource, read_shard, shard_path, write_shards
@@ -52,8 +46,7 @@ class TestPair:
 class MadePlaces:
     """Which generated pairs: split (test or validation), seed (0, 1, 2, ... other places), whether
     map and query share their fine texture, and the folder of the real textures, if any; size: of
-    the pictures. Wider ones look from further away, so that a pixel is as much ground. thermal: a
-    thermal camera flies over the map of colours, beside one of colours by day.
+    the pictures. Wider ones look from further away, so that a pixel is as much ground.
     """
 
     split: str
@@ -61,18 +54,16 @@ class MadePlaces:
     shared_detail: bool
     textures: Path | None
     size: tuple[int, int] = SIZE
-    thermal: bool = False
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """Of which each place has one pair."""
-        return ("day", *THERMAL_CONDITIONS) if self.thermal else MADE_CONDITIONS
+        return MADE_CONDITIONS
 
     @property
     def name(self) -> str:
         """Folder of these pairs in the cache."""
         kind = "easy" if self.shared_detail else "made"
-        kind += "-thermal" if self.thermal else ""
         wide = "" if self.size == SIZE else f"-{self.size[0]}"
         return f"{kind}-{self.split}-{self.seed}{wide}" + ("" if self.textures else "-untextured")
 
@@ -134,12 +125,8 @@ def mesh_pairs(
 
 
 def _degraded(pair: Pair, rng: np.random.Generator, place: int) -> TestPair:
-    if pair.condition in THERMAL_CONDITIONS:
-        sensor, span_k = draw_microbolometer(rng), SPAN_K[pair.condition]
-        query = film_thermal(pair.query, pair.query_depth, span_k, sensor, rng)
-    else:
-        look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
-        query = apply_appearance(pair.query, pair.query_depth, look, rng)
+    look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+    query = apply_appearance(pair.query, pair.query_depth, look, rng)
     view = RenderedView(
         pair.reference, pair.reference_depth, pair.world_from_reference, pair.camera
     )

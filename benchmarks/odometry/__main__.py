@@ -74,7 +74,11 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
     renderers = NumbaRenderer(seen, 1), NumbaRenderer(known, 1)
     scene = FlownScene(args.map.parent.name, *renderers, camera, terrain)
     extractor = DetailExtractor(load_extractor(threads=1, size=(camera.width, camera.height)))
-    config = OdometryConfig(**dict.fromkeys(_GROWTHS, _NONE)) if args.fit else OdometryConfig()
+    config = OdometryConfig()
+    if args.fit:
+        config = OdometryConfig(
+            with_map=_NONE, with_ground=_NONE, with_range=_NONE, with_plane=_NONE
+        )
     flyer = Flyer(scene, extractor, JNGO(threads=args.threads), config)
     plan = StretchPlan(args.seconds, args.rate, args.speed, args.height, tuple(args.half))
     flown: list[FlownStretch] = []

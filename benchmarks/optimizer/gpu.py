@@ -4,8 +4,7 @@
 
 Device events, median of many after warm-up. One iteration is (7 iterations - 1) / 6 of a launch,
 which starts from the same poses each time.
-"unfused" is unfused.cu, one kernel a step; before it is timed, its step is compared with the
-reference's. Roofline shares are of the float32 peak (multiprocessors x 128 lanes x 2 x clock)
+Roofline shares are of the float32 peak (multiprocessors x 128 lanes x 2 x clock)
 and of the bandwidth of a device copy measured here.
 """
 
@@ -14,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -32,10 +30,9 @@ from localizer.registration.backend import (
     world_from_camera,
 )
 from localizer.registration.config import JNGOConfig
-from localizer.registration.cpu.reference import in_view, linearize, project
+from localizer.registration.cpu.reference import in_view, project
 from localizer.registration.cuda.backend import CudaBackend
-from localizer.registration.cuda.compiler import compile_sources
-from localizer.registration.cuda.driver import Arena, Device, Kernels
+from localizer.registration.cuda.driver import Device
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid
@@ -51,18 +48,6 @@ SCHEDULES = (  # label, settings, anchors
     ("as flown, N=4000 at the end", JNGOConfig(min_overlap=0.01), 4000),
 )
 Poses = tuple[np.ndarray, np.ndarray]
-_POINTERS = (
-    "features", "confidence", "points", "anchor_features", "anchor_confidence", "rotations",
-    "translations", "camera_points", "pixels", "residuals", "gradients", "jacobians", "weights",
-    "sums", "steps",
-)  # fmt: skip
-UNFUSED = np.dtype(
-    [(name, np.uint64) for name in _POINTERS]
-    + [(name, np.int32) for name in ("height", "width", "anchors", "hypotheses")]
-    + [(name, np.float32) for name in ("fx", "fy", "cx", "cy", "huber", "damping")],
-    align=True,
-)
-UNFUSED_STEPS = ("project", "sample", "jacobian", "accumulate", "solve")
 
 
 @dataclass(frozen=True)
@@ -128,69 +113,6 @@ def fused_ms(backend: CudaBackend, problem: LevelProblem, swarm: Poses) -> float
             median_ms(device, reset, partial(kernels.launch, "refine_many", M, 256, arguments))
         )
     return (found[1] - found[0]) / 6
-
-
-class Unfused:
-    """The plain port, with its intermediates on the device."""
-
-    def __init__(self, device: Device, kernels: Kernels, problem: LevelProblem, swarm: Poses):
-        self.device, self._kernels = device, kernels
-        self._arena = Arena(device)
-        (h, w, C), M, N = problem.features.shape, len(swarm[0]), problem.points.shape[1]
-        a = np.zeros((), dtype=UNFUSED)
-        uploads = {
-            "features": problem.features, "confidence": problem.confidence,
-            "points": problem.points, "anchor_features": problem.anchor_features,
-            "anchor_confidence": problem.anchor_confidence,
-            "rotations": swarm[0].astype(np.float32), "translations": swarm[1].astype(np.float32),
-        }  # fmt: skip
-        for name, values in uploads.items():
-            a[name] = self._arena.put(name, np.ascontiguousarray(values))
-        sizes = {
-            "camera_points": 3, "pixels": 2, "residuals": C, "gradients": 2 * C,
-            "jacobians": 6 * C, "weights": 1,
-        }  # fmt: skip
-        for name, size in sizes.items():
-            a[name] = self._arena.buffer(name, 4 * size * M * N)
-        a["sums"], a["steps"] = (
-            self._arena.buffer("sums", 4 * 28 * M),
-            self._arena.buffer("steps", 24 * M),
-        )
-        a["height"], a["width"], a["anchors"], a["hypotheses"] = h, w, N, M
-        (a["fx"], a["fy"]), (a["cx"], a["cy"]) = problem.focal, problem.centre
-        a["huber"], a["damping"] = SETTINGS.scale, SETTINGS.damping
-        self._arguments, self._problem, self._swarm = a, problem, swarm
-
-    def run(self) -> None:
-        """Queue one iteration."""
-        M, N, C = len(self._swarm[0]), *self._problem.anchor_features.shape
-        for name, count in zip(UNFUSED_STEPS, (M * N, M * N * C, M * N * C, M * N, M), strict=True):
-            self._kernels.launch(f"unfused_{name}", -(-count // 256), 256, self._arguments)
-
-    def check(self) -> None:
-        """Its first step against the reference's; a wrong port must not be timed."""
-        self.run()
-        M = len(self._swarm[0])
-        steps = np.empty((M, 6), np.float32)
-        self.device.download(steps, int(self._arguments["steps"]))
-        self.device.synchronize()
-        for m in range(min(M, 4)):
-            model = linearize(self._problem, self._swarm[0][m], self._swarm[1][m], SETTINGS)
-            H = model.hessian + SETTINGS.damping * np.diag(np.diag(model.hessian))
-            step = np.linalg.solve(H, -model.gradient)
-            np.testing.assert_allclose(steps[m], step, rtol=0.02, atol=1e-3 * abs(step).max())
-
-    def close(self) -> None:
-        """Free its memory."""
-        self._arena.close()
-
-
-def unfused_kernels(device: Device, channels: int) -> Kernels:
-    source = Path(__file__).with_name("unfused.cu")
-    image = compile_sources(
-        {source.name: source.read_text()}, source.name, {"CHANNELS": channels}, device.architecture
-    )
-    return device.load(image.code)
 
 
 def torch_ms(problem: LevelProblem, swarm: Poses) -> float | None:
@@ -274,8 +196,7 @@ def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Pos
     """The GPU tables; without a GPU the same tables with '-' and the reason."""
     sizes = tuple(problems)
     rows: dict[str, list[float | None]] = {
-        name: [None] * len(sizes)
-        for name in ("naive PyTorch", "unfused kernels", "fused float32", "fused float16")
+        name: [None] * len(sizes) for name in ("naive PyTorch", "fused float32", "fused float16")
     }
     notes = ["GPU: -"]
     schedules: list[tuple[str, ...]] = []
@@ -316,13 +237,8 @@ def measure(
     bandwidth = copy_bandwidth(device)
     peak = device.multiprocessors * 128 * 2 * device.clock_hz
     notes.append(f"copy {bandwidth / 1e12:.2f} TB/s, float32 peak {peak / 1e12:.1f} TFLOP/s")
-    plain = unfused_kernels(device, 32)
     for k, problem in enumerate(problems.values()):
         rows["naive PyTorch"][k] = torch_ms(problem, swarm)
-        port = Unfused(device, plain, problem, swarm)
-        port.check()
-        rows["unfused kernels"][k] = median_ms(device, lambda: None, port.run)
-        port.close()
     for half in (False, True):
         backend = CudaBackend(device, half=half)
         kind = "float16" if half else "float32"

@@ -171,7 +171,7 @@ def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -
     """Replace the deployment file, if the result is one; the old one stays beside it under the name
     that is returned. Both may be read by whom the old one might.
     """
-    document = with_current_keys(read_settings(path, ConfigError), str(path))
+    document = with_current_keys(CompanionConfig, read_settings(path, ConfigError), str(path))
     _apply(document, wanted)
     today = datetime.now(timezone.utc).date().isoformat()
     _apply(document, (SettingChange(("camera", "calibrated"), None, today),))

@@ -1,10 +1,11 @@
-"""The command line: ``companion try | init | calibrate | run | plan | eval | localize | convert |
-replay | report | export | klv | console | map | world | doctor | key | self-test``.
+"""The command line: ``companion try | shadow-check | init | calibrate | run | plan | eval |
+localize | convert | replay | report | export | klv | console | map | world | doctor | key |
+self-test``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `plan` a leg on which vision will not do, `replay`
-differs, `localize` localized nothing, `try` found that vision does not work there, or `map verify`
-found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly; 130
-interrupted (`run` that was flying ends with 0).
+differs, `localize` localized nothing, `try` or `shadow-check` found that vision does not work
+there, or `map verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle
+not fit to fly; 130 interrupted (`run` that was flying ends with 0).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from rich.markup import escape
 from companion.cli.before.calibrate import app as calibrate_app
 from companion.cli.before.init import init_command
 from companion.cli.before.plan import plan_command
+from companion.cli.before.shadow_check import shadow_check_command
 from companion.cli.before.try_footage import try_command
 from companion.cli.console import console_command
 from companion.cli.convert import convert_command
@@ -65,6 +67,7 @@ def _options(
 
 
 app.command("try")(try_command)
+app.command("shadow-check")(shadow_check_command)
 app.command("run")(run_command)
 app.command("init")(init_command)
 app.command("plan")(plan_command)

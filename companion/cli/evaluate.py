@@ -129,11 +129,10 @@ def evaluate_command(
                 frames, metrics = evaluate(
                     localizer,
                     data,
-                    Perturbation(noise_m, noise_deg, seed),
+                    Perturbation(noise_m, noise_deg, seed, sensors.in_prior),
                     mode,
                     progress=tally(show, len(data.images)),
                     find=find,
-                    in_prior=sensors.in_prior,
                 )
             progress.close()  # before the tables are printed
             settings = {

@@ -8,13 +8,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel
 
 from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
 from companion.redaction import redacted
+from companion.settings_file import nested_models, settings
 from localizer.plain_files import plain_text
 
 _MOST_BYTES = 64 << 10
@@ -72,8 +73,8 @@ def replace(path: Path, text: str) -> Path:
 def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, str]]:
     """(key, default, description) of every setting."""
     lines = []
-    for name, field in model.model_fields.items():
-        nested = _models(field.annotation)
+    for name, field in settings(model).items():
+        nested = nested_models(field.annotation)
         key = f"{where}{name}"
         if nested:
             lines += [line for m in nested for line in help_lines(m, f"{key}.")]
@@ -81,12 +82,6 @@ def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, 
         default = "needed" if field.is_required() else str(field.default)
         lines.append((key, default, field.description or ""))
     return lines
-
-
-def _models(annotation: object) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [m for part in get_args(annotation) for m in _models(part)]
 
 
 @contextlib.contextmanager

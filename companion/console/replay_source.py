@@ -33,7 +33,10 @@ class ReplaySource:
     def __init__(self, tables: RecordTables, pictures: MapPictures | None = None) -> None:
         self._tables = tables
         self._map = pictures
-        self._tracks = AutopilotTracks() if pictures is None else read_autopilot(tables, pictures)
+        self._tracks = AutopilotTracks()
+        if pictures is not None:
+            clock = tables.start_ns, tables.utc_ns
+            self._tracks = read_autopilot(tables.tlog, *clock, pictures)
         self._residuals = self._gnss_residuals()
         self.newest = Newest()
         times = tables.estimates.get("exposure_time_ns", np.empty(0, np.int64))

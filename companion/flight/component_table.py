@@ -102,6 +102,7 @@ def _bridge(making: BuildContext) -> Bridge:
         on_hint=lambda hint: search().hint_at(hint),
         on_text=making.channels.texts.send,
         on_vehicle_text=making.channels.vehicle_texts.send,
+        clock=making.clock,
     )
     bridge.set_map_id(readable_map_hash(making.config.map) or "")
     return bridge
@@ -302,11 +303,9 @@ def _autopilot(making: BuildContext) -> AutopilotPose:
 
 def _last_fix(making: BuildContext) -> FixMemory:
     config, integrity_monitor, bridge = making.config, making.get(IntegrityMonitor), making[Bridge]
-    path = config.prior.state_file
-    if path is None and config.record is not None:
-        path = config.record.folder.parent / "last-fix.json"
+    folder = config.state_folder
     memory = FixMemory(
-        path,
+        folder and folder / "last-fix.json",
         config.prior,
         making[AutopilotPose],
         making[CameraExtrinsics],
@@ -363,7 +362,9 @@ def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
     calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
     protection = config.integrity_monitor.protection.of_camera(calibrated=calibrated)
     watched = config.integrity_monitor.model_copy(update={"protection": protection})
-    integrity_monitor = IntegrityMonitor(watched, limits, making[Bridge], _forbid_memory(config))
+    integrity_monitor = IntegrityMonitor(
+        watched, limits, making[Bridge], _forbid_memory(config), making.clock
+    )
     making[FixInjection].add_judge(lambda _, fix: integrity_monitor.judge(fix))
     making.channels.frames.subscribe(lambda f: integrity_monitor.see(f.exposure_time_ns, f.image))
     sightings = CalibrationObserver(
@@ -600,22 +601,22 @@ def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
 def _bridge_config(config: CompanionConfig) -> BridgeConfig:
     """The bridge announces the feed's real camera, and keeps its state beside the record."""
     camera = config.camera.model.camera()
-    asked = config.bridge.camera.zoom_rate_hz or _ZOOM_RATE_HZ
     announced = config.bridge.camera.model_copy(
         update={
             "width_px": camera.width,
             "height_px": camera.height,
             "horizontal_fov_deg": camera.horizontal_fov_deg,
         }
-        | ({"zoom_rate_hz": asked} if config.camera.zoom is not None else {})
+        | ({"zoom_rate_hz": _ZOOM_RATE_HZ} if config.camera.zoom is not None else {})
     )
-    return config.bridge.model_copy(update={"camera": announced, "state_file": _state_file(config)})
+    targets = config.bridge.targets.model_copy(update={"rate_hz": config.targets.rate_hz})
+    update = {"camera": announced, "targets": targets, "state_file": _state_file(config)}
+    return config.bridge.model_copy(update=update)
 
 
 def _state_file(config: CompanionConfig) -> Path | None:
-    if config.bridge.state_file is not None or config.record is None:
-        return config.bridge.state_file
-    return config.record.folder.parent / "injection-gate.json"
+    folder = config.state_folder
+    return folder and folder / "injection-gate.json"
 
 
 def _forbid_memory(config: CompanionConfig) -> InhibitMemory | None:

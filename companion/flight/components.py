@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ class BuildContext:
         self._part = part
         self._assembly = assembly
         self.config = assembly.config
-        self.channels = assembly.channels
+        self.channels, self.clock = assembly.channels, assembly.clock
 
     def __getitem__(self, kind: type[T]) -> T:
         """The part of that class."""
@@ -85,11 +86,16 @@ class BuildContext:
 
 
 class Assembly:
-    """The parts of one process, by their class."""
+    """The parts of one process, by their class. clock: CLOCK_MONOTONIC, ns, or a record's time."""
 
-    def __init__(self, config: CompanionConfig, parts: Sequence[Component[Any]]) -> None:
+    def __init__(
+        self,
+        config: CompanionConfig,
+        parts: Sequence[Component[Any]],
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         _check_order(parts)
-        self.config = config
+        self.config, self.clock = config, clock
         self.channels = Channels()
         self.abandonments: list[Callable[[], None]] = []
         self._parts = tuple(part for part in parts if part.wanted(config))

@@ -176,7 +176,7 @@ class PlaceSearch:
         """Why no place can be searched now; "" where one can."""
         self._stop = threading.Event()
         # A daemon: one that hangs must not keep the process from ending.
-        self._thread = threading.Thread(target=self._prepare, name="overview", daemon=True)
+        self._thread = threading.Thread(target=self.prepare, name="overview", daemon=True)
 
     def start(self) -> None:
         """Begin to make the search ready."""
@@ -272,7 +272,8 @@ class PlaceSearch:
         sigma_m = float(np.sqrt(prior.covariance[0, 0]))
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 
-    def _prepare(self) -> None:
+    def prepare(self) -> None:
+        """Make the search ready on this thread; what hinders it is told."""
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)

@@ -48,7 +48,9 @@ class IntegrityMonitor:
         limits: IntegrityLimits,
         bridge: Bridge,
         memory: InhibitMemory | None = None,
+        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
+        self._clock = clock
         self._monitor, self._memory = IntegrityChecks(config, limits), memory
         self._bridge = bridge
         self._lock = threading.Lock()
@@ -61,7 +63,7 @@ class IntegrityMonitor:
         self._inhibiting: frozenset[AlertId] = frozenset()
         self._fails: dict[str, int] = {}  # how often in a row, by what is failing
         self._failures = threading.Lock()
-        self.last_tick_ns = monotonic_ns()
+        self.last_tick_ns = self._clock()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="integrity", daemon=True)
@@ -71,7 +73,7 @@ class IntegrityMonitor:
         if self._memory is not None:
             self._monitor.restore(self._memory.recall())
             self._inhibit(self._monitor.inhibiting)
-        self.last_tick_ns = monotonic_ns()
+        self.last_tick_ns = self._clock()
         self._thread.start()
 
     def stop(self) -> None:
@@ -157,7 +159,7 @@ class IntegrityMonitor:
 
     def _hangs(self) -> bool:
         """Whether its thread stands; told by whoever asks."""
-        now_ns = monotonic_ns()
+        now_ns = self._clock()
         if now_ns - self.last_tick_ns < _STANDS_NS:
             return False
         self._fail("taking turns")
@@ -170,7 +172,7 @@ class IntegrityMonitor:
 
     def turn(self) -> None:
         """Look at everything once; ten times a second by its thread."""
-        self.last_tick_ns = monotonic_ns()
+        self.last_tick_ns = self._clock()
         self._works("taking turns")
         picture, self._picture = self._picture, None
         looks = picture is not None  # a turn without one is no word that pictures can be looked at
@@ -223,7 +225,7 @@ class IntegrityMonitor:
         with self._lock:
             if picture is not None:
                 self._monitor.see(*picture)
-            alerts = self._monitor.step(monotonic_ns(), self._bridge)
+            alerts = self._monitor.step(self._clock(), self._bridge)
             inhibiting, found = self._monitor.inhibiting, self._monitor.to_remember()
         self._inhibit(inhibiting)
         if self._memory is not None:

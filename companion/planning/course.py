@@ -1,4 +1,4 @@
-"""The line that is flown between two places: straight, or a spline as ArduPilot flies it."""
+"""The line that is flown: straight, a spline as ArduPilot flies it, or a circle."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from localizer.geometry.pose import Array
+from mavlink_bridge.mission.items import LoiterCircle
 
 _EARTH_M = 6.371e6
-_PIECES = 64  # of a spline
+_PIECES = 64  # of a spline or a circle
 # The vectors at both ends are shortened to so many times the distance between them
 # (SplineCurve::set_origin_and_destination).
 _LONGEST = 4.0
@@ -18,11 +19,12 @@ _LONGEST = 4.0
 @dataclass(frozen=True)
 class Course:
     """points: (N, 3) of the line, world metres; leaves: (3,) direction and strength with which it
-    ends, zero where it stops.
+    ends, zero where it stops; nose_deg: of the vehicle, to the right of the way.
     """
 
     points: Array
     leaves: Array
+    nose_deg: float = 0.0
 
     @property
     def length_m(self) -> float:
@@ -72,3 +74,14 @@ def spline(
         + (t**3 - t**2) * scale * leaves
     )
     return Course(points, leaves)
+
+
+def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
+    """One round about a place (3,), from where one who flies in the direction `arrives` (3,) meets
+    the circle.
+    """
+    begin = np.arctan2(-arrives[1], -arrives[0])
+    turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)
+    out = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
+    nose_deg = float(np.sign(circle.radius_m)) * 90.0 if circle.inward else 0.0
+    return Course(centre + abs(circle.radius_m) * out, np.zeros(3), nose_deg)

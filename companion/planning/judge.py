@@ -12,7 +12,7 @@ import numpy as np
 from companion.planning.way import FlightLeg, PathSample
 from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import RISK_LIMIT
-from localizer.odometry.config import OdometryConfig
+from localizer.odometry.config import GrowthModel, OdometryConfig
 
 _LEAST_MAP_SHARE = 0.5  # of the picture: with less it is the map that ends
 _LIKENESS = 0.7  # of another place's match, beyond which it may be taken for this one
@@ -126,10 +126,14 @@ def _reason(forecast: ViewForecast, limits: MissionLimits) -> Reason:
 
 
 def stretches(
-    verdicts: Sequence[LegVerdict], speed_m_s: float, odometry: OdometryConfig
+    verdicts: Sequence[LegVerdict],
+    speed_m_s: float,
+    odometry: OdometryConfig,
+    *,
+    terrain: bool = False,
 ) -> tuple[VisionGap, ...]:
     """What must be bridged, in the order of the way; neighbouring samples are one stretch.
-    speed_m_s: where the leg has none.
+    speed_m_s: where the leg has none; terrain: its heights are known outside the map.
     """
     found: list[tuple[float, float, float, bool]] = []
     for verdict in verdicts:
@@ -143,15 +147,20 @@ def stretches(
                 found[-1] = (start, end, before + seconds, beside or off_map)
             else:
                 found.append((begin, end, seconds, off_map))
-    return tuple(_stretch(*one, odometry) for one in found)
+    outside = odometry.with_ground if terrain else odometry.with_plane
+    return tuple(_stretch(*one, odometry, outside) for one in found)
 
 
 def _stretch(
-    begin_m: float, end_m: float, seconds: float, off_map: bool, odometry: OdometryConfig
+    begin_m: float,
+    end_m: float,
+    seconds: float,
+    off_map: bool,
+    odometry: OdometryConfig,
+    outside: GrowthModel,
 ) -> VisionGap:
     """off_map: the map has no geometry there, at one place at least."""
-    ground = odometry.with_plane if odometry.terrain is None else odometry.with_ground
-    growth, length = ground if off_map else odometry.with_map, end_m - begin_m
+    growth, length = outside if off_map else odometry.with_map, end_m - begin_m
     drift = math.hypot(growth.horizontal * math.sqrt(length), growth.scale * length)
     can_bridge = drift <= odometry.longest_sigma_m
     return VisionGap(begin_m, end_m, seconds, drift, can_bridge)

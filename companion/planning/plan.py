@@ -101,7 +101,10 @@ def make_plan(
         options = instead(found, verdicts, aim.fixed, progress) if question.seek else ()
     odometry = deployment.localizer.odometry or OdometryConfig()
     speed_m_s = mission.speed_m_s or question.speed_m_s
-    bridged = stretches(_as_flown(legs, verdicts), speed_m_s, odometry)
+    bridged = stretches(
+        _as_flown(legs, verdicts), speed_m_s, odometry,
+        terrain=deployment.localizer.terrain is not None,
+    )  # fmt: skip
     notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
     notes += _kind_notes(cache, deployment, [s.position for s in samples], ground)
     unknown = tuple(n.text for n in mission.not_judged if not (aim.fixed and n.gimbal_only))
@@ -132,9 +135,7 @@ def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list
 def _notes(
     mission: PlannedMission, deployment: CompanionConfig, aim: Aim, spacing_m: float
 ) -> tuple[str, ...]:
-    notes = [
-        f"A place every {spacing_m:.0f} m; legs are flown straight, turns and circles are left out."
-    ]
+    notes = [f"A place every {spacing_m:.0f} m; turns are left out."]
     if aim.fixed:
         notes.append("The camera is screwed on and the vehicle flown level: it leans in flight.")
     elif all(w.gimbal.pitch_deg is None and w.gimbal.roi is None for w in mission.path):

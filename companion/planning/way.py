@@ -18,7 +18,7 @@ from companion.geometry import (
     ned_from_world,
     world_from_camera,
 )
-from companion.planning.course import Course, spline, straight
+from companion.planning.course import Course, circled, spline, straight
 from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
 from localizer.geometry.antimeridian import geo_box
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
@@ -103,12 +103,12 @@ def legs_of(
     site = _Site(cache, ground, _launch(mission, cache))
     path = [replace(p, after_gap=False) for p in mission.path]
     positions = [site.position(p) for p in path]
-    legs: list[FlightLeg] = []
-    firsts: dict[tuple[Any, ...], FlightLeg] = {}
-    way_m, leaves = 0.0, np.zeros(3)
+    log = _Legs(site, aim, spacing_m)
+    leaves = np.zeros(3)
     for k, (start, end) in enumerate(itertools.pairwise(path)):
         if mission.path[k + 1].after_gap:
             leaves = np.zeros(3)
+            log.circle(end, positions[k + 1], leaves)
             continue
         beyond = path[k + 2] if k + 2 < len(path) else None
         here, there = positions[k], positions[k + 1]
@@ -119,25 +119,14 @@ def legs_of(
         arrived, leaves = leaves, course.leaves
         if course.length_m < LEAST_LEG_M:  # a climb on the spot
             leaves = np.zeros(3)
-            continue
-        alike = (start.name, start.latitude_deg, start.longitude_deg, start.height_m, end)
-        key = (*alike, *arrived, beyond) if end.curved else alike
-        if key not in firsts:
-            name = f"{start.name} to {end.name}"
-            firsts[key] = replace(_leg(name, end, course, site, aim, spacing_m), first=len(legs))
-        legs.append(_later(firsts[key], way_m))
-        way_m += course.length_m
-    if not legs:
+        else:
+            alike = (start.name, start.latitude_deg, start.longitude_deg, start.height_m, end)
+            key = (*alike, *arrived, beyond) if end.curved else alike
+            log.add(key, f"{start.name} to {end.name}", end, course)
+        log.circle(end, there, there - here)
+    if not log.legs:
         raise MissionFileError("the mission goes nowhere: its places lie on one another")
-    return tuple(legs)
-
-
-def _later(leg: FlightLeg, begun_m: float) -> FlightLeg:
-    """The leg, flown after so much of the way."""
-    samples = tuple(
-        replace(s, way_m=begun_m + (k + 0.5) * leg.step_m) for k, s in enumerate(leg.samples)
-    )
-    return replace(leg, samples=samples)
+    return tuple(log.legs)
 
 
 def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
@@ -167,6 +156,39 @@ class _Site:
         return _position(place, self.cache, self.ground, self.launch)
 
 
+class _Legs:
+    """The legs so far; what is flown alike again is not sampled again."""
+
+    def __init__(self, site: _Site, aim: Aim, spacing_m: float) -> None:
+        self.legs: list[FlightLeg] = []
+        self._site, self._aim, self._spacing_m = site, aim, spacing_m
+        self._firsts: dict[tuple[Any, ...], FlightLeg] = {}
+        self._way_m = 0.0
+
+    def add(self, key: tuple[Any, ...], name: str, end: MissionPlace, course: Course) -> None:
+        """One more leg, flown as `end` says. key: of those that are flown alike."""
+        if key not in self._firsts:
+            leg = _leg(name, end, course, self._site, self._aim, self._spacing_m)
+            self._firsts[key] = replace(leg, first=len(self.legs))
+        leg = self._firsts[key]
+        samples = tuple(
+            replace(s, way_m=self._way_m + (k + 0.5) * leg.step_m)
+            for k, s in enumerate(leg.samples)
+        )
+        self.legs.append(replace(leg, samples=samples))
+        self._way_m += course.length_m
+
+    def circle(self, place: MissionPlace, centre: Array, arrives: Array) -> None:
+        """The rounds about a place, if any."""
+        if place.circle is None:
+            return
+        course = circled(centre, arrives, place.circle)
+        for _ in range(place.circle.rounds):
+            self.add(
+                ("circle", replace(place, after_gap=False)), f"circle {place.name}", place, course
+            )
+
+
 def _leg(
     name: str, end: MissionPlace, course: Course, site: _Site, aim: Aim, spacing_m: float
 ) -> FlightLeg:
@@ -177,7 +199,9 @@ def _leg(
     samples = []
     for share in map(float, (np.arange(count) + 0.5) / count):
         position, heading = course.at(share)
-        pitch, turn = _look(end.gimbal, aim, position, heading, looked_at)
+        nose = course.nose_deg
+        pitch, turn = _look(end.gimbal, aim, position, heading + nose, looked_at)
+        turn = (turn + nose + 180.0) % 360.0 - 180.0
         samples.append(PathSample(position, share * course.length_m, heading, pitch, turn))
     return FlightLeg(name, course.length_m, step_m, tuple(samples), end.speed_m_s)
 

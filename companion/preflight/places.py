@@ -14,10 +14,12 @@ from mavlink_bridge.preflight.doctor import DoctorFinding
 def check_places(config: CompanionConfig) -> list[DoctorFinding]:
     """Folders of records and signing keys that a start would refuse; empty where none is named."""
     bridge = config.bridge
-    written = {"bridge.tlog": bridge.tlog, "bridge.state_file": bridge.state_file}
+    written = {"bridge.tlog": bridge.tlog}
     faults = []
     if config.record is not None:
         faults.append(_unwritable("record.folder", config.record.folder))
+    if config.state_dir is not None:
+        faults.append(_unwritable("state_dir", config.state_dir))
     faults += [_no_file(key, path) for key, path in written.items() if path is not None]
     keys = {"bridge.signing": bridge.signing, "bridge.ground_signing": bridge.ground_signing}
     for key, signing in keys.items():

@@ -1,4 +1,4 @@
-"""ArduPilot's logs beside video or photos: .bin (the dataflash log) and .tlog (MAVLink).
+"""Logs beside video or photos: ArduPilot's .bin (dataflash), MAVLink's .tlog and PX4's .ulg.
 
 Position by the EKF, attitude of the body, and the camera's view: a gimbal's where one reports, else
 that of a camera which is fixed to the body.
@@ -7,13 +7,12 @@ that of a camera which is fixed to the body.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pymavlink import DFReader
 
 from companion.errors import FootageError
 from companion.geometry import (
@@ -22,6 +21,7 @@ from companion.geometry import (
     Mount,
     camera_attitude,
 )
+from companion.recorded.dataflash import dataflash_messages
 from companion.recorded.flight import (
     Datum,
     Height,
@@ -30,12 +30,15 @@ from companion.recorded.flight import (
     Telemetry,
     Track,
 )
+from companion.recorded.log_messages import Dated
+from companion.recorded.ulog import ulog_messages
 from localizer.geometry.pose import euler_from_matrix, matrix_from_euler, matrix_from_quaternion
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.clock import BootClock
 from mavlink_bridge.link.tlog import read_tlog
+from mavlink_bridge.vehicle.readings import boot_time_ns, gimbal_in_earth_frame, is_autopilot
 
-LOG_SUFFIXES = frozenset({".bin", ".log", ".tlog"})
+LOG_SUFFIXES = frozenset({".bin", ".log", ".tlog", ".ulg"})
 _GNSS_M, _AMSL_M, _TAKEOFF_M = 2.0, 5.0, 2.0
 _TILT_DEG, _HEADING_DEG = 1.0, 5.0
 _FIXED_TILT_DEG = 3.0  # how well a camera is screwed on
@@ -59,7 +62,7 @@ class LogTrack:
 class _Raw:
     """Rows of a log by kind, each with UTC nanoseconds first."""
 
-    positions: list[tuple[int, float, float, float, float | None]]
+    positions: list[tuple[int, float, float, float, float]]
     attitudes: list[tuple[int, float, float, float]]
     gimbals: list[tuple[int, GimbalAngles]]
     triggers: list[int]
@@ -70,12 +73,7 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
 
     `FootageError` where the log lacks positions or attitudes, or is none.
     """
-    if path.suffix.lower() == ".ulg":
-        raise FootageError(f"{path}: PX4's logs are not read; give the .tlog of the ground station")
-    try:
-        raw = _read_tlog(path) if path.suffix.lower() == ".tlog" else _read_dataflash(path)
-    except (OSError, BridgeError, ValueError, TypeError, AttributeError, IndexError) as error:
-        raise FootageError(f"{path}: not an ArduPilot log that can be read: {error}") from error
+    raw = _read(path)
     for rows, what in ((raw.positions, "position"), (raw.attitudes, "attitude")):
         if len(rows) < 2:
             raise FootageError(f"{path}: holds no {what} of the vehicle; is the log complete?")
@@ -127,39 +125,53 @@ def _gimbal(raw: _Raw, times: np.ndarray, time_ns: int) -> GimbalAngles | None:
 
 
 def _position(
-    time_ns: int, latitude: float, longitude: float, amsl: float, above: float | None
+    time_ns: int, latitude: float, longitude: float, amsl: float, above: float
 ) -> Telemetry:
-    heights = [Height(amsl, Datum.AMSL, _AMSL_M)]
-    if above is not None:
-        heights.append(Height(above, Datum.TAKEOFF, _TAKEOFF_M))
-    return Telemetry(time_ns, RecordedPosition(latitude, longitude, _GNSS_M, tuple(heights)))
+    heights = (Height(amsl, Datum.AMSL, _AMSL_M), Height(above, Datum.TAKEOFF, _TAKEOFF_M))
+    return Telemetry(time_ns, RecordedPosition(latitude, longitude, _GNSS_M, heights))
 
 
-def _read_tlog(path: Path) -> _Raw:
+def vehicle_messages(path: Path) -> Iterator[Dated]:
+    """Every message of a log, in its order: what is not in a .tlog is made of its rows.
+
+    `FootageError` where it is no log that can be read.
+    """
+    readers: dict[str, Callable[[Path], Iterator[Dated]]] = {
+        ".tlog": read_tlog, ".ulg": ulog_messages
+    }  # fmt: skip
+    try:
+        yield from readers.get(path.suffix.lower(), dataflash_messages)(path)
+    except (OSError, BridgeError, ValueError, TypeError, AttributeError, IndexError) as error:
+        raise FootageError(
+            f"{path}: not a log of ArduPilot or PX4 that can be read: {error}"
+        ) from error
+
+
+def _read(path: Path) -> _Raw:
     raw, clock = _Raw([], [], [], []), BootClock()
     vehicle: int | None = None
-    for received_ns, message in read_tlog(path):
+    for received_ns, message in vehicle_messages(path):
         kind = message.get_type()
-        if vehicle is None and kind == "HEARTBEAT" and message.autopilot != 8:
+        if vehicle is None and is_autopilot(message):
             vehicle = message.get_srcSystem()
         if vehicle is not None and message.get_srcSystem() != vehicle:
             continue
-        boot_ms = getattr(message, "time_boot_ms", None)
-        time_ns = received_ns
-        if boot_ms is not None:
-            clock.observe(int(boot_ms) * 1_000_000, received_ns)
-            time_ns = clock.to_monotonic(int(boot_ms) * 1_000_000, received_ns)
-        _take_mavlink(raw, kind, message, time_ns)
+        boot_ns, time_ns = boot_time_ns(message), received_ns
+        if boot_ns is not None:
+            clock.observe(boot_ns, received_ns)
+            time_ns = clock.to_monotonic(boot_ns, received_ns)
+        _take(raw, kind, message, time_ns)
     return raw
 
 
-def _take_mavlink(raw: _Raw, kind: str, m: Any, time_ns: int) -> None:
+def _take(raw: _Raw, kind: str, m: Any, time_ns: int) -> None:
     if kind == "GLOBAL_POSITION_INT" and (m.lat or m.lon):
-        raw.positions.append(
-            (time_ns, m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3, m.relative_alt * 1e-3)
-        )
+        above_m = m.relative_alt * 1e-3
+        raw.positions.append((time_ns, m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3, above_m))
     elif kind == "ATTITUDE":
         raw.attitudes.append((time_ns, m.roll, m.pitch, m.yaw))
+    elif kind == "ATTITUDE_QUATERNION":
+        raw.attitudes.append((time_ns, *_euler((m.q1, m.q2, m.q3, m.q4))))
     elif kind == "MOUNT_STATUS":  # hundredths of degrees: a pitch, b roll, c yaw
         pitch, roll, yaw = (
             math.radians(x * 0.01) for x in (m.pointing_a, m.pointing_b, m.pointing_c)
@@ -169,45 +181,11 @@ def _take_mavlink(raw: _Raw, kind: str, m: Any, time_ns: int) -> None:
         roll, pitch, yaw = (math.radians(x) for x in (m.roll, m.pitch, m.yaw))
         raw.gimbals.append((time_ns, GimbalAngles(roll, pitch, yaw, GimbalFrame.HEADING)))
     elif kind == "GIMBAL_DEVICE_ATTITUDE_STATUS":
-        earth = bool(m.flags & 64)  # GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
-        frame = GimbalFrame.EARTH if earth else GimbalFrame.HEADING
+        frame = GimbalFrame.EARTH if gimbal_in_earth_frame(m.flags) else GimbalFrame.HEADING
         raw.gimbals.append((time_ns, GimbalAngles(*_euler(m.q), frame)))
     elif kind == "CAMERA_FEEDBACK":
-        raw.triggers.append(int(m.time_usec) * 1000)
+        raw.triggers.append(time_ns)
 
 
 def _euler(q: Sequence[float]) -> tuple[float, float, float]:
     return euler_from_matrix(matrix_from_quaternion(q))
-
-
-def _read_dataflash(path: Path) -> _Raw:
-    reader: Any = (
-        DFReader.DFReader_text(str(path))
-        if path.suffix.lower() == ".log"
-        else DFReader.DFReader_binary(str(path))
-    )
-    raw = _Raw([], [], [], [])
-    kinds = ["POS", "ATT", "MNT", "CAM", "TRIG"]
-    while (m := reader.recv_match(type=kinds)) is not None:
-        # The clock's base is UTC by the log's own GPS messages, or 0: seconds since boot.
-        time_ns, kind = round(1e9 * reader.clock.timebase) + int(m.TimeUS) * 1000, m.get_type()
-        if kind == "POS":
-            raw.positions.append((time_ns, m.Lat, m.Lng, m.Alt, getattr(m, "RelHomeAlt", None)))
-        elif kind == "ATT":
-            raw.attitudes.append((time_ns, *(math.radians(x) for x in (m.Roll, m.Pitch, m.Yaw))))
-        elif kind == "MNT":
-            raw.gimbals.append((time_ns, _logged_gimbal(m)))
-        else:
-            raw.triggers.append(time_ns)
-    return raw
-
-
-def _logged_gimbal(m: Any) -> GimbalAngles:
-    """MNT's angles, degrees; YawE is against north, Yaw or YawB against the vehicle's heading."""
-    earth = getattr(m, "YawE", math.nan)
-    if not math.isnan(earth):
-        yaw, frame = earth, GimbalFrame.EARTH
-    else:
-        yaw, frame = getattr(m, "YawB", getattr(m, "Yaw", 0.0)), GimbalFrame.HEADING
-    roll, pitch = getattr(m, "Roll", 0.0), getattr(m, "Pitch", 0.0)
-    return GimbalAngles(math.radians(roll), math.radians(pitch), math.radians(yaw), frame)

@@ -125,9 +125,21 @@ class CameraGuess:
 
 
 @dataclass(frozen=True)
+class LogBeside:
+    """The autopilot's log of the flight. ahead_ns: its clock less that of the images; has_gimbal:
+    whether a gimbal's angles are in it.
+    """
+
+    path: Path
+    ahead_ns: int
+    has_gimbal: bool
+
+
+@dataclass(frozen=True)
 class RecordedFlight:
     """Frames in order of time, their telemetry and camera. kind: photos are independent of each
-    other; a sequence has overlapping frames; notes: what was assumed or left out, and why.
+    other; a sequence has overlapping frames; notes: what was assumed or left out, and why; log:
+    that its telemetry is from, if it is from one.
     """
 
     name: str
@@ -135,6 +147,7 @@ class RecordedFlight:
     frames: tuple[RecordedFrame, ...]
     camera: CameraGuess
     notes: tuple[str, ...] = ()
+    log: LogBeside | None = None
 
     @property
     def located(self) -> int:

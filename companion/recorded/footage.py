@@ -16,6 +16,8 @@ from companion.recorded.cameras import camera_given, camera_of_tags, equivalent_
 from companion.recorded.clock import ClockOffset, find_offset
 from companion.recorded.flight import (
     CameraGuess,
+    Kind,
+    LogBeside,
     RecordedFlight,
     RecordedFrame,
     Telemetry,
@@ -42,6 +44,7 @@ _KLV_FOCAL_PERCENT = 3.0
 _FOV_FOCAL_PERCENT = 5.0
 _UTC_REACH_S = 3.0  # of clocks that both claim to be UTC
 _DAY_NS = 86_400 * 10**9
+_LEAST_STEP_NS, _PAIR_NS = 500_000_000, 1_000_000_000  # between frames of a video
 
 
 @dataclass(frozen=True)
@@ -134,22 +137,20 @@ def _read_photos(
     frames = _with_places(frames, _places_file(folder, tags, options), notes)
     frames.sort(key=lambda f: f.time_ns if f.time_ns is not None else 0)
     log = _log_file(folder, options)
+    beside = None
     if log is not None:
-        frames = _with_log(frames, camera.camera, log, options, notes, utc=True)
-    return _flight(folder, "photos", frames, camera, notes)
+        frames, beside = _with_log(frames, camera.camera, log, options, notes, utc=True)
+    return _flight(folder, "photos", frames, camera, notes, beside)
 
 
 def _flight(
-    path: Path, kind: str, frames: Sequence[RecordedFrame], camera: CameraGuess, notes: list[str]
-) -> RecordedFlight:
+    path: Path, kind: Kind, frames: Sequence[RecordedFrame], camera: CameraGuess,
+    notes: list[str], log: LogBeside | None,
+) -> RecordedFlight:  # fmt: skip
     missing = sum(f.telemetry.position is None for f in frames)
     if missing:
         notes.append(f"{missing} of {len(frames)} frames have no position")
-    kinds = {"photos": "photos", "video": "video"}
-    return RecordedFlight(
-        path.name, "video" if kinds[kind] == "video" else "photos", tuple(frames), camera,
-        tuple(notes),
-    )  # fmt: skip
+    return RecordedFlight(path.name, kind, tuple(frames), camera, tuple(notes), log)
 
 
 def _spread(items: Sequence[Path], most: int) -> list[Path]:
@@ -244,7 +245,7 @@ def _log_file(folder: Path, options: FootageOptions) -> Path | None:
 def _with_log(
     frames: Sequence[RecordedFrame], camera: Camera, file: Path, options: FootageOptions,
     notes: list[str], *, utc: bool,
-) -> list[RecordedFrame]:  # fmt: skip
+) -> tuple[list[RecordedFrame], LogBeside]:  # fmt: skip
     """Telemetry from the log, at the images' times plus the clocks' offset."""
     log = read_autopilot_log(file, options.fixed_pitch_deg)
     notes.extend(log.notes)
@@ -255,13 +256,12 @@ def _with_log(
         )
     reach = _reach_s(frames, log, file, utc=utc)
     found = find_offset(frames, camera, log.track, reach)
-    offset_s = _offset(found, file, notes, utc=utc)
+    ahead_ns = round(1e9 * _offset(found, file, notes, utc=utc))
     moved = []
     for frame in frames:
-        time_ns = (frame.time_ns or 0) + round(1e9 * offset_s)
-        said = log.track.at(time_ns)
+        said = log.track.at((frame.time_ns or 0) + ahead_ns)
         moved.append(frame.with_telemetry(said) if said is not None else frame)
-    return moved
+    return moved, LogBeside(file, ahead_ns, log.has_gimbal)
 
 
 def _reach_s(
@@ -308,8 +308,8 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
     notes: list[str] = []
     facts = video_facts(path)
     duration_ns = round(1e9 * max(facts.duration_s, 1e-3))
-    step_ns = max(duration_ns // options.frames, 500_000_000)
-    times = list(range(0, duration_ns, step_ns))
+    log = options.log or _beside(path, LOG_SUFFIXES)
+    times = _times(duration_ns, options.frames, in_pairs=log is not None)
     extracted = extract_frames(path, options.work / "frames", times, progress)
     if facts.rotation_deg % 360:
         notes.append(
@@ -326,15 +326,26 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
         frames.append(
             RecordedFrame(image.path.name, image.path, image.time_ns, said or Telemetry())
         )
-    log = options.log or _beside(path, LOG_SUFFIXES)
+    beside = None
     if log is not None:
-        frames = _with_log(frames, camera.camera, log, options, notes, utc=False)
+        frames, beside = _with_log(frames, camera.camera, log, options, notes, utc=False)
     elif track is None:
         notes.append(
             "the video has no telemetry: no .SRT beside it, no KLV in it, no log; every frame is "
             "searched on the whole map"
         )
-    return _flight(path, "video", frames, camera, notes)
+    return _flight(path, "video", frames, camera, notes, beside)
+
+
+def _times(duration_ns: int, frames: int, *, in_pairs: bool) -> list[int]:
+    """When frames are taken. in_pairs: motion between two of them is to be seen, which lie far
+    apart in a long video: then every second one follows the one before closely.
+    """
+    step_ns = max(duration_ns // frames, _LEAST_STEP_NS)
+    times = list(range(0, duration_ns, step_ns))
+    if not in_pairs or step_ns <= _PAIR_NS:
+        return times
+    return [t + late for t in times[::2] for late in (0, _PAIR_NS) if t + late < duration_ns]
 
 
 def _beside(path: Path, suffixes: frozenset[str]) -> Path | None:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from companion.offline.tables import Columns
+from companion.reporting.pictures import MapPictures
 from localizer.geometry.geo import LocalFrame
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.tlog import read_tlog
-
-if TYPE_CHECKING:
-    from companion.reporting.pictures import MapPictures
-    from companion.reporting.record import RecordTables
 
 _WITHIN_S = 0.5
 _FIX_3D = 3
@@ -52,14 +48,17 @@ class AutopilotTracks:
     gnss: TimedTrack | None = None
 
 
-def read_autopilot(tables: RecordTables, pictures: MapPictures) -> AutopilotTracks:
-    """From the record's `bridge.tlog`; a flight without one has none."""
-    path = tables.tlog
-    if path is None or pictures.cache is None or not tables.utc_ns:
+def read_autopilot(
+    tlog: Path | None, start_ns: int, utc_ns: int, pictures: MapPictures
+) -> AutopilotTracks:
+    """From the record's `bridge.tlog`; a flight without one has none.
+
+    start_ns, utc_ns: the record's begin on CLOCK_MONOTONIC and in UTC, 0 if unknown.
+    """
+    if tlog is None or pictures.cache is None or not utc_ns:
         return AutopilotTracks()
-    offset_ns = tables.utc_ns - tables.start_ns
     try:
-        return _tracks(path, offset_ns, tables.start_ns, pictures.cache.frame)
+        return _tracks(tlog, utc_ns - start_ns, start_ns, pictures.cache.frame)
     except (BridgeError, OSError) as error:
         pictures.notes.append(f"no track of the autopilot: {error}")
         return AutopilotTracks()

@@ -199,7 +199,7 @@ def record_report(folder: Path, say: Say = silent) -> Report:
         )  # fmt: skip
     time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
     with map_pictures(tables.map_path, say, tables.flown) as pictures:
-        autopilot = read_autopilot(tables, pictures)
+        autopilot = read_autopilot(tables.tlog, tables.start_ns, tables.utc_ns, pictures)
         tracks = _tracks(estimates, autopilot)
         sheet = pictures.sheet(tracks, figures.target_marks(tables.targets))
         overlays: tuple[Overlay, ...] = ()

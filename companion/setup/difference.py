@@ -6,13 +6,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from companion.settings_file import settings
+
 Settings = dict[str, Any]
 
 
 def differing(model: BaseModel) -> Settings:
     """The settings of a model that are not its defaults, as plain data; required ones, too."""
     found: Settings = {}
-    for name, field in type(model).model_fields.items():
+    for name, field in settings(type(model)).items():
         value = getattr(model, name)
         if field.is_required():
             found[name] = _plain(value)
@@ -30,7 +32,7 @@ def differing(model: BaseModel) -> Settings:
 def _changed(value: BaseModel, default: BaseModel) -> Settings:
     """The settings in which a part of a configuration differs from what it is by default."""
     found: Settings = {}
-    for name in type(value).model_fields:
+    for name in settings(type(value)):
         now, then = getattr(value, name), getattr(default, name)
         if now == then:
             continue

@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from companion.config import CompanionConfig
+from companion.settings_file import settings
 
 # What must be given: no default can be right.
 _EXAMPLES: dict[str, Any] = {
@@ -46,7 +47,7 @@ def reference() -> str:
 
 def _lines(model: type[BaseModel], default: BaseModel | None, depth: int) -> Iterator[str]:
     """The settings of a model; default: what it is where it is left out, None: its own."""
-    for name, field in model.model_fields.items():
+    for name, field in settings(model).items():
         indent = "  " * depth
         value = _default(field) if default is None else getattr(default, name)
         part = _part(field)

@@ -98,15 +98,9 @@ class SourceSettings(BaseModel):
         default="auto",
         description="auto: MISP timestamps if the stream has them; pts: never",
     )
-    stall_timeout_s: float = Field(
-        default=1.0,
-        ge=0.1,
-        le=60,
-        description="time without a frame after which a live stream is stalled",
-    )
-    retry_max_s: float = Field(
-        default=4.0, ge=0.1, le=600, description="longest wait between connection attempts"
-    )
+    # time without a frame after which a live stream is stalled
+    stall_timeout_s: float = Field(1.0, exclude=True)
+    retry_max_s: float = Field(4.0, exclude=True)  # longest wait between connection attempts
     rate_hz: float = Field(
         default=10.0,
         ge=0.01,

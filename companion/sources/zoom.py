@@ -39,7 +39,7 @@ class ZoomTable(BaseModel):
         min_length=2,
         description="CAMERA_SETTINGS level and focal length as a multiple of `model`'s",
     )
-    hold_s: float = Field(2.0, ge=0.1, le=3600.0, description="validity of a report, s")
+    hold_s: float = Field(2.0, exclude=True)  # validity of a report, s
 
     refine: float = Field(
         0.0,

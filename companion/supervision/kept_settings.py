@@ -7,7 +7,7 @@ import os
 from fcntl import F_DUPFD_CLOEXEC, fcntl
 from pathlib import Path
 
-from companion.config import CompanionConfig, load_config, parse_config
+from companion.config import CompanionConfig, load_config, parse_config, resolved
 from companion.errors import ConfigError
 
 
@@ -34,4 +34,5 @@ def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:
             raise
         # Several processes have this descriptor, and one position in it.
         data = os.pread(kept, os.fstat(kept).st_size, 0)
-        return parse_config(json.loads(data), "the supervisor's deployment"), str(error)
+        config = parse_config(json.loads(data), "the supervisor's deployment")
+        return resolved(config, Path()), str(error)

@@ -29,27 +29,23 @@ def without_lost_disks(
 
     probe: why a folder cannot be written to; empty if it can.
     """
-    bridge, prior, record = config.bridge, config.prior, config.record
+    bridge, record, state = config.bridge, config.record, config.state_folder
     beside = None if record is None else record.folder.parent
-    gate = bridge.state_file or (None if beside is None else beside / "injection-gate.json")
-    place = prior.state_file or (None if beside is None else beside / "last-fix.json")
-    files = [path for path in (bridge.tlog, gate, place) if path is not None]
-    lost = _lost({*(p.parent for p in files), *filter(None, (beside,))}, probe or written_to)
+    tlog = bridge.tlog
+    folders = {None if tlog is None else tlog.parent, state, beside} - {None}
+    lost = _lost(filter(None, folders), probe or written_to)
     if not lost:
         return config, ""
-
-    def kept(path: Path | None) -> Path | None:
-        """Of what is read, too: without a disk that answers there is nothing to read."""
-        return path if path is None or lost.get(path.parent) != _STILL else None
-
-    tlog = kept(bridge.tlog)
-    if tlog is not None and tlog.parent in lost and not os.access(tlog, os.W_OK):
-        tlog = None  # one that is there is appended to, though its folder takes no other
+    # Of what is read, too: without a disk that answers there is nothing to read.
+    if tlog is not None and tlog.parent in lost:
+        # One that is there is appended to, though its folder takes no other.
+        can_append = lost[tlog.parent] != _STILL and os.access(tlog, os.W_OK)
+        tlog = tlog if can_append else None
     changed = config.model_copy(
         update={
             "record": None if beside in lost else record,
-            "bridge": bridge.model_copy(update={"tlog": tlog, "state_file": kept(gate)}),
-            "prior": prior.model_copy(update={"state_file": kept(place)}),
+            "bridge": bridge.model_copy(update={"tlog": tlog}),
+            "state_dir": None if state is None or lost.get(state) == _STILL else state,
         }
     )
     return changed, ", ".join(f"{folder}: {why}" for folder, why in sorted(lost.items()))

@@ -28,16 +28,26 @@ def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
 def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
     found = trial.estimated
     camera = found.camera if found is not None else trial.flight.camera.camera
-    bridge: dict[str, Any] = {"mount": "gimbal" if _is_measured(trial) else "fixed"}
+    settings = footage_settings(map_cache, camera, _mount_deg(trial), fixed=not _is_measured(trial))
+    return settings | {"record": {"folder": str(Path("flights/flight").resolve())}}
+
+
+def footage_settings(
+    map_cache: Path, camera: Camera, mount_deg: Array, *, fixed: bool
+) -> dict[str, Any]:
+    """A deployment's settings. mount_deg: (3,) roll, pitch, yaw of the camera on its gimbal, or,
+    fixed, on the airframe.
+    """
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
-    for name, angle in zip(names, _mount_deg(trial), strict=True):
-        bridge[name] = round(float(angle), 2)
+    angles = {name: round(float(a), 2) for name, a in zip(names, mount_deg, strict=True)}
     return {
         "map": str(map_cache.resolve()),
         "map_sha256": map_hash(map_cache),
         "camera": {"source": _SOURCE, "model": _model(camera)},
-        "bridge": {"connection": _CONNECTION, "camera": bridge},
-        "record": {"folder": str(Path("flights/flight").resolve())},
+        "bridge": {
+            "connection": _CONNECTION,
+            "camera": {"mount": "fixed" if fixed else "gimbal"} | angles,
+        },
     }
 
 

@@ -21,6 +21,7 @@ wheels=$root/opt/companion/wheels
 mkdir -p "$wheels" "$root/DEBIAN" "$root/lib/systemd/system" "$root/lib/udev/rules.d" \
     "$root/etc/companion" "$root/usr/bin" "$root/usr/share/doc/pilot-companion" "$out"
 
+export PIP_CONSTRAINT="$source/constraints.txt" PIP_BUILD_CONSTRAINT="$source/constraints.txt"
 # Of a copy: setuptools leaves its build folder in the source otherwise.
 (cd "$source" && git archive HEAD) | (mkdir "$work/source" && cd "$work/source" && tar x)
 "python$python" -m pip wheel --quiet --no-deps --wheel-dir "$wheels" "$work/source"
@@ -28,7 +29,7 @@ version=$(basename "$wheels"/pilot_companion-*.whl | cut -d- -f2)
 platforms=$(for tag in manylinux2014 manylinux_2_17 manylinux_2_27 manylinux_2_28; do
     printf -- '--platform %s_%s ' "$tag" "$machine"; done)
 # shellcheck disable=SC2086  # the list is words
-"python$python" -m pip download --quiet --constraint "$source/constraints.txt" --only-binary=:all: $platforms --implementation cp \
+"python$python" -m pip download --quiet --only-binary=:all: $platforms --implementation cp \
     --python-version "$python" --dest "$wheels" \
     "pilot-companion[console] @ file://$(ls "$wheels"/pilot_companion-*.whl)" pip
 

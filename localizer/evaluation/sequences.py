@@ -96,11 +96,14 @@ class EvaluatedFrame:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """How far a prior is from the truth: up to so many metres and degrees, seeded."""
+    """How far a prior is from the truth: up to so many metres and degrees, seeded. reported: puts
+    into it what other sensors report at a frame (`DrawnSensors.in_prior`).
+    """
 
     translation_m: float = 10.0
     rotation_deg: float = 10.0
     seed: int = 0
+    reported: Callable[[PosePrior, Pose, int], PosePrior] = lambda prior, _truth, _index: prior
 
     def prior(self, truth: Pose, index: int, time_ns: int) -> PosePrior:
         """The truth moved along and turned about random axes by uniform amounts."""
@@ -111,7 +114,8 @@ class Perturbation:
         # A vector of uniform length up to a in a random direction has variance a²/9 per axis;
         # half the bound keeps the bound itself within two sigma.
         sigma = np.repeat([self.translation_m / 2, np.radians(self.rotation_deg) / 2], 3)
-        return PosePrior(pose, np.diag(np.maximum(sigma, 1e-3) ** 2), time_ns)
+        prior = PosePrior(pose, np.diag(np.maximum(sigma, 1e-3) ** 2), time_ns)
+        return self.reported(prior, truth, index)
 
 
 def _random_vector(rng: np.random.Generator, limit: float) -> Array:
@@ -182,7 +186,6 @@ def evaluate(
     passes: int = 3,
     progress: Callable[[int], None] = lambda _: None,
     find: FindPlace | None = None,
-    in_prior: Callable[[PosePrior, Pose, int], PosePrior] = lambda prior, _truth, _index: prior,
 ) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
     """Localize every frame and measure it.
 
@@ -191,8 +194,7 @@ def evaluate(
     prior is rendered and registered, each time from the last result. A frame that is predicted
     outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
     `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
-    whenever it is lost or led nowhere, instead of the perturbed truth. in_prior: puts into a
-    perturbed prior what other sensors report (`DrawnSensors.in_prior`).
+    whenever it is lost or led nowhere, instead of the perturbed truth.
     """
     frames: list[EvaluatedFrame] = []
     errors: list[LocalizerError] = []
@@ -213,8 +215,7 @@ def evaluate(
             if fresh:
                 truth = sequence.truth[index]
                 if find is None:
-                    perturbed = perturbation.prior(truth, index, frame.exposure_time_ns)
-                    prior = in_prior(perturbed, truth, index)
+                    prior = perturbation.prior(truth, index, frame.exposure_time_ns)
                 else:
                     found = find(frame, truth, index)
                     if found is None:

@@ -306,5 +306,5 @@ def odometry_optimizer(optimizer: JNGO, threads: int = 2) -> JNGO:
     Two pictures of one flight see the same things, so the map's own error is no part of the
     covariance.
     """
-    config = optimizer.config.model_copy(update={"map_error_m2": 0.0})
+    config = replace(optimizer.config, map_error_m2=0.0)
     return JNGO(config, optimizer.backend, threads)

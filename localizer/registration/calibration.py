@@ -31,12 +31,10 @@ class CalibrationSigmas(BaseModel):
     distortion: float = Field(0.003, ge=0, le=1, description="of k1; k2 as much, p1, p2 a tenth")
     readout_ms: float = Field(1.0, ge=0, le=100, description="of a rolling shutter's readout")
     stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
-    map_m: float = Field(0.07, ge=0, le=20, description="of the map's surface, per axis")
+    map_m: float = Field(0.07, exclude=True)  # of the map's surface, per axis
     # Ground that changed since the survey errs alike over more than a survey's own bumps: three
     # flights over other visits were likeliest with 20 m (docs/results/errors.md).
-    map_length_m: float = Field(
-        20.0, ge=0.01, le=1000, description="correlation length of that displacement"
-    )
+    map_length_m: float = Field(20.0, exclude=True)  # correlation length of that displacement
 
     @classmethod
     def none(cls) -> CalibrationSigmas:

@@ -39,7 +39,8 @@ from localizer.registration.covariance import (
 )
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
-from localizer.registration.device_registration import DeviceBackend
+from localizer.registration.cuda.backend import CudaBackend
+from localizer.registration.cuda.registration import CudaRegistration
 from localizer.registration.devices import trial
 from localizer.registration.hypotheses import draw_hypotheses
 from localizer.registration.priors import PoseConstraint
@@ -81,7 +82,9 @@ class JNGO:
         self.config = config or JNGOConfig()
         self.backend = make_backend(backend, threads) if isinstance(backend, str) else backend
         self._threads = threads
-        self._whole = self.backend.whole() if isinstance(self.backend, DeviceBackend) else None
+        self._whole = (
+            CudaRegistration(self.backend) if isinstance(self.backend, CudaBackend) else None
+        )
 
     @property
     def on_gpu(self) -> bool:

@@ -202,7 +202,7 @@ def open_relocalizer(
         )
         if overview is not None:
             # Its places are laid over the map's picture first, so that the swarm reaches them.
-            registration = config.registration.model_copy(update={"preselected": 0})
+            registration = replace(config.registration, preselected=0)
             optimizer = JNGO(registration, "numba", c.threads)
             height_sigma_m = MapHeightError.of_kind(map_kind(cache)).sigma_m
             relocalizer = Relocalizer(

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.registration.priors import PoseConstraint
@@ -36,17 +35,12 @@ _HONEST_M = 100.0
 _APART, _LEAST_APART_M = 0.5, 20.0  # of the distance; between two places that see other ground
 
 
-class AttitudePrior(BaseModel):
+@dataclass(frozen=True)
+class AttitudePrior:
     """How well the autopilot's attitude and the gimbal's tell the camera's roll and pitch."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    tilt_sigma_deg: float = Field(
-        0.4, ge=0.05, le=90, description="smallest error of roll and pitch, without the bias"
-    )
-    alignment_sigma_deg: float = Field(
-        1.0, ge=0.05, le=90, description="their bias before it is estimated in flight"
-    )
+    tilt_sigma_deg: float = 0.4  # smallest error of roll and pitch, without the bias
+    alignment_sigma_deg: float = 1.0  # their bias before it is estimated in flight
 
 
 @dataclass(frozen=True)

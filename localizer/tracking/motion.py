@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from filterpy.kalman import predict as kalman_predict
 from filterpy.kalman import update as kalman_update
-from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.geometry.shutter import Sweep
@@ -31,28 +30,21 @@ _LEAST_RATE_NS = 15_000_000  # to both sides of an exposure: sensors report ever
 _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 
 
-class MotionConfig(BaseModel):
+@dataclass(frozen=True)
+class MotionConfig:
     """Process noise of the constant-velocity model, as white accelerations.
 
     The limits are those of flight, and of what double precision can add and invert.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    acceleration_sigma: float = Field(3.0, ge=0.01, le=100, description="m/s²")
-    angular_acceleration_sigma: float = Field(1.0, ge=0.001, le=100, description="rad/s²")
-    turn_sigma: float = Field(
-        0.001, ge=1e-4, le=1, description="error of a measured turn between two frames, rad"
-    )
-    turn_walk: float = Field(0.004, ge=0, le=1, description="its growth, rad per root second")
-    turn_delay_s: float = Field(0.01, ge=0, le=1, description="its delay, times the turn rate")
-    initial_velocity_sigma: float = Field(
-        8.0, ge=0.01, le=100, description="m/s, of an unknown velocity"
-    )
-    prior_velocity_sigma: float = Field(
-        2.0, ge=0.01, le=100, description="m/s, of the velocity of a prior"
-    )
-    initial_angular_rate_sigma: float = Field(0.3, ge=0.001, le=10, description="rad/s")
+    acceleration_sigma: float = 3.0  # m/s²
+    angular_acceleration_sigma: float = 1.0  # rad/s²
+    turn_sigma: float = 0.001  # error of a measured turn between two frames, rad
+    turn_walk: float = 0.004  # its growth, rad per root second
+    turn_delay_s: float = 0.01  # its delay, times the turn rate
+    initial_velocity_sigma: float = 8.0  # m/s, of an unknown velocity
+    prior_velocity_sigma: float = 2.0  # m/s, of the velocity of a prior
+    initial_angular_rate_sigma: float = 0.3  # rad/s
 
 
 @dataclass(frozen=True)

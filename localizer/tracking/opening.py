@@ -79,7 +79,7 @@ def build_localizer(
     size = working_camera(camera, config.width)
     features = load_extractor(
         config.model,
-        threads=config.feature_threads,
+        threads=config.feature_threads or max(1, config.threads // 2),
         size=(size.width, size.height),
         half=config.feature_half,
     )
@@ -87,8 +87,9 @@ def build_localizer(
     optimizer = JNGO(
         config.registration, open_backend(config.device, config.threads), config.threads
     )
-    path = config.odometry.terrain if config.odometry is not None else None
-    terrain = open_terrain(path, stack.cache.frame) if path is not None else None
+    terrain = None
+    if config.terrain is not None and config.odometry is not None:
+        terrain = open_terrain(config.terrain, stack.cache.frame)
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(
         stack.renderer, extractor, optimizer, camera, config, sensors,

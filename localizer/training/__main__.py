@@ -92,18 +92,6 @@ def export(
     )
 
 
-@app.command()
-def quantize(
-    model: Annotated[Path, typer.Argument(help="ONNX model in float32.")],
-    out: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
-    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to calibrate on.")],
-) -> None:
-    """Write the int8 form of a model. Compare both with benchmarks.features before using it."""
-    from localizer.training.export.quantize import quantize as write
-
-    typer.echo(f"{out}: mean cosine to the float features {write(model, out, shards):.4f}")
-
-
 @app.command("make-trainable")
 def make_trainable(
     model: Annotated[Path, typer.Argument(help="Published ONNX model of this network.")],
@@ -112,10 +100,9 @@ def make_trainable(
 ) -> None:
     """Make a published model trainable again."""
     from localizer.training.checkpoint import write_checkpoint
-    from localizer.training.export.from_published import trainable_network
-    from localizer.training.export.quantize import calibration_images
+    from localizer.training.export.from_published import shard_images, trainable_network
 
-    network = trainable_network(model, list(calibration_images(shards)))
+    network = trainable_network(model, list(shard_images(shards)))
     write_checkpoint(out, {"average": network.state_dict()})
 
 

@@ -158,13 +158,6 @@ class OptimizerSection(_Frozen):
         return self
 
 
-class DistillSection(_Frozen):
-    """A teacher beside the losses: its run's checkpoint, and the weight of its term a level."""
-
-    teacher: Path
-    weight: float = Field(gt=0.0, le=1000.0)
-
-
 class TrainConfig(_Frozen):
     """A whole run. warm_start: checkpoint whose averaged weights are the first ones; kept_steps:
     every so many steps the checkpoint is also kept under the step's name, for a scaling curve.
@@ -179,7 +172,6 @@ class TrainConfig(_Frozen):
     model: NetworkConfig
     data: Data
     optimizer: OptimizerSection
-    distill: DistillSection | None = None
 
     @model_validator(mode="after")
     def _crop_fits(self) -> TrainConfig:

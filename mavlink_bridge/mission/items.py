@@ -115,6 +115,15 @@ class MissionItem:
 
 
 @dataclass(frozen=True)
+class LoiterCircle:
+    """Flown about a place. radius_m: negative against the clock; inward: the nose to the centre."""
+
+    radius_m: float
+    rounds: int = 1
+    inward: bool = False
+
+
+@dataclass(frozen=True)
 class UnreadItem:
     """What a ground station expands into items only when it uploads them. name: the file's."""
 

@@ -23,18 +23,19 @@ from mavlink_bridge.mission.items import (
     DESCENTS,
     FRAMES,
     LANDINGS,
-    LOITERS,
     PLACES,
     ROI_COMMANDS,
     TAKEOFFS,
     UNKNOWN_VEHICLE,
     HeightAbove,
+    LoiterCircle,
     MissionItem,
     MissionVehicle,
     UnreadItem,
     command_name,
 )
 from mavlink_bridge.mission.jumps import JUMPS, Jumps
+from mavlink_bridge.mission.loiter import circle_of
 
 _MOST_STEPS = 200_000  # of a mission of jumps in jumps
 
@@ -45,7 +46,8 @@ _ENDS = (*LANDINGS, mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
 class MissionPlace:
     """A place that is flown to. name: the waypoint's number among the waypoints, "home" or
     "take-off"; item: its number in the mission; gimbal, speed_m_s: on the way there (None: not
-    said); after_gap: how the vehicle gets there is not known; curved: by a spline.
+    said); after_gap: how the vehicle gets there is not known; curved: by a spline; circle: flown
+    about it on arrival.
     """
 
     name: str
@@ -58,6 +60,7 @@ class MissionPlace:
     speed_m_s: float | None = None
     after_gap: bool = False
     curved: bool = False
+    circle: LoiterCircle | None = None
 
     @property
     def pitch_deg(self) -> float | None:
@@ -274,18 +277,14 @@ class _Flight:
             raise MissionError(f"{what} is no place: its altitude is {height}")
         gap, self._gap = self._gap, False
         curved = item.command == mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT
+        circle, notes = circle_of(item, self._vehicle)
+        self._notes |= dict.fromkeys(notes)
         there = MissionPlace(name, item.number, *place, height, above, self._gimbal)
-        self._path.append(replace(there, speed_m_s=self._speed_m_s, after_gap=gap, curved=curved))
+        there = replace(there, speed_m_s=self._speed_m_s, after_gap=gap, curved=curved)
+        self._path.append(replace(there, circle=circle))
 
     def _note_place(self, item: MissionItem) -> None:
         _above(item)  # a local frame's coordinates are no latitude and longitude
-        radius = abs(item.parameters[LOITERS[item.command]]) if item.command in LOITERS else 0.0
-        circles = not self._vehicle.is_multirotor
-        if item.command == mavlink.MAV_CMD_NAV_LOITER_TO_ALT:
-            if radius > 0 and circles:  # once or twice round: a turn
-                self._notes[f"{item.named}: its circle of {radius:.0f} m is left out."] = None
-        elif radius > 0 and (circles or item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS):
-            self._leave_out(item.named, f"its circle of {radius:.0f} m")
         if item.command == mavlink.MAV_CMD_NAV_LOITER_UNLIM:
             self._notes[f"{item.named} holds until the pilot goes on."] = None
 

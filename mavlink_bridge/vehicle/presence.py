@@ -24,12 +24,16 @@ class VehicleWatch:
     """Every link asks with each tick: the flight controller's own may be waiting to reconnect.
 
     say: tell the operator (severity, text). first: called after the first of these texts.
+    clock: CLOCK_MONOTONIC, ns.
     """
 
     def __init__(
-        self, say: Callable[[int, str], None], first: Callable[[], None] = lambda: None
+        self,
+        say: Callable[[int, str], None],
+        first: Callable[[], None] = lambda: None,
+        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
-        self._say, self._first = say, first
+        self._say, self._first, self._clock = say, first, clock
         self._lock = threading.Lock()
         # Of the first tick: an application may compile for minutes before it starts the bridge.
         self._begun_ns: int | None = None
@@ -37,7 +41,7 @@ class VehicleWatch:
 
     def check(self, state: VehicleState) -> None:
         """Tell what changed since the last call."""
-        now_ns = monotonic_ns()
+        now_ns = self._clock()
         with self._lock:
             before, self._begun_ns = self._known, self._begun_ns or now_ns
             if state.connected:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -24,8 +25,14 @@ class TimeSync:
     That answers have stopped is told.
     """
 
-    def __init__(self, tracker: VehicleTracker, component: int, teller: StatusNotifier) -> None:
-        self._tracker = tracker
+    def __init__(
+        self,
+        tracker: VehicleTracker,
+        component: int,
+        teller: StatusNotifier,
+        clock: Callable[[], int] = monotonic_ns,
+    ) -> None:
+        self._tracker, self._clock = tracker, clock
         self._teller = teller
         self._component = component
         self._sent: dict[int, int] = {}
@@ -42,7 +49,7 @@ class TimeSync:
         if message.tc1 == 0:
             if link.congested:
                 return False  # as if lost: a flood of questions costs no position its place
-            answer = mavlink.MAVLink_timesync_message(monotonic_ns(), message.ts1)
+            answer = mavlink.MAVLink_timesync_message(self._clock(), message.ts1)
             link.send(answer, self._component)
             return False
         sent_ns = self._sent.pop(message.ts1, None)
@@ -58,7 +65,7 @@ class TimeSync:
         self._next_ns = now_ns + _PERIOD_NS
         while len(self._sent) >= _PENDING:
             del self._sent[next(iter(self._sent))]
-        sent_ns = monotonic_ns()
+        sent_ns = self._clock()
         self._sent[sent_ns] = sent_ns
         link.send(mavlink.MAVLink_timesync_message(0, sent_ns), self._component)
 

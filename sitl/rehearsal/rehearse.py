@@ -57,6 +57,8 @@ def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Sce
             unknown.append("the camera's region of interest")
         if any(p.curved for p in planned.path):
             unknown.append("the curves of its splines, flown straight")
+        if any(p.circle is not None for p in planned.path):
+            unknown.append("its loiter circles")
         if unknown:
             notes.append(f"of the mission is not rehearsed: {', '.join(unknown)}")
     _require_covered(opened, world.frame, flown)

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
-from companion.renamed_keys import with_current_keys
 from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge import BridgeConfig
 from sitl.demo.scenario import ScenarioError
@@ -179,7 +178,7 @@ class Case(_Model):
 
 def load_case(path: Path) -> Case:
     """Read a scenario file; ScenarioError names the file and every problem in it."""
-    data = with_current_keys(read_settings(path, ScenarioError), str(path))
+    data = read_settings(path, ScenarioError)
     if "name" in data:
         raise ScenarioError(f"{path}: name: a scenario is named by its file, leave it out")
     try:

@@ -17,7 +17,8 @@ def refused(
     """What the command line writes before it ends with exit code 2."""
     name, *arguments = command.split()
     monkeypatch.setattr(sys, "argv", [name, *arguments])
-    monkeypatch.delitem(sys.modules, f"benchmarks.{name}", raising=False)  # runpy would warn
+    for loaded in (f"benchmarks.{name}", f"benchmarks.{name}.__main__"):  # runpy would warn
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"benchmarks.{name}", run_name="__main__")
     assert ended.value.code == 2
@@ -28,34 +29,20 @@ def refused(
     ("command", "named"),
     [
         ("features --pairs 0", "--pairs"),
-        ("features --pairs -5", "--pairs"),
-        ("features --pairs 1e9", "--pairs"),
-        ("features --seed -1", "--seed"),
-        ("features --anchors 0", "--anchors"),
         ("features --real /no/such/set", "/no/such/set"),
         ("features --report /no/such.csv", "/no/such.csv"),
         ("features --models /no/such.onnx", "/no/such.onnx"),
         ("features --out /no/such/folder/a.csv", "/no/such/folder"),
         ("features --mesh --real .", "--mesh"),
         ("features.network_speed --count 0", "--count"),
-        ("features.network_speed --s0 /no/such.onnx", "/no/such.onnx"),
-        ("bridge --seconds 0", "--seconds"),
         ("bridge --seconds nan", "--seconds"),
         ("bridge --load", "--load"),
-        ("bridge --load -1", "--load"),
-        ("bridge.soak --minutes 0", "--minutes"),
-        ("bridge.soak --plot /no/such/folder/a.png", "/no/such/folder"),
         ("rendering --size 512", "--size"),
-        ("rendering --size 0x4", "--size"),
-        ("rendering --frames 0", "--frames"),
         ("rendering --triangles inf", "--triangles"),
         ("map_streaming --km 0", "--km"),
-        ("map_streaming --seconds -1", "--seconds"),
         ("optimizer --threads 0", "--threads"),
         ("basin ablation . --set nowhere", "nowhere"),
-        ("basin ablation . --pairs 0", "--pairs"),
         ("basin axes . --processes 0", "--processes"),
-        ("basin priors . --starts", "--starts"),
         ("gpu_checklist --map /no/such/cache", "/no/such/cache"),
         ("gpu_checklist --minutes -1", "--minutes"),
         ("places run . --frames 301", "--frames"),
@@ -63,7 +50,6 @@ def refused(
         ("places table . --plot /no/such/folder/a.png", "/no/such/folder"),
         ("targets 0 --height 5", "--height"),
         ("throughput run . --widths 0", "--widths"),
-        ("throughput run . --cores 0", "--cores"),
         ("tables", "--help"),
         ("tables --targets /no/such.json", "/no/such.json"),
     ],
@@ -91,7 +77,8 @@ def test_every_option_is_explained(
     if name == "pairs":
         pytest.importorskip("torch")
     monkeypatch.setattr(sys, "argv", [name, "--help"])
-    monkeypatch.delitem(sys.modules, f"benchmarks.{name}", raising=False)  # runpy would warn
+    for loaded in (f"benchmarks.{name}", f"benchmarks.{name}.__main__"):  # runpy would warn
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"benchmarks.{name}", run_name="__main__")
     assert ended.value.code == 0

@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.basin.axes import AXES, STEPS, axis_start, axis_starts, limit, limits
 from benchmarks.basin.axes import table as axes_table
-from benchmarks.basin.repeating import table
 from benchmarks.basin.run import BasinOutcome, random_start, summary
 from benchmarks.basin.tables import ablation_table, covariance_table
 from localizer.geometry.pose import Pose, so3_exp
@@ -107,14 +106,6 @@ def test_the_ablations_table_compares_with_ours_start_by_start():
     assert columns[1] == "5 m, 5°, n 4: R@1, change, median"
     assert cells[0] == ("quito: **ours**", "100.0 %, 0.50 m", "100.0 %, 0.50 m", "10")
     assert cells[1][1].startswith("50.0 %, -50.0 (-")
-
-
-def test_shares_of_equal_modes_stand_row_by_row():
-    rows = table([("ours", True, True), ("ours", True, False), ("other", False, True)])
-    assert rows[0][:2] == ("**ours**", "2")
-    assert rows[0][2].startswith("100 % [")
-    assert rows[0][3].startswith("50 % [")
-    assert rows[1][2].startswith("0 % [")
 
 
 def test_the_axes_table_has_limits_beside_the_papers_and_shares_of_all_axes():

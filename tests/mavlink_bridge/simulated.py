@@ -76,8 +76,7 @@ class Flight:
         options.setdefault("mode", "inject")
         config = BridgeConfig(**options)
         self.now_ns = 1_000 * SECOND
-        for module in ("vehicle.timesync", "vehicle.presence", "link.clock"):
-            monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
+        monkeypatch.setattr("mavlink_bridge.link.clock.monotonic_ns", lambda: self.now_ns)
         self.texts: list[str] = []
         self.tracked: list[TrackRequest] = []
         self.hinted: list[PlaceHint] = []
@@ -97,10 +96,11 @@ class Flight:
             say,
             self.track,
             self.hint,
-            VehicleWatch(say),
+            VehicleWatch(say, clock=lambda: self.now_ns),
             enable,
             LookAt(config, GEOID, say),
             lambda *told: self.vehicle_texts.append(told),
+            lambda: self.now_ns,
         )
         self.shared = shared
         self.end = FlightControllerEnd(shared)

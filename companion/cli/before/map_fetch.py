@@ -202,7 +202,8 @@ def _area(rectangle: str | None, circle: str | None, mission: Path | None, margi
                 "--margin may be needed",
                 soft_wrap=True,
             )
-    return around(np.array(places), margin)
+    circles = [abs(p.circle.radius_m) for p in planned.path if p.circle is not None]
+    return around(np.array(places), margin + max(circles, default=0.0))
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:

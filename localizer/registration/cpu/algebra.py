@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 # Reassociation and contraction give SIMD reductions; NaN and infinity keep their meaning.
@@ -34,7 +33,7 @@ def prefetch(_context, array, _index):  # type: ignore[no-untyped-def]
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        function = builder.module.declare_intrinsic("llvm.prefetch.p0i8", fnty=kind)
         address = builder.bitcast(builder.gep(data, [arguments[1]]), byte)
         read, keep, is_data = (ir.Constant(number, v) for v in (0, 3, 1))
         builder.call(function, [address, read, keep, is_data])

@@ -13,7 +13,6 @@ from localizer.registration.backend import LevelProblem, LMSettings, Refinement
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.compiler import Image, compile_kernels
 from localizer.registration.cuda.driver import Arena, Device, Kernels
-from localizer.registration.device_registration import DeviceRegistration
 
 FEW = 16  # hypotheses at most for which larger blocks pay: they leave multiprocessors idle anyway
 
@@ -78,12 +77,6 @@ class CudaBackend:
         return Refinement(
             R, t, scores, visible / problem.points.shape[1], int(state["evaluations"])
         )
-
-    def whole(self) -> DeviceRegistration:
-        """The whole schedule on this device (`WholeBackend`)."""
-        from localizer.registration.cuda.registration import CudaRegistration
-
-        return CudaRegistration(self)
 
     def close(self) -> None:
         """Free the device memory."""

@@ -18,7 +18,7 @@ from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStat
 
 
 class CudaRegistration:
-    """`DeviceRegistration` on a `CudaBackend`."""
+    """A whole frame on a `CudaBackend`, which shares its device and memory."""
 
     def __init__(self, backend: CudaBackend) -> None:
         self._schedule = CudaSchedule(backend)
@@ -36,7 +36,7 @@ class CudaRegistration:
         seed: int = 0,
     ) -> Registration:
         """As `JNGO.register`, for levels and anchors that it has checked; features may be on the
-        device (`DeviceArray`).
+        device (`DeviceArray`). `BackendError` if the device failed.
         """
         origin = local_origin(anchors, prior.world_from_camera)
         local = _local_constraint(constraint, origin) if config.prior_weight > 0 else None

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.synth.appearance.model import CONDITIONS
-from localizer.synth.appearance.thermal import THERMAL_CONDITIONS, draw_thermal_day
 from localizer.synth.heightfield.render import render
 from localizer.synth.heightfield.scene import (
     Land,
@@ -28,7 +27,6 @@ from localizer.synth.heightfield.scene import (
     light_scene,
     without,
 )
-from localizer.synth.heightfield.thermal import thermal_scene
 from localizer.synth.visits.texture import draw_texel, regrown, wetted
 from localizer.training.places.changes import coarse_mesh, plain_walls
 from localizer.training.places.land import generated_place, photo_place
@@ -223,9 +221,6 @@ def lived_scene(
         direct = 0.15
     if condition == "night" and rng.random() < 0.4:
         direct = 0.5  # moonlight
-    if condition in THERMAL_CONDITIONS:
-        day = draw_thermal_day(rng, condition)
-        return thermal_scene(compose(land, prisms), prisms, place.lasting, day, rng), season
     elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
     sun = _sun(rng, elevation, direct)
     if visit.style is not None and light is None:

@@ -115,7 +115,8 @@ def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:
 def read_shard(path: Path) -> list[Pair]:
     """The pairs of one shard."""
     try:
-        with np.load(path) as data:
+        # Opened here: NumPy leaves a damaged archive open.
+        with path.open("rb") as file, np.load(file) as data:
             z = {key: data[key] for key in data.files}
     except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         why = str(error).split("\n")[0]

@@ -108,7 +108,6 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
                 "optimizer": config.optimizer.model_dump(mode="json"),
                 # Paths are of one machine; what decides the weights is the rest.
                 "warm_start": config.warm_start is not None,
-                "distilled": config.distill is not None,
                 "data": config.data.model_dump(
                     mode="json", exclude={"shards", "photos", "workers"}
                 ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,25 @@ from torch import Tensor, nn
 
 from localizer.errors import ModelError
 from localizer.features.extractor import read_model_info
+from localizer.synth.appearance.model import apply_appearance, sample_appearance
+from localizer.training.data.batches import tamed
+from localizer.training.data.shards import read_shard
 from localizer.training.models.networks import Network, NetworkConfig, build
 from localizer.training.models.s0 import BranchedBlock, S0Config, S0Net
 from localizer.training.models.tiny import MobileOneBlock, ModelConfig, TinyNet
 from localizer.types import Image
 
 _KINDS = ("weight", "bias")
+
+
+def shard_images(shards: Sequence[Path]) -> Iterator[Image]:
+    """One reference and one degraded query of every shard: (H, W, 3) uint8."""
+    for k, path in enumerate(shards):
+        rng = np.random.default_rng(k)
+        for pair in read_shard(path)[:1]:
+            look = tamed(sample_appearance(rng), pair.query_depth)
+            yield pair.reference
+            yield apply_appearance(pair.query, pair.query_depth, look, rng)
 
 
 def trainable_network(model: Path, images: list[Image]) -> Network:

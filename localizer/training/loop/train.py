@@ -17,7 +17,6 @@ from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.data.batches import ShardStream
 from localizer.training.data.streams import hard_pairs, open_stream
 from localizer.training.distributed import TrainingProcess
-from localizer.training.loop.distill import Teacher, distillation_loss
 from localizer.training.loop.log import append
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
@@ -56,9 +55,6 @@ class Trainer:
             lr=config.optimizer.learning_rate,
             weight_decay=config.optimizer.weight_decay,
         )
-        self.teacher = None
-        if config.distill is not None:
-            self.teacher = Teacher(config.distill.teacher, self.model.strides, self.device)
         self.hard = hard_pairs(config.data)
         self.step = 0
         self.seconds = self.core_seconds = 0.0  # by the clock, and of the processor
@@ -122,7 +118,6 @@ class Trainer:
         pairs = batch.points.shape[0]
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
             levels = self.model(batch.images.contiguous())
-            taught = None if self.teacher is None else self.teacher.levels(batch.images)
         ramp = alignment_ramp(self.step, o)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         total, parts = batch.points.new_zeros(()), {}
@@ -144,13 +139,6 @@ class Trainer:
             )  # fmt: skip
             total = total + o.contrast_weight * contrast
             total = total + ramp * o.alignment_weight * alignment
-            if taught is not None and self.config.distill is not None:
-                lesson = distillation_loss(
-                    (features, confidence), self.log_scale[k].exp(), taught[k], at,
-                    batch.query_pixels / stride, batch.visible,
-                )  # fmt: skip
-                total = total + self.config.distill.weight * lesson
-                parts[f"distill_{k}"] = float(lesson.detach())
             parts[f"contrast_{k}"] = float(contrast.detach())
             parts[f"alignment_{k}"] = float(alignment.detach())
             parts[f"error_px_{k}"] = float(error.mean())

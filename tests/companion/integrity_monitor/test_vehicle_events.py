@@ -182,14 +182,12 @@ class Faulty:
 
 
 @pytest.fixture
-def faulty(monkeypatch: pytest.MonkeyPatch) -> tuple[IntegrityMonitor, Any]:
+def faulty() -> tuple[IntegrityMonitor, Any]:
     """A monitor whose clock goes on by its period at each turn, and its bridge."""
-    clock = iter(range(second(10.0), second(100.0), second(0.1)))
-    monkeypatch.setattr(
-        "companion.integrity_monitor.integrity_monitor.monotonic_ns", lambda: next(clock)
-    )
+    times = iter(range(second(10.0), second(100.0), second(0.1)))
     bridge: Any = Faulty(Flight(monitor()))
-    return IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge), bridge
+    config, limits = IntegrityMonitorConfig(), IntegrityLimits()
+    return IntegrityMonitor(config, limits, bridge, clock=lambda: next(times)), bridge
 
 
 FIX = VisionFix(second(1.0), 47.0, 8.0, 500.0)
@@ -330,16 +328,16 @@ class Hand:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Hand:
-    hand = Hand()
-    monkeypatch.setattr("companion.integrity_monitor.integrity_monitor.monotonic_ns", hand)
-    return hand
+def clock() -> Hand:
+    return Hand()
 
 
 def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock: Hand) -> None:
     """Its last findings stood for ever: fixes passed, and neither health nor a text said a word."""
     bridge: Any = Faulty(Flight(monitor()))
-    integrity_monitor = IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge)
+    integrity_monitor = IntegrityMonitor(
+        IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
+    )
     integrity_monitor.turn()
     clock.now_ns += second(1.9)  # a busy computer
     assert integrity_monitor.judge(FIX) is not None
@@ -371,7 +369,9 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
         return ()
 
     bridge.inertial_since = hangs
-    integrity_monitor = IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge)
+    integrity_monitor = IntegrityMonitor(
+        IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
+    )
     integrity_monitor.start()
     try:
         assert stuck.wait(30.0)
@@ -387,7 +387,9 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
 def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Hand) -> None:
     """Its last level went out with every heartbeat, for ever."""
     bridge: Any = Faulty(Flight(monitor()))
-    integrity_monitor = IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge)
+    integrity_monitor = IntegrityMonitor(
+        IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
+    )
     turned_ns = clock.now_ns
     integrity_monitor.watch(lambda: {"health": turned_ns})
     for _ in range(39):

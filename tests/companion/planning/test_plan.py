@@ -117,9 +117,9 @@ def test_zero_zero_is_where_the_vehicle_is_and_no_place_off_africa(tmp_path, cac
         item(19, 5, 0, 0, 0, 0, 0, altitude), waypoint(cache, 100, 50, 0),
     )  # fmt: skip
     legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 1000.0)
-    assert [leg.name for leg in legs] == ["1 to 2", "3 to 4"]
-    assert legs[1].length_m == pytest.approx(50, abs=0.5)
-    above = legs[1].samples[0].position[2] - float(height(0, 0))
+    assert [leg.name for leg in legs] == ["circle 1", "1 to 2", "circle 3", "3 to 4"]
+    assert legs[3].length_m == pytest.approx(50, abs=0.5)
+    above = legs[3].samples[0].position[2] - float(height(0, 0))
     assert above == pytest.approx(altitude or 40, abs=0.5)
 
 
@@ -187,6 +187,24 @@ def test_a_spline_is_flown_as_a_curve_through_its_places(tmp_path, cache):
     middle = np.array([40 + 100 / 8, 40 - 80 / 8])
     nearest = min(np.linalg.norm(s.position[:2] - middle) for s in curve.samples)
     assert nearest < 2.5
+
+
+def test_a_loiter_circle_is_judged_as_a_leg(tmp_path, cache):
+    path = plan_file(
+        tmp_path / "a.plan", cache, item(18, 3, 0, -40, 0, *place(cache, 60, 0), 50),
+        waypoint(cache, 60, 90, 50),
+    )  # fmt: skip
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 4.0)
+    names = ["home to 1", *["circle 1"] * 3, "1 to 2"]
+    assert [(leg.name, leg.first) for leg in legs] == list(zip(names, (0, 1, 1, 1, 4), strict=True))
+    circle = legs[1]
+    assert circle.length_m == pytest.approx(2 * math.pi * 40, rel=2e-3)
+    away = np.array([s.position[:2] for s in circle.samples]) - (60, 0)
+    assert np.linalg.norm(away, axis=1) == pytest.approx(40, abs=0.2)
+    # From the west, against the clock: south first.
+    assert away[0][0] < -39
+    assert away[0][1] < 0
+    assert circle.samples[0].heading_deg == pytest.approx(180, abs=6)
 
 
 def test_rounds_are_flown_often_and_judged_once(tmp_path, cache):
@@ -289,17 +307,18 @@ def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
     assert not stretches(verdict((0, 1)), 5.0, strict)[0].can_bridge
 
 
-def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg, tmp_path):
-    def drift_m(share, odometry):
+def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg):
+    def drift_m(share, terrain=False):
         off = forecast(risk=0.9, share=share, ground=0.0 if share == 0.0 else 0.3)
         judged = tuple(judge(s, [off], MissionLimits()) for s in leg.samples)
-        return stretches([LegVerdict(leg, judged)], 5.0, odometry)[0].drift_m
+        return stretches([LegVerdict(leg, judged)], 5.0, OdometryConfig(), terrain=terrain)[
+            0
+        ].drift_m
 
-    level, terrain = OdometryConfig(), OdometryConfig(terrain=tmp_path / "terrain.tif")
-    mapped, off = drift_m(1.0, level), drift_m(0.0, level)
+    mapped, off = drift_m(1.0), drift_m(0.0)
     assert off == pytest.approx(0.1 * leg.length_m, rel=0.1)
-    assert mapped < drift_m(0.0, terrain) < 0.2 * off
-    assert drift_m(0.3, level) == off
+    assert mapped < drift_m(0.0, terrain=True) < 0.2 * off
+    assert drift_m(0.3) == off
 
 
 def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):

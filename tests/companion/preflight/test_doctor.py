@@ -75,7 +75,6 @@ def test_what_is_missing_is_named(tmp_path, feed):
     [
         ({"model": "no.onnx"}, "no.onnx: no such model file"),
         ({"renderer": "pyrender"}, "pyrender is not installed"),
-        ({"registration": {"iterations": [1]}}, "levels of features"),
     ],
 )
 def test_a_localizer_that_a_flight_could_not_make_is_wrong(

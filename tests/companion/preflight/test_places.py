@@ -38,10 +38,9 @@ def test_a_name_that_no_disk_takes_is_told(tmp_path: Path) -> None:
     assert "bridge.tlog" in tlog
 
 
-@pytest.mark.parametrize("key", ["tlog", "state_file"])
-def test_a_folder_in_place_of_a_file_is_told(tmp_path: Path, key: str) -> None:
-    (why,) = faults(bridge={key: str(tmp_path)})
-    assert why == f"bridge.{key} {tmp_path}: a folder, not a file"
+def test_a_folder_in_place_of_a_file_is_told(tmp_path: Path) -> None:
+    (why,) = faults(bridge={"tlog": str(tmp_path)})
+    assert why == f"bridge.tlog {tmp_path}: a folder, not a file"
 
 
 def test_a_signing_key_that_is_not_there_is_told(tmp_path: Path) -> None:
@@ -54,9 +53,9 @@ def test_what_a_start_makes_itself_is_no_fault(tmp_path: Path) -> None:
     create_key(tmp_path / "mavlink.key")
     assert not faults(
         record={"folder": str(tmp_path / "flights/flight")},
+        state_dir=str(tmp_path / "state"),
         bridge={
             "tlog": str(tmp_path / "flights/latest.tlog"),
-            "state_file": str(tmp_path / "state/gate.json"),
             "signing": {"key_file": str(tmp_path / "mavlink.key")},
         },
     )

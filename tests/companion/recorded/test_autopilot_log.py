@@ -1,6 +1,7 @@
 """ArduPilot's logs, and the clock of images beside them."""
 
 import math
+import sys
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from tests.companion.recorded.logs import (
     swaying,
     write_dataflash,
     write_tlog,
+    write_ulog,
 )
 
 _WRITERS = {"tlog": write_tlog, "bin": write_dataflash}
@@ -50,6 +52,26 @@ def test_a_log_says_where_the_camera_was_and_looked(tmp_path, kind, gimbal):
         assert log.triggers_ns[0] == pytest.approx((UTC_S + 2.0) * 1e9, abs=2e8)
 
 
+def test_a_log_of_px4_is_read_by_pyulog(tmp_path, monkeypatch):
+    pytest.importorskip("pyulog")
+    log = read_autopilot_log(write_ulog(tmp_path / "flight.ulg", swaying, 10.0))
+    at = log.track.at(round((UTC_S + 5.03) * 1e9))
+    north, east, height, roll, _, yaw = swaying(5.03)
+    place_deg = at.position.latitude_deg, at.position.longitude_deg
+    assert place_deg == pytest.approx(place(north, east), abs=2e-6)
+    assert {h.datum: round(h.value_m) for h in at.position.heights} == {
+        Datum.TAKEOFF: height, Datum.AMSL: 500 + height
+    }  # fmt: skip
+    expected = [math.sin(roll) * math.sin(yaw), -math.sin(roll) * math.cos(yaw), math.cos(roll)]
+    np.testing.assert_allclose(at.view.ned_from_camera[:, 2], expected, atol=0.02)
+    (tmp_path / "b.ulg").write_bytes(b"no log at all")
+    with pytest.raises(FootageError, match="not a log that pyulog reads"):
+        read_autopilot_log(tmp_path / "b.ulg")
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    with pytest.raises(FootageError, match=r"pip install 'pilot-companion\[ulog\]'"):
+        read_autopilot_log(tmp_path / "flight.ulg")
+
+
 def test_half_a_log_and_no_log_are_named(tmp_path):
     whole = write_tlog(tmp_path / "flight.tlog", swaying, 10.0).read_bytes()
     half = tmp_path / "half.tlog"
@@ -59,8 +81,6 @@ def test_half_a_log_and_no_log_are_named(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(FootageError, match=name):
             read_autopilot_log(tmp_path / name)
-    with pytest.raises(FootageError, match="PX4's logs are not read"):
-        read_autopilot_log(tmp_path / "d.ulg")
 
 
 def _ground(rng):

@@ -13,6 +13,7 @@ from companion.cli.commands import app
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
+from companion.settings_file import settings
 from companion.setup.difference import differing
 from companion.setup.reference import reference
 from localizer.errors import MapCacheError
@@ -52,16 +53,15 @@ def paths(data, where=""):
 
 def test_only_what_differs_is_kept_and_nothing_is_lost():
     given = MINIMAL | {
-        "bridge": {"injection": {"rate_hz": 10.0, "yaw_guard": {"enabled": False}}},
-        "localizer": {"odometry": None, "attitude": {"tilt_sigma_deg": 0.5}},
+        "bridge": {"injection": {"rate_hz": 10.0}},
+        "localizer": {"calibration": {"stamp_ms": 1.5}},
         "console": {"listen": "127.0.0.1:8081"},
     }
     config = parse_config(given, "test")
     kept = differing(config)
     assert set(paths(kept)) == {
         "map", "camera.source", *(f"camera.model.{k}" for k in MODEL),
-        "bridge.injection.rate_hz", "bridge.injection.yaw_guard.enabled", "localizer.odometry",
-        "localizer.attitude.tilt_sigma_deg", "console.listen",
+        "bridge.injection.rate_hz", "localizer.calibration.stamp_ms", "console.listen",
     }  # fmt: skip
     assert parse_config(kept, "again") == config
 
@@ -74,7 +74,7 @@ def test_the_reference_is_a_valid_deployment_of_true_defaults():
     text = reference()
 
     def names(model: type[BaseModel]) -> set[str]:
-        return set(model.model_fields)
+        return set(settings(model))
 
     assert all(f"{name}:" in text for name in names(CompanionConfig))
     assert "delay_ms: 100.0" in text

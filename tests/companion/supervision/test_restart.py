@@ -40,8 +40,7 @@ def test_a_stick_that_is_gone_costs_the_record_and_not_the_flight(tmp_path: Path
     assert left.bridge.tlog is None
     assert str(stick) in told
     # They are only read and written where that goes, and keep their names.
-    assert left.bridge.state_file == stick / "injection-gate.json"
-    assert left.prior.state_file == stick / "last-fix.json"
+    assert left.state_folder == stick
 
 
 def test_one_disk_of_two(tmp_path: Path) -> None:
@@ -79,8 +78,7 @@ def test_a_disk_that_stands_still_is_not_even_read(
     assert told == f"{tmp_path / 'stick'}: does not answer"
     assert left.record is None
     assert left.bridge.tlog == tmp_path / "a.tlog"
-    assert left.bridge.state_file is None
-    assert left.prior.state_file is None
+    assert left.state_folder is None
 
 
 @pytest.mark.parametrize(

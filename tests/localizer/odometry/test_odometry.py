@@ -65,7 +65,7 @@ def test_what_did_not_match_stays_uncertain_whatever_other_sensors_say(hills):
     """At night sensors and the map's shape held the sigma at 1.8 m while the place drifted 13 m."""
 
     def flown(unmatched: float) -> list:
-        model = OdometryConfig().with_map.model_copy(update={"unmatched": unmatched})
+        model = replace(OdometryConfig().with_map, unmatched=unmatched)
         sensed = [
             combine(
                 attitude_constraint(hills.pose(k).rotation, 0.001, 0.002),

@@ -169,27 +169,3 @@ def test_the_priors_velocity_starts_the_filter():
     still = motion.predict(motion.start(_prior(), CONFIG), SECOND, CONFIG)
     np.testing.assert_allclose(ahead.mean[:3] - still.mean[:3], [12.0, 0.0, 0.0], atol=1e-9)
     assert ahead.covariance[0, 0] < 0.25 * still.covariance[0, 0]
-
-
-@pytest.mark.parametrize("end", ["minimum", "maximum"])
-@pytest.mark.parametrize("name", [*MotionConfig.model_fields, None])
-def test_settings_at_their_limits_keep_a_covariance_that_is_one(name, end):
-    """The limits are what the arithmetic bears, each alone and all at once."""
-    limits = {k: p[end] for k, p in MotionConfig.model_json_schema()["properties"].items()}
-    config = MotionConfig(**(limits if name is None else {name: limits[name]}))
-    state = motion.start(_prior(), config)
-    turn = so3_exp(np.array([0.0, 0.0, 0.01]))
-    for k in range(1, 60):
-        # Turns come and go, the localizer is silent at times, and some poses are refused.
-        gap = 9 * SECOND if k % 20 == 0 else SECOND // 10
-        measured = turn if k % 3 else None
-        state = motion.predict(state, state.time_ns + gap, config, measured)
-        if k % 7:
-            assert np.isfinite(motion.mahalanobis_squared(state.prior, Pose.identity()))
-            state = motion.update(state, Pose.identity(), np.eye(6) * 1e-4)
-        else:
-            state = motion.inflated(state, config)
-        scale = np.sqrt(state.covariance.diagonal())
-        assert np.isfinite(scale).all()
-        correlation = state.covariance / np.outer(scale, scale)
-        assert np.linalg.eigvalsh(correlation)[0] > -1e-9

@@ -41,7 +41,7 @@ def test_a_renderer_that_is_not_there_is_named_and_leaves_no_thread(small_assets
 
 @pytest.mark.parametrize("iterations", [(4, 4), (4, 4, 4, 4)])
 def test_a_model_of_another_number_of_levels_ends_the_start(small_assets, iterations):
-    registration = JNGOConfig().model_copy(update={"iterations": iterations})
+    registration = JNGOConfig(iterations=iterations)
     config = LocalizerConfig(renderer="numba", threads=1, registration=registration)
     stack = MapStack(small_assets.map_cache, config)
     with pytest.raises(ModelError, match="the model has 3 levels"):

@@ -19,10 +19,8 @@ from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream  # noqa: E402
 from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import read_shard, store  # noqa: E402
-from localizer.training.export import quantize as quantization  # noqa: E402
 from localizer.training.export.export import export, load_network  # noqa: E402
 from localizer.training.export.from_published import trainable_network  # noqa: E402
-from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
 from localizer.training.models.networks import build  # noqa: E402
@@ -179,27 +177,6 @@ def test_a_model_that_gives_no_numbers_is_not_exported(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"run.pt", "tiny.onnx"}
 
 
-def test_a_quantisation_that_fails_leaves_the_older_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model, described = tmp_path / "tiny.onnx", tmp_path / "tiny.json"
-    model.write_bytes(SHIPPED_MODEL.read_bytes())
-    described.write_bytes(SHIPPED_MODEL.with_suffix(".json").read_bytes())
-    before = model.read_bytes(), described.read_bytes()
-
-    def stopped(_: object, out: str, *_args: object, **_options: object) -> None:
-        Path(out).write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    image = np.zeros((64, 64, 3), np.uint8)
-    monkeypatch.setattr(quantization, "calibration_images", lambda _: [image])
-    monkeypatch.setattr(quantization, "quantize_static", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        quantize(model, model, [])
-    assert (model.read_bytes(), described.read_bytes()) == before
-    assert set(tmp_path.iterdir()) == {model, described}
-
-
 def test_a_stopped_generation_leaves_no_half_shard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,13 +188,6 @@ def test_a_stopped_generation_leaves_no_half_shard(
     with pytest.raises(KeyboardInterrupt):
         store(tmp_path / "1.npz", [], SceneConfig(width=64, height=48))
     assert not list(tmp_path.iterdir())
-
-
-def test_a_model_is_tried_before_it_is_quantised(tmp_path: Path) -> None:
-    model = tmp_path / "tiny.onnx"
-    model.write_bytes(b"junk")
-    with pytest.raises(ModelError, match=r"tiny\.json: cannot be read"):
-        quantize(model, tmp_path / "int8.onnx", [tmp_path / "1.npz"])
 
 
 def test_unfusing_needs_pairs() -> None:

@@ -23,7 +23,6 @@ from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
 from localizer.training.export.from_published import trainable_network  # noqa: E402
-from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.ablation import ablations  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer, learning_rate, perturbed  # noqa: E402
@@ -279,19 +278,6 @@ def test_a_published_model_becomes_trainable_again(config: TrainConfig, tmp_path
         torch.testing.assert_close(confidence, expected[k][1], atol=1e-4, rtol=0)
         # Batch statistics of the same images: about the same function.
         assert float((features * trained[k][0]).sum(1).mean()) > 0.98
-
-
-def test_int8_keeps_the_features(config: TrainConfig, shards: Path, tmp_path: Path) -> None:
-    trainer = Trainer(config)
-    trainer.run(steps=3)
-    model, small = tmp_path / "model" / "tiny.onnx", tmp_path / "model" / "tiny8.onnx"
-    export(trainer.checkpoint, model)
-    assert quantize(model, small, sorted(shards.glob("*.npz"))) > 0.97
-    operators = {node.op_type for node in onnx.load(small).graph.node}
-    assert "QuantizeLinear" in operators
-    assert OnnxExtractor(small).info.name == "tiny-int8"
-    with pytest.raises(ModelError, match="calibrate"):
-        quantize(model, small, [])
 
 
 def test_ablations_differ_in_their_data_alone(config: TrainConfig) -> None:

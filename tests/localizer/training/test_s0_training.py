@@ -17,7 +17,6 @@ from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
 from localizer.training.export.from_published import trainable_network  # noqa: E402
-from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.train import Trainer, alignment_ramp  # noqa: E402
 from localizer.training.models.s0 import S0Config, S0Net  # noqa: E402
 
@@ -123,17 +122,6 @@ def test_float16_is_close_and_says_so(trainer: Trainer, tmp_path: Path) -> None:
     kinds = {i.data_type for i in onnx.load(path).graph.initializer if len(i.dims) == 4}
     assert kinds == {onnx.TensorProto.FLOAT16}
     assert OnnxExtractor(path).info.name == "s0-float16"
-
-
-def test_int8_keeps_heads_in_float(model: Path, shards: Path, tmp_path: Path) -> None:
-    small = tmp_path / "s0-int8.onnx"
-    assert quantize(model, small, sorted(shards.glob("*.npz"))) > 0.9
-    graph = onnx.load(small).graph
-    assert any(node.op_type == "QuantizeLinear" for node in graph.node)
-    heads = [n for n in graph.node if n.op_type == "Conv" and "uncertainties" in n.name]
-    weights = {i.name for i in graph.initializer}
-    assert len(heads) == 3
-    assert all(head.input[1] in weights for head in heads)
 
 
 def test_a_published_model_becomes_trainable_again(trainer: Trainer, model: Path) -> None:

@@ -9,7 +9,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.mission.gimbal import GimbalTarget, RegionOfInterest
-from mavlink_bridge.mission.items import HeightAbove, MissionItem, MissionVehicle, UnreadItem
+from mavlink_bridge.mission.items import (
+    HeightAbove,
+    LoiterCircle,
+    MissionItem,
+    MissionVehicle,
+    UnreadItem,
+)
 from mavlink_bridge.mission.path import PlannedMission, fly
 
 NAN = math.nan
@@ -58,22 +64,27 @@ def test_a_vtol_takes_off_loiters_to_an_altitude_and_lands():
 
 
 @pytest.mark.parametrize(
-    ("row", "vehicle", "note", "unknown"),
+    ("row", "vehicle", "circle", "note"),
     [
-        (to(B, 50, 31, 0, 60), PX4_VTOL, "LOITER_TO_ALT (item 1): its circle of 60 m", ""),
-        (to(B, 50, 31, 0, 60), COPTER, "", ""),
-        (to(B, 50, 18, 3, 0, -40), COPTER, "", "LOITER_TURNS (item 1): its circle of 40 m"),
-        (to(B, 50, 19, 60, 0, 75), PLANE, "", "LOITER_TIME (item 1): its circle of 75 m"),
-        (to(B, 50, 19, 60, 0, 75), COPTER, "", ""),
-        (to(B, 50, 17, 0, 0, 0), PLANE, "LOITER_UNLIM (item 1) holds until the pilot", ""),
+        (to(B, 50, 31, 0, 60), PX4_VTOL, LoiterCircle(60.0), ""),
+        (to(B, 50, 31, 0, 60), COPTER, None, ""),
+        (to(B, 50, 31, 0, 0), PX4_VTOL, LoiterCircle(80.0), "default circle of 80 m"),
+        (to(B, 50, 31, 0, NAN), PLANE, LoiterCircle(60.0), "default circle of 60 m"),
+        (to(B, 50, 18, 2.5, 0, -40), COPTER, LoiterCircle(-40.0, 3, True), ""),
+        (to(B, 50, 18, 3, 0, 40), PX4_COPTER, None, ""),
+        (to(B, 50, 18, 30, 0, 40), PLANE, LoiterCircle(40.0, 10), "10 of its 30 rounds"),
+        (to(B, 50, 19, 60, 0, 75), PLANE, LoiterCircle(75.0), "one round of its circle"),
+        (to(B, 50, 19, 60, 0, 75), COPTER, None, ""),
+        (to(B, 50, 17, 0, 0, 75), PLANE, LoiterCircle(75.0), "holds until the pilot"),
+        (to(B, 50, 17, 0, 0, 0), MissionVehicle(), LoiterCircle(60.0), "default circle of 60 m"),
     ],
 )
-def test_circles_are_told(row, vehicle, note, unknown):
+def test_a_circle_is_flown_as_the_firmware_does(row, vehicle, circle, note):
     mission = flown(row, vehicle=vehicle)
-    assert names(mission) == ["home", "1"]
-    for expected, found in ((note, " ".join(mission.notes)), (unknown, told(mission))):
-        assert expected in found
-        assert bool(expected) == bool(found)
+    assert [p.circle for p in mission.path] == [None, circle]
+    assert note in " ".join(mission.notes)
+    assert bool(note) == bool(mission.notes)
+    assert not mission.not_judged
 
 
 def test_after_a_landing_only_a_take_off_goes_on():

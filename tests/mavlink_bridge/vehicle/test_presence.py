@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -135,7 +136,9 @@ def test_a_write_that_fails_reconnects_at_once_and_is_no_error_of_the_handler() 
 
 
 @pytest.mark.parametrize("reconnecting", [False, True])
-def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> None:
+def test_loss_is_told_on_the_ground_link_within_seconds(
+    reconnecting: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """reconnecting: the connection attempt itself hangs, as one to a host that is gone does."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
@@ -158,7 +161,10 @@ def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> N
             attempts.append(endpoint)
             return open_transport(endpoint)
 
-        with Bridge(config, 0.0, opener=opened) as bridge:
+        monkeypatch.setattr(
+            "mavlink_bridge.bridge.LinkOptions", partial(LinkOptions, opener=opened)
+        )
+        with Bridge(config, 0.0) as bridge:
             client, _ = server.accept()
             spoke_at = time.monotonic()
             client.sendall(HEARTBEAT.pack(mavlink.MAVLink(None, 1, 1)))
@@ -196,12 +202,11 @@ def test_each_change_is_told_once() -> None:
     ]
 
 
-def test_a_vehicle_that_never_speaks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_vehicle_that_never_speaks_is_told() -> None:
     """Five seconds after the first tick, however long the application took to get there."""
     now_ns = [10**12]
-    monkeypatch.setattr("mavlink_bridge.vehicle.presence.monotonic_ns", lambda: now_ns[0])
     told: list[str] = []
-    watch = VehicleWatch(lambda _, text: told.append(text))
+    watch = VehicleWatch(lambda _, text: told.append(text), clock=lambda: now_ns[0])
     for seconds, connected, texts in ((100, False, 0), (4, False, 0), (2, False, 1), (1, True, 2)):
         now_ns[0] += seconds * 10**9
         watch.check(VehicleState(connected=connected))

@@ -152,15 +152,6 @@ def faulty(emulator: Emulator) -> Kernels:
 
 
 @pytest.fixture
-def unfused(emulator: Emulator) -> Kernels:
-    """The benchmark's plain port, loaded on the emulated device."""
-    source = Path(__file__).resolve().parents[4] / "benchmarks" / "optimizer" / "unfused.cu"
-    options = (f'-DKERNEL_SOURCE="{source}"', "-DUNFUSED", "-DCHANNELS=32")
-    library = build(EMULATION / "kernels.cpp", *options, reads=(source,))
-    return emulator.device.load(f"emulated:{library}".encode())
-
-
-@pytest.fixture
 def make_emulated() -> Callable[..., CudaBackend]:
     """In place of `CudaBackend`: a backend whose kernels are compiled for the emulation."""
     return partial(CudaBackend, compile=emulated_kernels)

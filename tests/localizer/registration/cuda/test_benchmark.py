@@ -31,11 +31,9 @@ def printed(gpu, problems, swarm):
     return console.export_text()
 
 
-def test_every_cell_is_filled_on_a_device(emulator, benchmark, make_emulated, unfused, monkeypatch):
-    """The unfused port is compared with the reference before it is timed, here as there."""
+def test_every_cell_is_filled_on_a_device(emulator, benchmark, make_emulated, monkeypatch):
     problem, gpu = benchmark
     monkeypatch.setattr(gpu, "CudaBackend", make_emulated)
-    monkeypatch.setattr(gpu, "unfused_kernels", lambda *_: unfused)
     monkeypatch.setattr(gpu, "Device", lambda: emulator.device)
     tiny = partial(problem.make_problem)
     monkeypatch.setattr(gpu, "make_problem", lambda size, **k: tiny(min(size, 32), **k))

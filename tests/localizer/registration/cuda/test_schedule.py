@@ -63,7 +63,7 @@ def check(device, cpu, metres=3e-3, degrees=3e-3, rtol=0.02):
     ids=str,
 )
 def test_agrees_with_the_cpu(registered, scene, prior, changes):
-    config = JNGOConfig(**{**CONFIG.model_dump(), **changes})
+    config = replace(CONFIG, **changes)
     arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.5))
     check(registered(config)(*arguments), JNGO(config).register(*arguments))
 
@@ -91,7 +91,7 @@ def test_agrees_with_a_prediction_and_a_constraint(registered, scene, prior):
 
 def test_the_prediction_does_not_prune(registered, scene, prior):
     """One survivor a level, and a prediction that would rather keep a hypothesis that is worse."""
-    config = CONFIG.model_copy(update={"keep": (1, 1), "motion_weight": 100.0})
+    config = replace(CONFIG, keep=(1, 1), motion_weight=100.0)
     about = prior(scene.reference, 1.0, 3.0)
     arguments = (scene.query, scene.camera, scene.anchors, about)
     far = replace(scene.true, rotation=so3_exp([0.0, 0.1, 0.0]) @ scene.true.rotation)
@@ -242,7 +242,7 @@ def test_features_on_the_device_are_used_in_place(emulator, registered, scene, p
 
 def test_no_barrier_is_missing(emulator, registered, scene, prior):
     """The bits do not depend on the order in which the threads run between barriers."""
-    register = registered(JNGOConfig(**{**CONFIG.model_dump(), "hypotheses": 6, "keep": (3, 2)}))
+    register = registered(replace(CONFIG, hypotheses=6, keep=(3, 2)))
     arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.5))
     expected = register(*arguments)
     for order in (1, 5):

@@ -17,14 +17,7 @@
         return text.empty() ? 0 : 1;                                                         \
     }
 
-#ifdef UNFUSED
-#define KERNELS                               \
-    KERNEL(unfused_project, UnfusedArguments)  \
-    KERNEL(unfused_sample, UnfusedArguments)   \
-    KERNEL(unfused_jacobian, UnfusedArguments) \
-    KERNEL(unfused_accumulate, UnfusedArguments) \
-    KERNEL(unfused_solve, UnfusedArguments)
-#elif defined(FAULTY)
+#ifdef FAULTY
 #define KERNELS                         \
     KERNEL(no_barrier, Arguments)       \
     KERNEL(with_barrier, Arguments)     \

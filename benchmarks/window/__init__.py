@@ -1,1 +1,0 @@
-"""What a sliding window of frames would be worth over single frames."""

@@ -1,0 +1,108 @@
+"""``companion shadow-check``: what the monitor would have done on a past flight."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from companion.terminal.steps import COMPILES, shown_count
+
+if TYPE_CHECKING:
+    from companion.config import CompanionConfig
+    from companion.offline.shadow_check import ShadowCheck
+    from companion.recorded.flight import RecordedFlight
+
+_WARNING = 4  # MAV_SEVERITY
+
+
+def shadow_check_command(
+    log: Annotated[Path, typer.Argument(help="the flight's .bin, .tlog or .ulg")],
+    video: Annotated[Path, typer.Option(help="video or folder of photos of the same flight")],
+    map_cache: Annotated[
+        Path, typer.Option("--map", help="tile cache made by `companion map build`")
+    ],
+    config: Annotated[
+        Path | None, typer.Option(help="deployment file; else made from the footage")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.json; else the footage's own tags")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
+    ] = None,
+    mount_pitch: Annotated[
+        float, typer.Option(min=-180, max=180, help="of a camera on the airframe; -90 looks down")
+    ] = -90.0,
+    rate_hz: Annotated[float, typer.Option(min=0.1, max=60, help="images a second, at most")] = 5.0,
+    report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
+) -> None:
+    """Play a recorded flight through bridge and integrity monitor, as in shadow mode.
+
+    Exit code 0: the shadow score is a go; 1: no-go.
+    """
+    from companion.config import load_config
+    from companion.offline.shadow_check import shadow_check
+    from companion.recorded.footage import FootageOptions, read_footage
+    from localizer.map.cache.cache import TileCache
+
+    TileCache.open(map_cache)  # what is missing is said before anything is computed
+    console = Console(stderr=True)
+    with tempfile.TemporaryDirectory(prefix="shadow-check-") as work:
+        options = FootageOptions(Path(work), 60, None, log, camera, fov, mount_pitch)
+        with shown_count(console, "reading footage") as count:
+            flight = read_footage(video, options, count)
+        if config is None:
+            deployment = _deployment(flight, map_cache, mount_pitch)
+        else:
+            deployment = load_config(config).model_copy(update={"map": map_cache})
+        with shown_count(console, "playing the flight, s", begins=COMPILES) as count:
+            found = shadow_check(
+                flight, video, deployment, rate_hz, lambda s, total: count(round(s), round(total))
+            )
+    if report is not None:
+        report.write_text(json.dumps(asdict(found) | {"go": found.go}, indent=1), encoding="utf-8")
+    _show(found)
+    raise typer.Exit(0 if found.go else 1)
+
+
+def _deployment(flight: RecordedFlight, map_cache: Path, mount_pitch: float) -> CompanionConfig:
+    import numpy as np
+
+    from companion.config import parse_config
+    from companion.trial.deployment import footage_settings
+
+    fixed = flight.log is None or not flight.log.has_gimbal
+    mount_deg = np.array([0.0, mount_pitch if fixed else 0.0, 0.0])
+    settings = footage_settings(map_cache, flight.camera.camera, mount_deg, fixed=fixed)
+    return parse_config(settings, flight.name)
+
+
+def _show(found: ShadowCheck) -> None:
+    for note in found.notes:
+        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
+    out = Console()
+    table = Table("at, s", "the operator would have been told")
+    for line in found.lines:
+        if line.severity <= _WARNING:
+            table.add_row(f"{line.at_s:.0f}", escape(line.text))
+    if table.row_count:
+        out.print(table)
+    held = ", ".join(f"{name} {s:.0f} s" for name, s in found.held_s.items()) or "never"
+    begun = "never" if found.first_go_s is None else f"from {found.first_go_s:.0f} s on"
+    for text in (
+        f"{found.frames} images in {found.seconds:.0f} s: {found.localized} localized, "
+        f"{found.accepted} accepted; {found.passed} of {found.judged} fixes passed the monitor",
+        f"output held: {held}",
+        f"the shadow score was a go for {found.go_s:.0f} s, {begun}",
+    ):
+        out.print(text, soft_wrap=True, highlight=False)
+    style = "bold green" if found.go else "bold red"
+    out.print(f"shadow verdict: {escape(found.score.line())}", style=style, soft_wrap=True)
