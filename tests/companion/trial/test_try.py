@@ -20,6 +20,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
+from localizer.relocalization.relocalizer import Relocalizer
 from localizer.tracking.opening import MapStack, build_localizer
 from tests.companion.recorded.photos import dji, write_photo
 
@@ -91,7 +92,10 @@ def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequen
     black = [(replace(frame, path=tmp_path / "black.png"), prior) for frame, prior in good]
 
     def localized(shots):
-        loader = FrameLocalizer(build_localizer(stack, camera, config), lambda: None, camera)
+        def no_search() -> Relocalizer:
+            raise AssertionError("every prior is complete")
+
+        loader = FrameLocalizer(build_localizer(stack, camera, config), no_search, camera)
         return [loader.from_prior(frame, prior) for frame, prior in shots]
 
     alone = [localized([shot])[0] for shot in good]
