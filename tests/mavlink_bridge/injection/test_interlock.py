@@ -323,7 +323,7 @@ def test_shadow_mode_orders_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -
 def test_what_the_pilot_chooses_is_followed_and_not_undone(
     monkeypatch: pytest.MonkeyPatch, echo: bool
 ) -> None:
-    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True, good_after_s=2)
+    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True)
     flight = on_gnss(monkeypatch, switch=switch)
     flight.run(20.0)
     chosen(flight, 2)  # before a denial that is meant
@@ -355,7 +355,7 @@ def test_what_the_pilot_chooses_is_followed_and_not_undone(
 
 
 def test_the_echo_of_our_own_order_is_nobodys_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True, good_after_s=2)
+    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True)
     flight = on_gnss(monkeypatch, switch=switch)
     flight.run(20.0)
     flight.gnss_north_m = None
@@ -363,7 +363,7 @@ def test_the_echo_of_our_own_order_is_nobodys_choice(monkeypatch: pytest.MonkeyP
     accept(flight, echo=True)
     chosen(flight, 2)  # heard twice, the second time after the acknowledgement
     flight.gnss_north_m = 0.0
-    flight.run(5.0)
+    flight.run(8.0)
     assert orders(flight)[-1] == 1.0
 
 
