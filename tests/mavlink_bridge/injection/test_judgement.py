@@ -336,8 +336,9 @@ def returned(
     ekf_speed: float | None = None,
     seconds: float = 10.0,
 ) -> GnssReturnCheck:
-    """What is found of a receiver that is error(t) metres off, north, at five reports a second, in a
-    flight northwards. ekf_speed: where it differs from vision's.
+    """What is found of a receiver that is error(t) metres off, north, in a flight northwards.
+
+    ekf_speed: where it differs from vision's.
     """
     check, rng = GnssReturnCheck(), np.random.default_rng(4)
     for i in range(int(seconds * 10)):
