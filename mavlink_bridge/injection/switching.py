@@ -21,7 +21,7 @@ from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared, spec_of
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import SourceSwitchConfig
-from mavlink_bridge.injection.gnss_return import GnssReturnCheck
+from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mavlink_bridge.config import SourceSwitchConfig
+from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
-from mavlink_bridge.injection.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScorer
 from mavlink_bridge.injection.switching import SourceSwitch, SwitchOrder
