@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from mavlink_bridge.mission.items import LoiterCircle
 
-_EARTH_M = 6.371e6
 _PIECES = 64  # of a spline or a circle
 # The vectors at both ends are shortened to so many times the distance between them
 # (SplineCurve::set_origin_and_destination).
@@ -41,7 +41,7 @@ class Course:
         east, north, _ = end - start
         part = (way - done[k]) / max(steps[k], 1e-9)
         # As high above the Earth as between the ends: a chord lies below.
-        bulge = 0.5 * part * (1.0 - part) * (east * east + north * north) / _EARTH_M
+        bulge = 0.5 * part * (1.0 - part) * (east * east + north * north) / EARTH_RADIUS_M
         position = start + part * (end - start) + (0.0, 0.0, bulge)
         return position, float(np.degrees(np.arctan2(east, north)) % 360.0)
 
