@@ -124,6 +124,10 @@ def legs_of(
             key = (*alike, *arrived, beyond) if end.curved else alike
             log.add(key, f"{start.name} to {end.name}", end, course)
         log.circle(end, there, there - here)
+    if len(path) == 1 and not log.legs:
+        raise MissionFileError(
+            "the mission has one place and no home, so no way between places: set its home"
+        )
     if not log.legs:
         raise MissionFileError("the mission goes nowhere: its places lie on one another")
     return tuple(log.legs)

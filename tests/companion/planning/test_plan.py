@@ -231,6 +231,11 @@ def test_missions_that_cannot_be_placed_are_named(tmp_path, cache):
     spot = plan_file(tmp_path / "s.plan", cache, waypoint(cache, 0, 0, 50))
     with pytest.raises(MissionFileError, match="goes nowhere"):
         legs_of(read_mission(spot), cache, ground, GIMBAL, 25.0)
+    nowhere = json.loads(spot.read_text())
+    nowhere["mission"]["plannedHomePosition"] = [0, 0, 0]
+    spot.write_text(json.dumps(nowhere))
+    with pytest.raises(MissionFileError, match="one place and no home"):
+        legs_of(read_mission(spot), cache, ground, GIMBAL, 25.0)
     local = plan_file(tmp_path / "l.plan", cache, waypoint(cache, 0, 0, 50, frame=1))
     with pytest.raises(MissionFileError, match="frame 1"):
         read_mission(local)
