@@ -235,6 +235,9 @@ class CompanionConfig(_Model):
         pattern=r"^[0-9a-fA-F]{64}$",
         description="hash of the map's manifest (`companion map verify`); null: any map",
     )
+    map_max_age_days: int = Field(
+        730, ge=1, le=36500, description="age of the imagery beyond which preflight checks warn"
+    )
     camera: FeedConfig
     localizer: LocalizerConfig = LocalizerConfig()
     bridge: BridgeConfig = BridgeConfig()

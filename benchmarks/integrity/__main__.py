@@ -2,7 +2,7 @@
 
     python -m benchmarks.integrity FOLDER [--sets generated quito ...] [--minutes 10]
     python -m benchmarks.integrity FOLDER --without SEEN
-    python -m benchmarks.integrity FOLDER --again
+    python -m benchmarks.integrity FOLDER --fit localizer/integrity/probability.json
     python -m benchmarks.integrity FOLDER --report [--json out.json] [--plot out.png]
 
 FOLDER keeps worlds, maps, views and one file of outcomes a set (`integrity/SET.jsonl`); a run goes
@@ -13,10 +13,10 @@ and every prior tells its own error, so that the gate against the prior is as wi
 false accept is a wrong beginning that ends accepted and more than 3 m or 3 degrees off (beside it:
 more than 10 m). The set "tuning" is for choosing thresholds and in no figure of the report. On
 "shifted" a result counts by the place that the map's picture shows: no single picture tells that a
-map is shifted. --again brings outcomes of an older version up to date: what its tests accepted is
-registered once more, has to end where it did, and gets what is tested since; what they refused no
-further test lets in. --without: the views that another folder has outcomes of are left out, so that
-a limit that was chosen on those is held against others. The set "unseen" is run where it is named.
+map is shifted. --fit: the probability of `localizer.integrity.probability` is fitted to the
+outcomes of all sets but "shifted"; each set is also judged by a fit without its kind. --without:
+the views that another folder has outcomes of are left out, so that a limit that was chosen on those
+is held against others. The set "unseen" is run where it is named.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from benchmarks.common.deadline import deadline
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
+    from benchmarks.integrity.fit import fit, fit_table
     from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
     from benchmarks.integrity.report import by_condition, plot, rows, table
-    from benchmarks.integrity.run import StartOutcome, again, read, run_set, turn
+    from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
 _USUAL = [name for name in SETS if name != UNSEEN]
@@ -46,7 +47,7 @@ def parser() -> Parser:
     p.add_argument("--sets", nargs="+", choices=list(SETS), default=_USUAL, help="to run")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--minutes", type=number(0.1, 1e4), default=10.0, help="until it pauses")
-    p.add_argument("--restart", action="store_true", help="bring older outcomes up to date")
+    p.add_argument("--fit", type=output, help="probability.json from the outcomes that are there")
     p.add_argument("--without", type=existing, help="folder whose outcomes' views are left out")
     p.add_argument("--report", action="store_true", help="tables of what is there; no run")
     p.add_argument("--json", type=output, help="the report's rows")
@@ -58,7 +59,7 @@ def main() -> None:
     args = parser().parse_args()
     home = args.folder / "integrity"
     home.mkdir(parents=True, exist_ok=True)
-    if not args.report:
+    if not (args.report or args.fit):
         more_time = deadline(args.minutes)
         wanted = args.sets if args.sets == [TUNING] else list(dict.fromkeys(_USUAL + args.sets))
         views = {n: load_set(n, args.folder, args.data, SETS[n]) for n in wanted}
@@ -69,17 +70,19 @@ def main() -> None:
                 # Thresholds were chosen on the tuning set's map: no other set sees it, nor it them.
                 kept = [] if name == TUNING else [v for n in usual for v in views[n]]
                 mine = name, views[name], kept, home / f"{name}.jsonl", turn(more_time, _TURN)
-                if args.again:
-                    left[name] = again(*mine)
-                else:
-                    seen = args.without and args.without / "integrity" / f"{name}.jsonl"
-                    left[name] = run_set(*mine, seen)
+                seen = args.without and args.without / "integrity" / f"{name}.jsonl"
+                left[name] = run_set(*mine, seen)
                 print(f"{name}: {left[name]} of {len(views[name])} views left", flush=True)
         return
     outcomes: list[StartOutcome] = []
     for name in (n for n in args.sets if n != TUNING or args.sets == [TUNING]):
         if (home / f"{name}.jsonl").exists():
             outcomes += read(home / f"{name}.jsonl")
+    if args.fit:
+        fitted = fit(outcomes)
+        args.fit.write_text(json.dumps(fitted, indent=2) + "\n")
+        print(fit_table(fitted))
+        return
     config = IntegrityConfig()
     made = rows(outcomes, config)
     print(table(made))

@@ -4,6 +4,7 @@
 forest (few photographs of crowns, turned and mirrored, over and over), water (nothing but waves,
 others in the query), roofs (one house on equal lots), "outdated" (portugal, of which three squares
 in ten show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
+"fengyuan" and "neon" are real photos over maps of another date (`benchmarks.real.sets`).
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ import rasterio
 from rasterio.transform import Affine, from_origin
 
 from benchmarks.basin.views import (
+    SIZE,
     VIEWS_PER_WORLD,
     BasinView,
     load_kept,
     load_views,
     store_renders,
 )
+from benchmarks.real.sets import load
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.importers.rules import ImportRules
@@ -33,7 +36,7 @@ TUNING = "tuning"  # thresholds may be chosen on it, figures are those of the ot
 UNSEEN = "unseen"  # two more worlds, made and run only when asked for: nobody has seen them before
 SETS = {
     TUNING: 40, "generated": 40, "quito": 40, "portugal": 40, "caliterra": 50, "outdated": 30,
-    "shifted": 20, "forest": 30, "water": 15, "roofs": 30, UNSEEN: 80,
+    "shifted": 20, "forest": 30, "water": 15, "roofs": 30, "fengyuan": 32, "neon": 32, UNSEEN: 80,
 }  # fmt: skip
 _CHANGED, _CHANGE_M = 0.3, 24.0  # share of an outdated map that has changed, side of a change
 SHIFT_M = (4.0, -3.0)  # of the orthophoto, east and north
@@ -55,6 +58,8 @@ def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]
     if name in ("quito", "portugal", "caliterra"):
         views = load_views(name, folder, data, count)
         return (views * -(-count // len(views)))[:count]
+    if name in ("fengyuan", "neon"):
+        return [view.at_width(SIZE[0]) for view in load(name, folder, data)[:count]]
     if not (home / "views.npz").exists():
         home.mkdir(parents=True, exist_ok=True)
         {"outdated": _outdated, "shifted": _shifted}.get(name, _made)(home, folder, data, count)

@@ -18,11 +18,12 @@ from localizer.errors import SequenceError
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.geometry.camera import Camera
-from localizer.integrity.acceptance import IntegrityConfig
+from localizer.geometry.pose import Pose, so3_log
 from localizer.integrity.probability import evidence, place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration
+from localizer.registration.agreement import PatchDisplacements
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.motion import mahalanobis_squared, place_sigma_m
 from localizer.tracking.pipeline import reference_anchors
@@ -31,14 +32,14 @@ from localizer.types import Anchors, FeaturePyramid, RegistrationStatus
 _LEAST_MAP = 0.1  # of a reference view, as in flight: with less there is no registration
 _BYTES = 96 * 2**20  # of a map's resident tiles
 _PLACES = 48  # at which views of other places are tried
-_SAME_M = 0.01
 _FAR_M = 1e6  # error where the place is not on the map
 
 
 @dataclass(frozen=True)
 class StartOutcome:
     """One registration. metres, degrees: its error, and off_map_m: against the picture of a map
-    whose picture is shifted; sigma_m: the largest of its position; gate: squared Mahalanobis
+    whose picture is shifted; ground_m: by which its patches lie beside the true ground, root mean
+    square; sigma_m: the largest of its position; gate: squared Mahalanobis
     distance from the prior, prior_sigma_m: of its horizontal place; the rest as `Registration` has
     it.
     """
@@ -53,6 +54,7 @@ class StartOutcome:
     metres: float = _FAR_M
     degrees: float = 180.0
     off_map_m: float = _FAR_M
+    ground_m: float = _FAR_M
     overlap: float = 0.0
     quality: float = 0.0
     sigma_m: float = 1e3
@@ -112,21 +114,6 @@ class MapRegistrar:
             if found is not None:
                 yield _outcome(name, view, index, begun, found, shift)
 
-    def repeated(
-        self, name: str, view: BasinView, index: int, begun: RegistrationStart,
-        shift: tuple[float, float], kept: StartOutcome,
-    ) -> StartOutcome:  # fmt: skip
-        """The outcome of one beginning once more; it has to be the one that is kept."""
-        found = self._register(self._extractor.extract(view.query), begun, index)
-        if found is not None:
-            fresh = _outcome(name, view, index, begun, found, shift)
-            if abs(fresh.metres - kept.metres) < _SAME_M:
-                return fresh
-        raise SequenceError(
-            f"{name}, view {index}, {begun.kind}: not {kept.metres:.3f} m off as it was: the "
-            "registration or the views changed since: begin anew"
-        )
-
     def _register(
         self, query: FeaturePyramid, begun: RegistrationStart, index: int
     ) -> Registration | None:
@@ -168,19 +155,22 @@ def _outcome(
     )  # fmt: skip
     if not head.ok:
         return head
-    metres, degrees, off_map = _FAR_M, 180.0, _FAR_M
+    metres, degrees, off_map, ground = _FAR_M, 180.0, _FAR_M, _FAR_M
     pose, truth = found.world_from_camera, view.truth
     if begun.has_truth:
         metres, degrees = pose.distance_to(truth)
         off_map = float(np.linalg.norm(pose.translation - truth.translation - [*shift, 0.0]))
     votes = found.agreement
     if votes is None:
-        raise SequenceError("the registration did not say how the image's parts voted")
+        raise SequenceError("the registration did not say how the image's patches agree")
+    if begun.has_truth and votes.displacements is not None:
+        ground = ground_error_m(votes.displacements, pose, truth)
     return replace(
         head,
         metres=metres,
         degrees=degrees,
         off_map_m=off_map,
+        ground_m=ground,
         overlap=found.overlap,
         quality=found.quality,
         sigma_m=float(np.sqrt(found.covariance.diagonal()[:3].max())),
@@ -192,6 +182,18 @@ def _outcome(
         focal_gain=max(found.focal_gain, -1.0),
         prior_sigma_m=place_sigma_m(begun.prior),
     )
+
+
+def ground_error_m(patches: PatchDisplacements, pose: Pose, truth: Pose) -> float:
+    """How far a pose shows the ground of its patches beside where it is, root mean square, m. A
+    tilt and a shift that cancel on the ground count little. To first order.
+    """
+    if len(patches.shift) == 0:
+        return _FAR_M
+    turn = so3_log(pose.rotation @ truth.rotation.T)
+    pixels = patches.motion @ np.concatenate([pose.translation - truth.translation, turn])
+    per_metre = np.linalg.norm(patches.motion[:, :, :2], axis=(1, 2)).mean() / np.sqrt(2.0)
+    return float(np.sqrt((pixels**2).sum(axis=1).mean()) / per_metre)
 
 
 def run_set(
@@ -224,44 +226,6 @@ def run_set(
     return len(left)
 
 
-def again(
-    name: str,
-    views: Sequence[BasinView],
-    everywhere: Sequence[BasinView],
-    path: Path,
-    more_time: Callable[[], bool],
-) -> int:
-    """Bring a file of an older version up to date; how many views are left.
-
-    What the parts' votes accept is registered once more, with what was not tested then; what they
-    refuse no further test lets in. SequenceError where an answer is not the one that is kept.
-    """
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    old = list(dict.fromkeys(r["view"] for r in rows if "focal_gain" not in r))
-    places, shift, config = places_of(everywhere), shift_of(name), IntegrityConfig()
-    with MapRegistrar(LocalizerConfig()) as registrar:
-        while old and more_time():
-            k = old.pop(0)
-            here, others = _around(views, k, places)
-            mine = iter([r for r in rows if r["view"] == k])
-            row, fresh = next(mine, None), []
-            for begun in beginnings(views[k], k, here, others):
-                if row is None or _start(begun) != (row["kind"], row["start_m"], row["start_deg"]):
-                    continue  # it did not meet the map
-                kept = StartOutcome(**row, prior_sigma_m=place_sigma_m(begun.prior))
-                if evidence_accepts(kept, config):
-                    kept = registrar.repeated(name, views[k], k, begun, shift, kept)
-                fresh.append(asdict(kept))
-                row = next(mine, None)
-            if row is not None:
-                raise SequenceError(f"{path}: view {k} does not begin as it did: begin anew")
-            at = next(i for i, r in enumerate(rows) if r["view"] == k)
-            rows = [r for r in rows if r["view"] != k]
-            rows[at:at] = fresh
-            path.write_text("".join(json.dumps(r) + "\n" for r in rows))
-    return len(old)
-
-
 def unseen(views: Sequence[BasinView], seen: Path | None) -> list[int]:
     """The numbers of the views that another run's outcomes do not have, each picture once."""
     if seen is None:
@@ -269,13 +233,6 @@ def unseen(views: Sequence[BasinView], seen: Path | None) -> list[int]:
     known = {id(views[o.view]) for o in read(seen)} if seen.exists() else set()
     first = {id(view): k for k, view in reversed(list(enumerate(views)))}
     return [k for k, view in enumerate(views) if id(view) not in known and first[id(view)] == k]
-
-
-def evidence_accepts(outcome: StartOutcome, config: IntegrityConfig) -> bool:
-    """Whether it passes all tests but those for another focal length and a wide prior."""
-    o, c = outcome, config
-    good = o.ok and o.overlap >= c.min_overlap and o.gate <= c.chi2_threshold
-    return good and o.log_odds >= c.min_log_odds
 
 
 def places_of(everywhere: Sequence[BasinView]) -> list[BasinView]:
@@ -290,10 +247,6 @@ def _around(
     """The views of a view's own map, and those of other places."""
     own, at = views[k].map_cache, place_of(views[k])
     return [v for v in views if v.map_cache == own], [v for v in places if place_of(v) != at]
-
-
-def _start(begun: RegistrationStart) -> tuple[str, float, float]:
-    return begun.kind, begun.start_m, begun.start_deg
 
 
 def read(path: Path) -> list[StartOutcome]:

@@ -25,6 +25,7 @@ from companion.trajectory import stamped, write_trajectory
 from companion.versions import made_by
 from companion.writing import made_folder, writing
 from localizer.config import LocalizerConfig
+from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.evaluation.places import KnownOfPlace, PlaceFinder
 from localizer.evaluation.sequences import (
@@ -73,6 +74,14 @@ def evaluate_command(
     noise_deg: Annotated[
         float, typer.Option(min=0, max=180, help="prior noise up to, degrees")
     ] = 10.0,
+    attitude_sigma_deg: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=45, help="roll and pitch are reported so well (drawn), degrees"),
+    ] = None,
+    height_sigma_m: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1000, help="the height is reported so well (drawn), m"),
+    ] = None,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     renderer: Annotated[
         RendererName, typer.Option(help="auto: a GPU if there is one, otherwise numba")
@@ -92,8 +101,11 @@ def evaluate_command(
         raise ConfigError("--known-heading goes with --prior lost or none")
     _prepare(report)
     mode: PriorMode = "each" if prior == "each" else "first"
-    config = LocalizerConfig(
-        width=width, model=model, seed=seed, renderer=renderer, device=device, feature_threads=2
+    sensors = DrawnSensors(attitude_sigma_deg, height_sigma_m, prior == "each", seed)
+    config = sensors.config(
+        LocalizerConfig(
+            width=width, model=model, seed=seed, renderer=renderer, device=device, feature_threads=2
+        )
     )
     counting = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
     with ExitStack() as progress:
@@ -102,13 +114,22 @@ def evaluate_command(
         try:
             data = load_sequence(sequence, stack.cache.frame, name)
             data = data if limit is None else data.first(limit)
-            localizer = build_localizer(stack, data.camera, config)
-            known = KnownOfPlace(prior == "lost", known_heading, seed=seed) if searched else None
+            if not data.is_timed and prior != "each":
+                Console(stderr=True).print(
+                    f"{sequence}: no timestamps.txt, 30 frames/s assumed", style="yellow"
+                )
+            localizer = build_localizer(stack, data.camera, config, sensors.auxiliary(data))
+            known = None
+            if searched:
+                known = KnownOfPlace(
+                    prior == "lost", known_heading, attitude_sigma_deg or 0.7,
+                    height_sigma_m or 2.0, seed,
+                )  # fmt: skip
             with place_finder(stack, config, known) as find:
                 frames, metrics = evaluate(
                     localizer,
                     data,
-                    Perturbation(noise_m, noise_deg, seed),
+                    Perturbation(noise_m, noise_deg, seed, sensors.in_prior),
                     mode,
                     progress=tally(show, len(data.images)),
                     find=find,
@@ -117,7 +138,9 @@ def evaluate_command(
             settings = {
                 "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
                 "known_heading": known_heading,
-                "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
+                "noise_m": noise_m, "noise_deg": noise_deg,
+                "attitude_sigma_deg": attitude_sigma_deg, "height_sigma_m": height_sigma_m,
+                "width": localizer.camera.width,
                 "height": localizer.camera.height, "features": load_extractor(model).name,
                 "renderer": stack.renderer.name, "optimizer": localizer.optimizer_name,
             }  # fmt: skip

@@ -33,6 +33,7 @@ FindPlace = Callable[[Frame, Pose, int], PosePrior | None]
 
 # Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
 _FRAME_INTERVAL_NS = 33_333_333
+_TIMESTAMPS = "timestamps.txt"
 
 CSV_COLUMNS = (
     "name", "latitude_deg", "longitude_deg", "height_m", "translation_error_m",
@@ -42,12 +43,15 @@ CSV_COLUMNS = (
 
 @dataclass(frozen=True)
 class Sequence:
-    """A recorded sequence: image paths in order, and the true pose of each."""
+    """A recorded sequence: image paths in order, and the true pose of each. is_timed: whether the
+    exposure times were given; else 30 frames a second are assumed.
+    """
 
     images: tuple[Path, ...]
     times_ns: tuple[int, ...]
     truth: tuple[Pose, ...]
     camera: Camera
+    is_timed: bool = True
 
     def frame(self, index: int) -> Frame:
         """Decode one frame."""
@@ -92,11 +96,14 @@ class EvaluatedFrame:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """How far a prior is from the truth: up to so many metres and degrees, seeded."""
+    """How far a prior is from the truth: up to so many metres and degrees, seeded. reported: puts
+    into it what other sensors report at a frame (`DrawnSensors.in_prior`).
+    """
 
     translation_m: float = 10.0
     rotation_deg: float = 10.0
     seed: int = 0
+    reported: Callable[[PosePrior, Pose, int], PosePrior] = lambda prior, _truth, _index: prior
 
     def prior(self, truth: Pose, index: int, time_ns: int) -> PosePrior:
         """The truth moved along and turned about random axes by uniform amounts."""
@@ -107,7 +114,8 @@ class Perturbation:
         # A vector of uniform length up to a in a random direction has variance a²/9 per axis;
         # half the bound keeps the bound itself within two sigma.
         sigma = np.repeat([self.translation_m / 2, np.radians(self.rotation_deg) / 2], 3)
-        return PosePrior(pose, np.diag(np.maximum(sigma, 1e-3) ** 2), time_ns)
+        prior = PosePrior(pose, np.diag(np.maximum(sigma, 1e-3) ** 2), time_ns)
+        return self.reported(prior, truth, index)
 
 
 def _random_vector(rng: np.random.Generator, limit: float) -> Array:
@@ -130,14 +138,15 @@ def load_sequence(path: Path, frame: LocalFrame, name: str | None = None) -> Seq
             f"first {missing[0]}"
         )
     truth = tuple(world_from_camera(row, frame) for row in rows)
-    return Sequence(paths, _times(images, paths), truth, Camera.from_json(camera))
+    times = _times(images / _TIMESTAMPS, paths)
+    assumed = tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
+    return Sequence(paths, times or assumed, truth, Camera.from_json(camera), times is not None)
 
 
-def _times(images: Path, paths: tuple[Path, ...]) -> tuple[int, ...]:
-    """Exposure times from ``timestamps.txt`` (name and ns per line); else 30 frames a second."""
-    file = images / "timestamps.txt"
+def _times(file: Path, paths: tuple[Path, ...]) -> tuple[int, ...] | None:
+    """Exposure times from ``timestamps.txt`` (name and ns per line); None without the file."""
     if not file.is_file():
-        return tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
+        return None
     try:
         stamps = {
             name: int(time_ns)

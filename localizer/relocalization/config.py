@@ -35,22 +35,4 @@ class RelocalizationConfig(BaseModel):
     passes: int = Field(
         3, ge=1, le=10, description="renderings of a candidate, each from the last pose"
     )
-    min_quality: float = Field(0.2, ge=0, le=1, description="registration quality of an answer")
-    min_patch_inlier_ratio: float = Field(
-        0.6, ge=0, le=1, description="share of the patches that agree on an answer"
-    )
-    max_focal_gain: float = Field(
-        0.01, ge=0, le=1, description="largest gain of another focal length"
-    )
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the anchors in view")
-    max_sigma_m: float = Field(4.0, ge=0.01, le=100, description="position sigma of an answer")
-    tilt_gate_deg: float = Field(
-        2.0, ge=0.1, le=90, description="added to three sigmas of roll and pitch"
-    )
-    height_gate_m: float = Field(
-        4.0, ge=0.1, le=1000, description="added to three sigmas of height"
-    )
-    decisive_agreement: float = Field(0.8, ge=0, le=1, description="agreement that ends the search")
-    margin: float = Field(
-        0.05, ge=0, le=1, description="quality lead over every other credible position"
-    )

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from localizer.registration.result import Registration, failure
+from localizer.integrity.probability import log_odds
+from localizer.registration.result import failure
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
-from localizer.relocalization.verdict import NEARLY, SAME_PLACE_M, VerifiedCandidate, is_decisive
+from localizer.relocalization.verdict import NEARLY, SAME_PLACE_M, VerifiedCandidate
 from localizer.relocalization.verify import Aligned, QueryFeatures, Verifier
+from localizer.tracking.sensor_fusion import FusedRegistration
 from localizer.types import PosePrior, RegistrationStatus
 
 _ROUNDS = (3, 24)  # candidates screened before the best are registered; then all
@@ -63,7 +65,7 @@ class Confirmation:
             self._finish()
             order = self._order()
             # Only now: the last pass may leave a place in doubt that was decisive before.
-            if order and order[0].credible and not is_decisive(order[0], self.config):
+            if order and order[0].credible and not order[0].is_decisive:
                 self._screen(min(len(self.candidates), _ROUNDS[-1]))
                 self._settle_alike(order[0])
                 self._finish()
@@ -110,7 +112,8 @@ class Confirmation:
         for other, done in self.judged.items():
             metres, degrees = self._apart(rank, other)
             if other not in self.surrounded and max(metres, degrees) <= _SAME_START:
-                self.judged[rank] = self._judged(rank, done.prior, done.result)
+                candidate = self.candidates[rank]
+                self.judged[rank] = replace(done, rank=rank, candidate=candidate)
                 if other in self.finished:
                     self.finished.add(rank)
                 return
@@ -126,9 +129,11 @@ class Confirmation:
             self._go_on()
             self.surrounded.add(rank)
             begun = self.judged[rank]
-            result = self.verifier.around(self.sight, begun.prior, self.query)
-            if result.quality > begun.result.quality:
-                self.judged[rank] = self._judged(rank, begun.prior, result)
+            better = self._judged(
+                rank, begun.prior, self.verifier.around(self.sight, begun.prior, self.query)
+            )
+            if better.log_odds > begun.log_odds:
+                self.judged[rank] = better
 
     def _settle_alike(self, best: VerifiedCandidate) -> None:
         """The others whose ground looks nearly as much like the frame, so that it is known whether
@@ -142,7 +147,7 @@ class Confirmation:
                 self._register(rank)
             elif rank not in self.judged:
                 none = failure(place.prior, RegistrationStatus.NOT_TRIED)
-                self.judged[rank] = self._judged(rank, place.prior, none)
+                self.judged[rank] = self._judged(rank, place.prior, FusedRegistration(none))
 
     def _finish(self) -> None:
         """The further passes of the best, each once."""
@@ -166,7 +171,7 @@ class Confirmation:
         return j
 
     def _order(self) -> list[VerifiedCandidate]:
-        return sorted(self.judged.values(), key=lambda j: (-int(j.credible), -j.result.quality))
+        return sorted(self.judged.values(), key=lambda j: (-int(j.credible), -j.log_odds))
 
     def _is_any_credible(self) -> bool:
         return any(j.credible for j in self.judged.values())
@@ -191,12 +196,12 @@ class Confirmation:
         return False
 
     def _decisive(self) -> list[VerifiedCandidate]:
-        return [j for j in self.judged.values() if is_decisive(j, self.config)]
+        return [j for j in self.judged.values() if j.is_decisive]
 
-    def _judged(self, rank: int, prior: PosePrior, result: Registration) -> VerifiedCandidate:
-        candidate = self.candidates[rank]
-        credible = self.verifier.is_credible(result, candidate, self.query)
-        return VerifiedCandidate(candidate, rank, result, prior, credible)
+    def _judged(self, rank: int, prior: PosePrior, found: FusedRegistration) -> VerifiedCandidate:
+        candidate, result = self.candidates[rank], found.registration
+        credible = self.verifier.is_credible(found, candidate, self.query)
+        return VerifiedCandidate(candidate, rank, result, prior, log_odds(result), credible)
 
     def _apart(self, a: int, b: int) -> tuple[float, float]:
         """Two screened places, metres and degrees."""

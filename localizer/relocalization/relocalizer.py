@@ -16,8 +16,10 @@ from localizer.config import LocalizerConfig
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.geometry.camera import Camera
+from localizer.integrity.height_error import MapHeightError
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.inspection.kind import map_kind
 from localizer.registration.jngo import JNGO
 from localizer.relocalization.align import FrameShift
 from localizer.relocalization.confirm import Confirmation, compared
@@ -44,7 +46,8 @@ class Relocalizer:
     """Finds a camera on a map from one frame. One thread uses it at a time.
 
     extractor: the network without the detail level. Everything that is handed in stays the
-    caller's; the renderer must be no other thread's.
+    caller's; the renderer must be no other thread's. height_sigma_m: spread of the heights that
+    the map does not have.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class Relocalizer:
         optimizer: JNGO,
         overview: MapOverview,
         config: LocalizerConfig,
+        height_sigma_m: float = 0.0,
     ) -> None:
         self.overview = overview
         self.extractor = extractor
@@ -61,8 +65,9 @@ class Relocalizer:
         self._width = config.width
         self._detail = DetailExtractor(extractor)
         self._verifier = Verifier(
-            renderer, self._detail, extractor, optimizer, self._config, config.anchors, config.seed
-        )
+            renderer, self._detail, extractor, optimizer, self._config, config.integrity,
+            height_sigma_m, config.anchors, config.seed,
+        )  # fmt: skip
         budget = self._config.spectra_mib * 2**20
         self._correlators = tuple(LevelCorrelator(x, budget) for x in overview.levels)
         for correlator in self._correlators:
@@ -96,7 +101,7 @@ class Relocalizer:
         stages = {"confirm": time.perf_counter() - began}
         if not judged:
             return None
-        return answer(query, compared(candidates, judged), judged, self._config, stages)
+        return answer(query, compared(candidates, judged), judged, stages)
 
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
@@ -199,7 +204,10 @@ def open_relocalizer(
             # Its places are laid over the map's picture first, so that the swarm reaches them.
             registration = replace(config.registration, preselected=0)
             optimizer = JNGO(registration, "numba", c.threads)
-            relocalizer = Relocalizer(renderer, extractor, optimizer, overview, config)
+            height_sigma_m = MapHeightError.of_kind(map_kind(cache)).sigma_m
+            relocalizer = Relocalizer(
+                renderer, extractor, optimizer, overview, config, height_sigma_m
+            )
             return OpenRelocalizer(relocalizer, streamer, renderer)
     except BaseException:
         renderer.close()

@@ -75,7 +75,7 @@ class Relocalization:
 
     covariance: (6, 6) as `PosePrior`'s. quality, overlap: of the registration; score: correlation
     of the candidate it came from, runner_up: of the best candidate elsewhere; rank: of the
-    candidate, from 0; rival_quality: of the best credible registration elsewhere, 0 without;
+    candidate, from 0; rival_quality: of the best registration elsewhere, 0 without;
     stage_s: seconds by stage.
     """
 

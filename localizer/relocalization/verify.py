@@ -9,25 +9,33 @@ import numpy as np
 from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_log
+from localizer.integrity.acceptance import IntegrityConfig
+from localizer.integrity.probability import log_odds
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
     PoseConstraint,
     attitude_constraint,
-    combine,
     height_constraint,
 )
 from localizer.registration.result import Registration, failure
 from localizer.relocalization.align import FrameShift, moved
 from localizer.relocalization.config import RelocalizationConfig
+from localizer.relocalization.patch import turned
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
+from localizer.tracking.sensor_fusion import (
+    FusedRegistration,
+    fused_registration,
+    with_map_error,
+)
 from localizer.types import FeaturePyramid, PosePrior, RegistrationStatus, RenderedView
 
 _PLACE_SIGMA_M = 5.0  # of a candidate: some cells, and houses that lean
 _HEADING_SIGMA_RAD = np.radians(5.0)  # half a step of the headings tried
 _LEAST_TILT_SIGMA_RAD = np.radians(0.3)
+_LEAST_HEIGHT_SIGMA_M = 0.3
 _FARTHEST_M = 60.0  # of an answer from its candidate: a registration that ran so far ran away
 _MIN_MAP_SHARE = 0.1  # of the view
 _ALIGNMENTS = 1  # after the one at half the size, from nearly the right side of the houses
@@ -75,7 +83,8 @@ class QueryFeatures:
 class Verifier:
     """Renders the map at a candidate and registers the frame to it.
 
-    extractor: with the detail level, as the tracker's; coarse: without.
+    extractor: with the detail level, as the tracker's; coarse: without. height_sigma_m: spread of
+    the heights that the map does not have.
     """
 
     renderer: MapRenderer
@@ -83,6 +92,8 @@ class Verifier:
     coarse: FeatureExtractor
     optimizer: JNGO
     config: RelocalizationConfig
+    integrity: IntegrityConfig
+    height_sigma_m: float
     anchors: int
     seed: int
 
@@ -117,7 +128,7 @@ class Verifier:
 
     def from_place(
         self, sight: QueryFeatures, place: Aligned, query: PlaceQuery
-    ) -> tuple[PosePrior, Registration]:
+    ) -> tuple[PosePrior, FusedRegistration]:
         """A screened place aligned once more, at full size, and registered from there."""
         prior = place.prior
         reference = self.reference(prior, sight.camera)
@@ -132,16 +143,18 @@ class Verifier:
             reference = self.reference(prior, sight.camera)
         return prior, self.register(sight, prior, query, reference)
 
-    def around(self, sight: QueryFeatures, prior: PosePrior, query: PlaceQuery) -> Registration:
+    def around(
+        self, sight: QueryFeatures, prior: PosePrior, query: PlaceQuery
+    ) -> FusedRegistration:
         """The best of registrations that begin to all sides of an aligned place."""
         reference = self.reference(prior, sight.camera)
         if reference is None:
-            return failure(prior, RegistrationStatus.NO_OVERLAP)
+            return FusedRegistration(failure(prior, RegistrationStatus.NO_OVERLAP))
         above = prior.world_from_camera.translation[2] - reference.ground_m
         reach = _AROUND * float(np.clip(above, *_AROUND_HEIGHTS_M))
         starts = [shifted(prior, reach * np.array(side)) for side in _SIDES]
         found = [self.register(sight, start, query, reference) for start in starts]
-        return max(found, key=lambda result: result.quality)
+        return max(found, key=lambda each: log_odds(each.registration))
 
     def register(
         self,
@@ -149,73 +162,57 @@ class Verifier:
         prior: PosePrior,
         query: PlaceQuery,
         reference: RenderedReference | None = None,
-    ) -> Registration:
-        """One pass: the frame registered to the view at the prior's pose, rendered if not given;
-        another focal length is tried where the result is good.
+    ) -> FusedRegistration:
+        """One pass: the frame registered to the view at the prior's pose, rendered if not given,
+        with what attitude and height know of it; another focal length is tried where the result is
+        good.
         """
         reference = reference or self.reference(prior, sight.camera)
         if reference is None:
-            return failure(prior, RegistrationStatus.NO_OVERLAP)
+            return FusedRegistration(failure(prior, RegistrationStatus.NO_OVERLAP))
         anchors = select_anchors(reference.view, reference.features, self.anchors, self.seed)
-        constraint = self._constraint(prior.world_from_camera, query)
-        found = self.optimizer.register(
-            sight.features, sight.camera, anchors, prior, constraint=constraint, seed=self.seed
+        image = self.optimizer.register(
+            sight.features, sight.camera, anchors, prior, seed=self.seed
         )
-        if not self.is_good(found):
-            return found
-        return self.optimizer.focal_tested(sight.features, sight.camera, anchors, found)
+        if log_odds(image) >= self.integrity.min_log_odds:
+            image = self.optimizer.focal_tested(sight.features, sight.camera, anchors, image)
+        known = _constraints(image.world_from_camera, query)
+        return fused_registration(with_map_error(image, self.height_sigma_m), known)
 
     def again(self, prior: PosePrior, result: Registration) -> PosePrior:
         """The prior of the next pass: the same image is no new evidence, sigma only halves."""
         return PosePrior(result.world_from_camera, prior.covariance / 4, prior.time_ns)
 
     def is_credible(
-        self, result: Registration, candidate: PlaceCandidate, query: PlaceQuery
+        self, found: FusedRegistration, candidate: PlaceCandidate, query: PlaceQuery
     ) -> bool:
-        """Whether a registration is good in itself and agrees with the other sensors."""
-        if not self.is_good(result) or result.focal_gain > self.config.max_focal_gain:
+        """Whether a registration shows a place by its image, where the candidate was, and neither
+        attitude nor height nor the heading speaks against it.
+        """
+        result = found.registration
+        if found.contradicted or result.overlap < self.config.min_overlap:
             return False
-        return self.agrees(result.world_from_camera, candidate, query)
-
-    def is_good(self, result: Registration) -> bool:
-        """Whether a registration is good in itself, as far as one focal length tells."""
-        c = self.config
-        if result.status is not RegistrationStatus.OK:
+        if result.focal_gain > self.integrity.max_focal_gain:
             return False
-        if result.overlap < c.min_overlap or result.quality < c.min_quality:
+        away = result.world_from_camera.translation - candidate.world_from_camera.translation
+        if float(np.linalg.norm(away[:2])) > _FARTHEST_M:
             return False
-        if result.covariance.diagonal()[:3].max() > c.max_sigma_m**2:
-            return False
-        votes = result.agreement  # None on a GPU: the other tests decide
-        return votes is None or votes.share >= c.min_patch_inlier_ratio
-
-    def agrees(self, pose: Pose, candidate: PlaceCandidate, query: PlaceQuery) -> bool:
-        """Whether a pose is where the candidate was, as high and as level as the sensors say."""
-        c = self.config
-        place = candidate.world_from_camera
-        moved = float(np.linalg.norm((pose.translation - place.translation)[:2]))
-        rise = abs(float(pose.translation[2]) - query.height_m)
-        tilt, heading = tilt_and_heading(pose.rotation, query.rotation)
         if query.heading_sigma_rad is not None:
-            limit = c.heading_reach * query.heading_sigma_rad + 3 * _HEADING_SIGMA_RAD
-            if abs(heading) > limit:
+            _, heading = tilt_and_heading(result.world_from_camera.rotation, query.rotation)
+            reach = self.config.heading_reach * query.heading_sigma_rad
+            if abs(heading) > reach + 3 * _HEADING_SIGMA_RAD:
                 return False
-        return (
-            moved <= _FARTHEST_M
-            and rise <= 3 * query.height_sigma_m + c.height_gate_m
-            and tilt <= 3 * query.tilt_sigma_rad + np.radians(c.tilt_gate_deg)
-        )
+        return log_odds(result) >= self.integrity.min_log_odds
 
-    def _constraint(self, pose: Pose, query: PlaceQuery) -> PoseConstraint:
-        """Roll and pitch as the autopilot has them, at the candidate's heading; and the height."""
-        _, heading = tilt_and_heading(pose.rotation, query.rotation)
-        c, s = np.cos(heading), np.sin(heading)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
-        return combine(
-            attitude_constraint(turn @ query.rotation, tilt, np.pi),
-            height_constraint(query.height_m, max(query.height_sigma_m, 0.3)),
-        )
+
+def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseConstraint]:
+    """Roll and pitch as the autopilot has them, at the pose's heading; and the height."""
+    _, heading = tilt_and_heading(pose.rotation, query.rotation)
+    tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
+    return (
+        attitude_constraint(turned(query.rotation, heading), tilt, np.pi),
+        height_constraint(query.height_m, max(query.height_sigma_m, _LEAST_HEIGHT_SIGMA_M)),
+    )
 
 
 def shifted(prior: PosePrior, away: Array) -> PosePrior:

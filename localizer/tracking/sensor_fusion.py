@@ -11,6 +11,7 @@ attitude (`attitude_bias`) and how wrong the map's heights are (`localizer.integ
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +45,41 @@ class FusedRegistration:
     contradicted: bool = False
 
 
+def with_map_error(result: Registration, height_sigma_m: float) -> Registration:
+    """The registration with the covariance that its image's patches and the map's heights give;
+    unchanged where there are no patches. height_sigma_m: of heights that the map does not have.
+    """
+    votes = result.agreement
+    if result.status is not RegistrationStatus.OK or votes is None:
+        return result
+    if votes.displacements is None:
+        return result
+    covariance = patch_covariance(votes.displacements, height_sigma_m)
+    if covariance is None:
+        return replace(result, status=RegistrationStatus.NO_TEXTURE)
+    # The patches' displacements are the map's, alike from frame to frame. A motion filter that
+    # took them for noise of each frame would lag behind the camera.
+    whole = covariance + result.mode_covariance
+    return replace(result, covariance=whole, noise=result.covariance)
+
+
+def fused_registration(
+    result: Registration, constraints: Iterable[PoseConstraint]
+) -> FusedRegistration:
+    """The registration with what other sensors know of its pose, each taken in by itself."""
+    if result.status is not RegistrationStatus.OK:
+        return FusedRegistration(result)
+    pose, covariance, contradicted = result.world_from_camera, result.covariance, False
+    for known in constraints:
+        found = fused(pose, covariance, known)
+        if found.innovation_squared > CONTRADICTS**2:
+            contradicted = True
+            continue
+        pose, covariance = found.world_from_camera, found.covariance
+    together = replace(result, world_from_camera=pose, covariance=covariance)
+    return FusedRegistration(together, contradicted)
+
+
 class SensorFusion:
     """Belongs to the localization thread.
 
@@ -65,35 +101,11 @@ class SensorFusion:
 
     def fuse(self, result: Registration, time_ns: int) -> FusedRegistration:
         """The registration of a frame exposed at `time_ns`, with attitude and height."""
-        result = self.with_map_error(result)
-        if result.status is not RegistrationStatus.OK:
-            return FusedRegistration(result)
-        pose, covariance, contradicted = result.world_from_camera, result.covariance, False
-        for known in self._constraints(result.world_from_camera, time_ns):
-            found = fused(pose, covariance, known)
-            if found.innovation_squared > CONTRADICTS**2:
-                contradicted = True
-                continue
-            pose, covariance = found.world_from_camera, found.covariance
-        together = replace(result, world_from_camera=pose, covariance=covariance)
-        return FusedRegistration(together, contradicted)
+        known = self._constraints(result.world_from_camera, time_ns)
+        return fused_registration(self._with_map_error(result), known)
 
-    def with_map_error(self, result: Registration) -> Registration:
-        """The registration with the covariance that its image's patches and the map's heights
-        give; unchanged where there are no patches.
-        """
-        votes = result.agreement
-        if result.status is not RegistrationStatus.OK or votes is None:
-            return result
-        if votes.displacements is None:
-            return result
-        covariance = patch_covariance(votes.displacements, self.height_error.sigma_m)
-        if covariance is None:
-            return replace(result, status=RegistrationStatus.NO_TEXTURE)
-        # The patches' displacements are the map's, alike from frame to frame. A motion filter that
-        # took them for noise of each frame would lag behind the camera.
-        whole = covariance + result.mode_covariance
-        return replace(result, covariance=whole, noise=result.covariance)
+    def _with_map_error(self, result: Registration) -> Registration:
+        return with_map_error(result, self.height_error.sigma_m)
 
     def learn(
         self, result: Registration, place: Pose, unknown: Array, distance_m: float, time_ns: int
@@ -115,7 +127,7 @@ class SensorFusion:
             )
             if likelihood is not None:
                 self.height_error = self.height_error.after(likelihood)
-        seen = self.with_map_error(result)
+        seen = self._with_map_error(result)
         if seen.status is not RegistrationStatus.OK:
             self.attitude_bias.pass_by(place.translation, time_ns)
             return

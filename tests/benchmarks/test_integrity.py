@@ -10,14 +10,14 @@ import pytest
 
 from benchmarks.basin.views import BasinView
 from benchmarks.common.shares import exact_interval
-from benchmarks.integrity.beginnings import beginnings
+from benchmarks.integrity.fit import fit
 from benchmarks.integrity.report import DISTINCT, FOCAL, LIKELY, OURS, WITHOUT, rows
-from benchmarks.integrity.run import MapRegistrar, StartOutcome, again, read, turn, unseen
-from localizer.errors import SequenceError
+from benchmarks.integrity.run import StartOutcome, read, turn, unseen
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig
 
+HALVES = {"right": 40, "wrong": 40}
 RIGHT = StartOutcome(
     "quito", 0, "day", "near", 3.0, 3.0, True, metres=0.2, degrees=0.1, off_map_m=0.2,
     overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0, lead=1.0,
@@ -79,50 +79,29 @@ def test_a_better_focal_length_and_a_place_that_does_not_stand_out_are_refused_b
     assert (of(outcomes, OURS).lost.hits, of(outcomes, OURS).lost.count) == (0, 1)
 
 
-@pytest.fixture
-def older(tmp_path):
-    """A view and its outcomes as an older version kept them: without the newer tests' figures."""
-    camera = Camera.from_fov(32, 24, 60.0)
-    truth = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
-    view = BasinView(tmp_path / "map", np.zeros((24, 32, 3), np.uint8), truth, camera, "day", 100.0)
-    path, rows = tmp_path / "quito.jsonl", []
-    for begun in beginnings(view, 0, [view], []):
-        kept = RIGHT if begun.kind == "near" else WRONG
-        row = asdict(
-            replace(kept, kind=begun.kind, start_m=begun.start_m, start_deg=begun.start_deg)
-        )
-        rows.append({k: v for k, v in row.items() if k not in ("focal_gain", "prior_sigma_m")})
-    del rows[4]  # one that did not meet the map
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    return view, path, len(rows)
+def drawn(name: str, seed: int) -> list[StartOutcome]:
+    """Outcomes of which the right ones have more quality, votes and lead, with noise."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for k in range(80):
+        base, ground = (RIGHT, 0.5) if k % 2 else (WRONG, 80.0)
+        quality = float(np.clip(base.quality + rng.normal(0, 0.05), 0.02, 1))
+        votes = int(np.clip(base.votes + rng.normal(0, 4), 0, base.parts))
+        made.append(replace(base, set=name, quality=quality, votes=votes, ground_m=ground))
+    return made
 
 
-def test_of_older_outcomes_what_was_accepted_is_registered_again(older, monkeypatch):
-    view, path, count = older
-    repeated = []
-
-    def repeat(self, name, view, index, begun, shift, kept):
-        repeated.append(begun.kind)
-        return replace(kept, focal_gain=-0.03)
-
-    monkeypatch.setattr(MapRegistrar, "repeated", repeat)
-    for _ in range(2):  # the second time nothing is left
-        assert again("quito", [view], [view], path, lambda: True) == 0
-    assert repeated == ["near"] * 3
-    found = read(path)
-    assert len(found) == count
-    assert [o.focal_gain for o in found if o.kind == "near"] == [-0.03] * 3
-    far = next(o for o in found if o.kind == "far")
-    assert far.votes == WRONG.votes
-    assert far.prior_sigma_m == pytest.approx(20 / np.sqrt(2))
-
-
-def test_outcomes_of_other_beginnings_are_named(older, monkeypatch):
-    view, path, _ = older
-    monkeypatch.setattr(MapRegistrar, "repeated", lambda *given: given[-1])
-    path.write_text(path.read_text().replace('"start_m": 200.0', '"start_m": 250.0'))
-    with pytest.raises(SequenceError, match="begin anew"):
-        again("quito", [view], [view], path, lambda: True)
+def test_the_fit_tells_right_from_wrong_on_a_set_that_it_has_not_seen():
+    outcomes = [*drawn("quito", 0), *drawn("forest", 1), *drawn("portugal", 2)]
+    between = [replace(RIGHT, set="quito", ground_m=4.0)] * 9
+    fitted = fit([*outcomes, *between])
+    assert fitted["fitted_on"] == dict.fromkeys(("quito", "forest", "portugal"), HALVES)
+    for judged in fitted["left_out"].values():
+        assert (judged["right_accepted"], judged["wrong_accepted"]) == (1.0, 0)
+    swapped = [replace(o, ground_m=80.0 if o.ground_m < 1 else 0.5) for o in outcomes]
+    assert fit(swapped)["left_out"]["quito"]["right_accepted"] == 1.0  # it follows the labels
+    mixed = [replace(o, ground_m=0.5 if k % 4 < 2 else 80.0) for k, o in enumerate(outcomes)]
+    assert fit(mixed)["left_out"]["quito"]["wrong_accepted"] > 0  # labels that say nothing
 
 
 def test_views_that_another_run_has_seen_are_left_out_and_photos_given_again_are_one(tmp_path):

@@ -347,6 +347,7 @@ def test_no_verdict_is_given_for_what_was_not_judged(tmp_path, cache):
     words = " ".join(done.output.split())
     assert "Not judged: StructureScan (item 5)" in words
     assert "all 3 legs" not in words
+    assert "Imagery: date not known; map_max_age_days is 730." in words
     assert "StructureScan (item 5)" in (out / "plan.html").read_text()
     made = json.loads((out / "plan.json").read_text())
     assert not made["holds"]

@@ -9,6 +9,7 @@ import scipy.fft
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
+from localizer.integrity.acceptance import IntegrityConfig
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.relocalization.align import FrameShift, moved
@@ -20,6 +21,7 @@ from localizer.relocalization.search import ground_of, headings, scales, shared_
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier, tilt_and_heading
 from localizer.render.topview import DOWN
+from localizer.tracking.sensor_fusion import FusedRegistration
 from localizer.types import FeatureLevel, Frame, RegistrationStatus
 
 CAMERA = Camera.from_fov(160, 120, 60.0)
@@ -231,14 +233,19 @@ def test_the_shift_of_an_image_is_found_and_moves_the_camera():
 
 
 @pytest.mark.parametrize(
-    ("votes", "credible"),
-    [(PatchAgreement(60, 54, 6.0), True), (PatchAgreement(60, 20, 4.0), False), (None, True)],
+    ("patches", "contradicted", "credible"),
+    [
+        (PatchAgreement(60, 54, 6.0), False, True),
+        (PatchAgreement(60, 12, 3.0), False, False),
+        (PatchAgreement(60, 54, 6.0), True, False),
+        (None, False, False),
+    ],
 )
-def test_an_answer_needs_the_parts_of_the_image(votes, credible):
-    """Without votes (a GPU) the other tests decide, as before."""
+def test_an_answer_needs_the_image_and_no_sensor_against_it(patches, contradicted, credible):
     pose = Pose(DOWN, np.array([0.0, 0.0, 100.0]))
     found = Registration(
-        pose, 0.01 * np.eye(6), 0.2, 0.9, 0.5, RegistrationStatus.OK, 1, agreement=votes
+        pose, 0.01 * np.eye(6), 0.2, 0.9, 0.5, RegistrationStatus.OK, 1, agreement=patches
     )
-    verifier = Verifier(None, None, None, None, CONFIG, 1000, 0)
-    assert verifier.is_credible(found, PlaceCandidate(pose, 0.4), query()) == credible
+    verifier = Verifier(None, None, None, None, CONFIG, IntegrityConfig(), 0.0, 1000, 0)
+    together = FusedRegistration(found, contradicted)
+    assert verifier.is_credible(together, PlaceCandidate(pose, 0.4), query()) == credible

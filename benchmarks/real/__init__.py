@@ -1,0 +1,1 @@
+"""The product's judgement on real imagery: acceptance, covariance, protection level, search."""

@@ -1,0 +1,115 @@
+"""The product's judgement on real imagery: what it accepts, and how wrong it says that it may be.
+
+    python -m benchmarks.real FOLDER [--sets fengyuan neon ...] [--attitudes 0.3 1 3 none]
+    python -m benchmarks.real FOLDER --search --rivals --json real.json --plot real.png
+
+FOLDER keeps the maps between runs. Each image begins from a prior up to 10 m off; roll, pitch and
+the height (3 m) are reported with the stated sigma, or not at all. A registration is right where
+the middle of its image lies on its true ground. NEES: squared error of the accepted over the told
+covariance and the truth's own, per degree of freedom, the median. --search: each image without a
+prior, heading unknown, on its map and on one that does not hold it. --rivals: SIFT, XFeat and
+ALIKED + LightGlue on the same images, those that are installed.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.arguments import Parser, output, whole
+from benchmarks.common.named_errors import named_errors, needs_torch
+
+with needs_torch():
+    from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
+    from benchmarks.real.report import (
+        attitude_text,
+        judged_row,
+        judged_table,
+        plot,
+        rival_rows,
+        rival_table,
+        searched_row,
+        searched_table,
+    )
+    from benchmarks.real.rivals import load_rivals, rival_images
+    from benchmarks.real.searched import searched_images
+    from benchmarks.real.sets import SETS, describe, load
+from companion.versions import made_by
+
+_RIVALS_AT = 1.0  # degrees of attitude
+_ELSEWHERE = {"caliterra": "fengyuan"}  # whose map holds no place of a set; else caliterra's
+_SEARCHED = ("fengyuan", "caliterra")
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser(__doc__)
+    p.add_argument("folder", type=Path, help="of the maps that are built")
+    p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real data")
+    p.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS), help="to judge")
+    names = {attitude_text(a).rstrip("°"): a for a in ATTITUDES}
+    p.add_argument(
+        "--attitudes",
+        nargs="+",
+        choices=list(names),
+        default=list(names),
+        help="sigma of roll and pitch, degrees",
+    )
+    p.add_argument("--width", type=whole(64, 2048), default=320, help="working width, px")
+    p.add_argument("--search", action="store_true", help="without a prior, too")
+    p.add_argument("--rivals", action="store_true", help="matchers on the same images")
+    p.add_argument("--json", type=output, help="rows and every image")
+    p.add_argument("--plot", type=output, help="PNG: error over protection level")
+    return p
+
+
+def main() -> None:
+    args = parser().parse_args()
+    wanted = [a for a in ATTITUDES if attitude_text(a).rstrip("°") in args.attitudes]
+    views = {name: load(name, args.folder, args.data) for name in args.sets}
+    judged: list[JudgedImage] = []
+    rows: list[dict[str, Any]] = []
+    for name in args.sets:
+        for attitude in wanted:
+            images = list(judged_images(name, describe(name), views[name], attitude, args.width))
+            judged += images
+            rows.append(judged_row(images))
+            print(judged_table(rows[-1:]).splitlines()[-1], flush=True)
+    result: dict[str, Any] = {"settings": {"width": args.width}, "judged": rows}
+    print(judged_table(rows))
+    if args.search:
+        result["searched"] = [
+            searched_row(list(searched_images(name, views[name], _map_of(name, args), args.width)))
+            for name in args.sets
+            if name in _SEARCHED
+        ]
+        print(searched_table(result["searched"]))
+    if args.rivals:
+        rivals, at = load_rivals(), [i for i in judged if i.attitude_deg == _RIVALS_AT]
+        matched = [
+            row
+            for name in args.sets
+            for row in rival_images(
+                name, describe(name), views[name], rivals, _RIVALS_AT, args.width
+            )
+        ]
+        result["rivals"] = rival_rows(matched, at)
+        print(rival_table(result["rivals"]))
+    if args.json:
+        result |= {"images": [asdict(i) for i in judged], "versions": made_by()}
+        args.json.write_text(json.dumps(result, indent=1))
+    if args.plot:
+        plot(judged, args.plot)
+
+
+def _map_of(name: str, args: Any) -> Path:
+    """A map that holds no place of a set."""
+    other = _ELSEWHERE.get(name, "caliterra")
+    return load(other, args.folder, args.data)[0].map_cache
+
+
+if __name__ == "__main__":
+    with named_errors():
+        main()

@@ -1,0 +1,94 @@
+"""Roll, pitch and height as an autopilot would report them: drawn about the truth, seeded.
+
+A recorded sequence with true poses seldom has the autopilot's reports. To see what they add, they
+are drawn with a stated sigma.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localizer.config import LocalizerConfig
+from localizer.evaluation.sequences import Sequence
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.relocalization.patch import turned
+from localizer.tracking.attitude_bias import AttitudePrior
+from localizer.tracking.motion import AuxiliarySensors
+from localizer.types import PosePrior
+
+_LEAST_DEG = 0.05  # of a sigma in `AttitudePrior`
+
+
+@dataclass(frozen=True)
+class DrawnSensors:
+    """tilt_sigma_deg: of roll and pitch, per axis; height_sigma_m: of the height; None: not
+    reported. by_frame: every frame has errors of its own, as photos have; else they are constant,
+    as a gimbal's and a barometer's are over a flight.
+    """
+
+    tilt_sigma_deg: float | None = None
+    height_sigma_m: float | None = None
+    by_frame: bool = False
+    seed: int = 0
+
+    def rotation(self, truth: Pose, index: int) -> Array | None:
+        """(3, 3) world_from_camera as reported at a frame; the heading is the true one."""
+        if self.tilt_sigma_deg is None:
+            return None
+        tilt = self._rng(index).normal(0.0, np.radians(self.tilt_sigma_deg), 2)
+        rotation: Array = so3_exp(np.array([*tilt, 0.0])) @ truth.rotation
+        return rotation
+
+    def height_m(self, truth: Pose, index: int) -> float | None:
+        """World z as reported at a frame."""
+        if self.height_sigma_m is None:
+            return None
+        error = self._rng(index).normal(0.0, 1.0, 3)[2]
+        return float(truth.translation[2] + self.height_sigma_m * error)
+
+    def config(self, config: LocalizerConfig) -> LocalizerConfig:
+        """The settings with these sigmas."""
+        tilt = self.tilt_sigma_deg
+        attitude = None if tilt is None else _attitude_prior(tilt)
+        return config.model_copy(
+            update={"attitude": attitude, "height_sigma_m": self.height_sigma_m}
+        )
+
+    def auxiliary(self, sequence: Sequence) -> AuxiliarySensors:
+        """As a localizer asks for them, by the frames' exposure times."""
+        index = {time_ns: k for k, time_ns in enumerate(sequence.times_ns)}
+
+        def rotation_at(time_ns: int) -> Array | None:
+            k = index.get(time_ns)
+            return None if k is None else self.rotation(sequence.truth[k], k)
+
+        def height_at(time_ns: int) -> float | None:
+            k = index.get(time_ns)
+            return None if k is None else self.height_m(sequence.truth[k], k)
+
+        return AuxiliarySensors(rotation_at=rotation_at, height_at=height_at)
+
+    def in_prior(self, prior: PosePrior, truth: Pose, index: int) -> PosePrior:
+        """A prior with roll, pitch and height as reported; its place and heading stay."""
+        pose, covariance = prior.world_from_camera, prior.covariance.copy()
+        rotation, height_m = self.rotation(truth, index), self.height_m(truth, index)
+        if rotation is not None and self.tilt_sigma_deg is not None:
+            ahead, true_ahead = pose.rotation[:2, 1], truth.rotation[:2, 1]
+            turn = np.arctan2(ahead[1], ahead[0]) - np.arctan2(true_ahead[1], true_ahead[0])
+            pose = Pose(turned(rotation, float(turn)), pose.translation)
+            covariance[3:5, :] = covariance[:, 3:5] = 0.0
+            covariance[3, 3] = covariance[4, 4] = np.radians(self.tilt_sigma_deg) ** 2
+        if height_m is not None and self.height_sigma_m is not None:
+            pose = Pose(pose.rotation, np.array([*pose.translation[:2], height_m]))
+            covariance[2, :] = covariance[:, 2] = 0.0
+            covariance[2, 2] = self.height_sigma_m**2
+        return replace(prior, world_from_camera=pose, covariance=covariance)
+
+    def _rng(self, index: int) -> np.random.Generator:
+        return np.random.default_rng((self.seed, 5, index if self.by_frame else 0))
+
+
+def _attitude_prior(sigma_deg: float) -> AttitudePrior:
+    return AttitudePrior(tilt_sigma_deg=max(sigma_deg, _LEAST_DEG), alignment_sigma_deg=_LEAST_DEG)
