@@ -78,7 +78,10 @@ class HealthInputs:
 
 
 class HealthMonitor:
-    """Watches the parts and reports transitions, and keeps ``health.json``."""
+    """Watches the parts and reports transitions, and keeps ``health.json``.
+
+    Above 200 lines: every condition that can be true is ranked here, in one place.
+    """
 
     def __init__(
         self,

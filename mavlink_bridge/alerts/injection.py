@@ -116,7 +116,7 @@ INJECTION: tuple[AlertSpec, ...] = (
           "vision yaw is checked"),
     event(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
           "the computer's clock is before its build date", "GPS_INPUT carries no time",
-          "set the clock, by NTP or the autopilot", "the clock is set", ""),
+          "set the clock, by NTP or the autopilot"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": ""},
           "the .tlog cannot be written", "MAVLink is not recorded", "check the disk after landing"),
 )  # fmt: skip
