@@ -89,10 +89,13 @@ class AlertSpec:
 
 
 def event(
-    of: AlertId, severity: Severity, text: str, units: dict[str, str], raised: str, meaning: str,
-    operator: str, cleared: str = "", cleared_text: str | None = None, *, lead: str = "",
-) -> AlertSpec:  # fmt: skip
-    """The row of what is told when it begins. cleared: empty where its end is not told."""
+    of: AlertId, severity: Severity, text: str, units: dict[str, str], *told: str, lead: str = ""
+) -> AlertSpec:
+    """The row of what is told when it begins. told: raised, meaning, operator; and, where its end
+    is told, cleared and its text.
+    """
+    raised, meaning, operator, *end = told
+    cleared, cleared_text = end or ("", None)
     return AlertSpec(
         of, severity, of.words, text, units, raised, cleared, meaning, operator, cleared_text,
         lead=lead,
