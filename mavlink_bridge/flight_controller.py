@@ -312,4 +312,4 @@ class FlightControllerEnd:
             )
         held = came and may_inject
         self.news.held(self._interlock.reason if held else None, now_ns)
-        self.news.look(state, now_ns, injecting=good)
+        self.news.look(state, now_ns, injecting=good, refused=self.sources.gnss_refused)

@@ -25,6 +25,7 @@ class Course:
     points: Array
     leaves: Array
     nose_deg: float = 0.0
+    is_circle: bool = False
 
     @property
     def length_m(self) -> float:
@@ -84,4 +85,4 @@ def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
     turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)
     out = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
     nose_deg = float(np.sign(circle.radius_m)) * 90.0 if circle.inward else 0.0
-    return Course(centre + abs(circle.radius_m) * out, np.zeros(3), nose_deg)
+    return Course(centre + abs(circle.radius_m) * out, np.zeros(3), nose_deg, is_circle=True)

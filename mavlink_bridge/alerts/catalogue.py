@@ -6,10 +6,10 @@ from mavlink_bridge.alerts.alert import PREFIX, Alert, AlertSpec, Severity, Valu
 from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.injection import INJECTION
-from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR
+from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
 from mavlink_bridge.alerts.vehicle import VEHICLE
 
-_GROUPS = (INTEGRITY, MONITOR, INJECTION, VEHICLE, HEALTH, TARGETS, CONSOLE)
+_GROUPS = (INTEGRITY, MONITOR, SOURCES, INJECTION, VEHICLE, HEALTH, TARGETS, CONSOLE)
 
 CATALOGUE: dict[AlertId, AlertSpec] = {spec.id: spec for group in _GROUPS for spec in group}
 TEXT_LENGTH = 50  # STATUSTEXT.text

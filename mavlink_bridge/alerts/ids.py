@@ -152,6 +152,9 @@ class AlertId(enum.Enum):
     CONSOLE_BOX = "console_box"
     CONSOLE_HINT = "console_hint"
 
+    # EKF source sets
+    GNSS_REFUSED = "gnss_refused"
+
     @property
     def words(self) -> str:
         """For a table."""

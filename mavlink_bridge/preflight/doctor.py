@@ -295,7 +295,7 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
             rules = [
                 *ardupilot_rules(config, source_set),
                 *arming_rules(config, source_set, client.read),
-                *(gnss_rules(source_set, client.read) if source_set > 1 else ()),
+                *(gnss_rules(client.read) if source_set > 1 else ()),
             ]
         findings += check_parameters(rules, client.read)
         known = client.read_known(PX4_PARAMETERS if px4 else PARAMETERS)

@@ -17,7 +17,6 @@ _SOURCE_SETS = (1, 2, 3)
 _PX4_LATE_MS = 50.0
 _AGP_INSTANCES = 4
 _AGP_CONTROLS = ("EKF2_AGP0_CTRL", "EKF2_AGP_CTRL")
-_GNSS_SOURCE = 3.0
 _OWN_SOURCES = 0b1001  # FuseAllVelocities, UsePerCoreEKFSources
 _ALL_CHECKS = 1  # bit 0 of ARMING_CHECK, whatever the other bits say
 _EVERY_CHECK = (1 << 21) - 2  # bits 1 to 20, the last is OSD
@@ -127,7 +126,10 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
         ParameterRule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
         ParameterRule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
         ParameterRule(
-            (prefix + "POSZ",), (1.0,), "the barometer is smoother than vision", required=False
+            (prefix + "POSZ",),
+            (1.0,),
+            "vision is rougher, 3 follows wrong GNSS",
+            required=False,
         ),
         ParameterRule(
             (prefix + "YAW",), (1.0,), "a wrong vision yaw is taken unseen", required=False
@@ -245,7 +247,7 @@ def missing_feature(config: BridgeConfig, read: Read, *, px4: bool) -> tuple[str
     return None if any(read(p) is not None for p in parameters) else (parameters[0], option)
 
 
-def gnss_rules(source_set: int, read: Read) -> list[ParameterRule]:
+def gnss_rules(read: Read) -> list[ParameterRule]:
     """ArduPilot with GNSS and vision: what lets it use GNSS by itself while vision is selected."""
     if not (read("GPS1_TYPE") or read("GPS_TYPE")):
         return []
@@ -256,9 +258,6 @@ def gnss_rules(source_set: int, read: Read) -> list[ParameterRule]:
         why += "set, and a core that fails brings GNSS back"
         kept = int(options) & ~_OWN_SOURCES if math.isfinite(options) else 0
         rules.append(ParameterRule(("EK3_SRC_OPTIONS",), (float(kept),), why))
-    if read(f"EK3_SRC{source_set}_POSZ") == _GNSS_SOURCE:
-        why = "heights from GNSS in the vision set: a wrong receiver moves the vehicle up or down"
-        rules.append(ParameterRule((f"EK3_SRC{source_set}_POSZ",), (1.0,), why))
     if read("SCR_ENABLE"):
         why = "a script may select the source set (ahrs-source*.lua): remove it"
         rules.append(ParameterRule(("SCR_ENABLE",), (0.0,), why, required=False, reboot=True))

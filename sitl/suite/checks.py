@@ -168,17 +168,22 @@ class Says(_Span):
 
 
 class Reports(_Span):
-    """An alert of our bridge came (or, with absent, did not) within the span."""
+    """An alert of our bridge came (or, with absent, did not) within the span. values: it must show
+    these.
+    """
 
     check: Literal["alert"]
     alert: AlertId
+    values: dict[str, str] = {}
     absent: bool = False
 
     def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
         times = [
             t.at_s for t in record.texts
-            if t.alert is self.alert and self.from_s <= t.at_s <= self.to_s
+            if t.alert is self.alert
+            and self.values.items() <= t.values.items()
+            and self.from_s <= t.at_s <= self.to_s
         ]  # fmt: skip
         said = f"{times[0]:.1f} s" if times else "never"
         return CheckResult(bool(times) != self.absent, f"bridge: {self.alert.words} {said}")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.reading import alert_of
+from mavlink_bridge.alerts.reading import values_of
 from mavlink_bridge.messages import Figures
 
 Array = NDArray[np.float64]
@@ -29,8 +29,14 @@ class Text:
     @property
     def alert(self) -> AlertId | None:
         """The active alert of our bridge that it tells; None for others."""
-        read = alert_of(self.text) if self.sender == "bridge" else None
-        return read[0] if read is not None and read[1] else None
+        read = values_of(self.text) if self.sender == "bridge" else None
+        return None if read is None else read[0]
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Of its alert, as shown."""
+        read = values_of(self.text)
+        return {} if read is None else read[1]
 
 
 @dataclass(frozen=True)

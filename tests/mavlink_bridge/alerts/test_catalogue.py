@@ -22,7 +22,7 @@ WHY = {  # the longest that is told
     AlertId.SENDERS_REFUSED: "not allowed", AlertId.SOURCE_SET_HELD: "EKF with GNSS",
     AlertId.TLOG_INCOMPLETE: "Read-only file system", AlertId.NO_TARGET: "position not known",
     AlertId.TARGET_REFUSED: "the map has a hole there", AlertId.TARGET_SILENT: "moved 12 m",
-    AlertId.TARGET_NOT_LOCATED: "no map under it",
+    AlertId.GNSS_REFUSED: "m/s off vision", AlertId.TARGET_NOT_LOCATED: "no map under it",
 }  # fmt: skip
 
 

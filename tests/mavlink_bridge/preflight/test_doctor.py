@@ -175,7 +175,6 @@ def test_odometry_wants_velocity_noise_that_is_true() -> None:
         ({"EK3_SRC_OPTIONS": 2.0}, {}),  # of optical flow
         ({"EK3_SRC_OPTIONS": 1.0}, {"EK3_SRC_OPTIONS": 0.0}),
         ({"EK3_SRC_OPTIONS": 10.0}, {"EK3_SRC_OPTIONS": 2.0}),
-        ({"EK3_SRC2_POSZ": 3.0}, {"EK3_SRC2_POSZ": 1.0}),
         ({"SCR_ENABLE": 1.0}, {"SCR_ENABLE": 0.0}),
         ({"GPS1_TYPE": 0.0, "EK3_SRC_OPTIONS": 9.0}, {}),  # no receiver
     ],
@@ -183,10 +182,10 @@ def test_odometry_wants_velocity_noise_that_is_true() -> None:
 def test_what_lets_the_autopilot_use_gnss_by_itself_is_found(
     more: dict[str, float], fixes: dict[str, float]
 ) -> None:
-    parameters = {"GPS1_TYPE": 1.0, "EK3_SRC_OPTIONS": 0.0, "EK3_SRC2_POSZ": 1.0} | more
-    found = check_parameters(gnss_rules(2, parameters.get), parameters.get)
+    parameters = {"GPS1_TYPE": 1.0, "EK3_SRC_OPTIONS": 0.0} | more
+    found = check_parameters(gnss_rules(parameters.get), parameters.get)
     assert {f.name: f.fix for f in found if not f.ok} == fixes
-    assert gnss_rules(2, {"GPS1_TYPE": 1.0}.get) == []  # firmware that has no options
+    assert gnss_rules({"GPS1_TYPE": 1.0}.get) == []  # firmware that has no options
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,13 @@ def test_what_compressed_content_refers_to_belongs_to_the_source(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "told"),
-    [("0.0", "'0.0', read as 1.0"), (None, "no version"), (1.0, ""), ("1.1", "")],
+    [
+        ("0.0", "'0.0', read as 1.0"),
+        (0, "0, read as 1.0"),
+        (None, "no version"),
+        (1.0, ""),
+        ("1.1", ""),
+    ],
 )
 def test_versions_that_mean_1_0_are_read(tmp_path, content, version, told):
     asset = {"gltfUpAxis": "Y"} | ({} if version is None else {"version": version})
