@@ -118,9 +118,8 @@ class HealthMonitor:
         """Start watching."""
         if self._file is not None:
             self._file.start()
-        self.last_tick_ns = (
-            time.monotonic_ns()
-        )  # since it was made, kernels were compiled for a minute
+        # Since it was made, kernels were compiled for a minute.
+        self.last_tick_ns = time.monotonic_ns()
         self._thread.start()
 
     def stop(self) -> None:
@@ -269,7 +268,7 @@ class HealthMonitor:
             "stages_ms": _stages([e for _, e in list(self._estimates)]),
             "bridge": self._bridge.counters(),
             "shadow": {"ready": score.go, "text": score.line()},
-            "guardian": self._guardian_report(),
+            "guardian": _monitor_report(self._integrity_monitor),
             "map_shift": self._map_shift(),
             "targets": self._targets(),
         }
@@ -277,21 +276,22 @@ class HealthMonitor:
         if self._file is not None:
             self._file.put(json.dumps(_finite(report), indent=1, default=str))
 
-    def _guardian_report(self) -> dict[str, Any] | None:
-        """Standing findings with their figures, and the newest protection level."""
-        if self._integrity_monitor is None:
-            return None
-        level = self._integrity_monitor.level
-        return {
-            "findings": self._integrity_monitor.standing(),
-            "hpl_m": None if level is None else level.horizontal_m,
-            "vpl_m": None if level is None else level.vertical_m,
-        }
-
     def _rate(self) -> float:
         """Localized frames per second over the last few seconds."""
         now = time.monotonic()
         return sum(1 for t, _ in list(self._estimates) if now - t < _RATE_S) / _RATE_S
+
+
+def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
+    """Active findings with their figures, and the newest protection level."""
+    if monitor is None:
+        return None
+    level = monitor.level
+    return {
+        "findings": monitor.standing(),
+        "hpl_m": None if level is None else level.horizontal_m,
+        "vpl_m": None if level is None else level.vertical_m,
+    }
 
 
 def _file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:

@@ -91,8 +91,8 @@ class AlertSpec:
 def event(
     of: AlertId, severity: Severity, text: str, units: dict[str, str], *told: str, lead: str = ""
 ) -> AlertSpec:
-    """The row of what is told when it begins. told: raised, meaning, operator; cleared and its text
-    where the end is told, too.
+    """The row of what is told when it begins. told: raised, meaning, operator; and, where its end
+    is told, cleared and its text.
     """
     raised, meaning, operator, *end = told
     cleared, cleared_text = end or ("", None)

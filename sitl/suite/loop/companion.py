@@ -38,11 +38,6 @@ class Health:
     alerts: tuple[str, ...] = ()
 
     @property
-    def has_go(self) -> bool:
-        """Whether the shadow score is a go."""
-        return self.ready
-
-    @property
     def is_tracking(self) -> bool:
         """Whether all is well."""
         return self.level == "ok" and AlertId.TRACKING.value in self.alerts

@@ -13,6 +13,7 @@ import numpy as np
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
 from sitl.suite.loop.case import Expectation
+from sitl.suite.loop.companion import Health
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
 _AUTOPILOT = 1  # component id
@@ -85,7 +86,7 @@ class LoopRecord:
     """What a flight left. fix_errors_m: horizontal, of every position that was injected.
 
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
-    back: where the companion was killed or hung; None elsewhere. shadow: its score when the
+    back: where the companion was killed or hung; None elsewhere. shadow: the health when the
     recorded part began; None where injection was forced.
     """
 
@@ -95,7 +96,7 @@ class LoopRecord:
     pace: float = 1.0
     stall_s: float = 0.0
     back: Back | None = None
-    shadow: str | None = None
+    shadow: Health | None = None
 
 
 @dataclass(frozen=True)
@@ -196,7 +197,7 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         ok = flown.false <= expect.false_fixes and (flown.sent > 0 or not expect.injects)
         held.append(Held("false fixes injected", ok, f"{flown.false} of {flown.sent}"))
     if record.shadow is not None:
-        held.append(Held("go earned", record.shadow.startswith("ready"), record.shadow))
+        held.append(Held("shadow check passed", record.shadow.ready, record.shadow.shadow))
     if expect.back_within_s is not None:
         back = record.back or Back(math.inf, math.inf, math.inf)
         ok = back.injects_s <= expect.back_within_s
