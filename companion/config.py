@@ -22,6 +22,7 @@ from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
 from localizer.geometry.camera import MAX_READOUT_MS, Camera, lens_fault
 from localizer.geometry.lens import LensModel, whole_coefficients
+from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.config import BridgeConfig
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
@@ -169,7 +170,7 @@ class TargetConfig(_Model):
     detector: DetectorConfig | None = Field(None, description="detection network; null: none")
     rate_hz: float = Field(5.0, ge=0.01, le=30, description="reports per second and target")
     pixel_sigma: float = Field(1.5, exclude=True)  # error of a detection, pixels
-    map_sigma_m: float = Field(0.3, exclude=True)  # error of the map's surface, metres
+    map_sigma_m: float = Field(SENSORS.map_m, exclude=True)  # error of the map's surface, metres
     outline_sigma_m: float = Field(0.5, exclude=True)  # error of roof and crown outlines, m
     bias_sigma_m: float = Field(0.2, exclude=True)  # common error of all targets of a flight, m
     max_sigma_m: float = Field(50.0, exclude=True)  # largest reported sigma, m
@@ -200,8 +201,8 @@ class TargetConfig(_Model):
 class PriorConfig:
     """How well the autopilot's own position is believed when tracking (re)starts from it."""
 
-    position_sigma_m: float = 5.0
-    rotation_sigma_deg: float = 4.0
+    position_sigma_m: float = SENSORS.start_m
+    rotation_sigma_deg: float = SENSORS.heading_deg
     recall_s: float = 20.0  # oldest confirmed position that a restart uses
 
 
@@ -233,6 +234,9 @@ class CompanionConfig(_Model):
         None,
         pattern=r"^[0-9a-fA-F]{64}$",
         description="hash of the map's manifest (`companion map verify`); null: any map",
+    )
+    map_max_age_days: int = Field(
+        730, ge=1, le=36500, description="age of the imagery beyond which preflight checks warn"
     )
     camera: FeedConfig
     localizer: LocalizerConfig = LocalizerConfig()

@@ -13,6 +13,7 @@ from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.render.select import RendererName
+from localizer.sensors.error_model import SENSORS
 from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import MotionConfig
 
@@ -57,7 +58,7 @@ class LocalizerConfig(BaseModel):
     # fuse roll and pitch of autopilot and gimbal with each fix; None: no
     attitude: AttitudePrior | None = Field(AttitudePrior(), exclude=True)
     # of the autopilot's height (barometer) against the map's; None: not used
-    height_sigma_m: float | None = Field(3.0, exclude=True)
+    height_sigma_m: float | None = Field(SENSORS.height_m, exclude=True)
     motion: MotionConfig = Field(MotionConfig(), exclude=True)
     integrity: IntegrityConfig = Field(IntegrityConfig(), exclude=True)
     # propagates the pose where the map does not match; None: off

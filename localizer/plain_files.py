@@ -49,6 +49,14 @@ def as_text(data: bytes) -> str:
         raise
 
 
+def legible(data: bytes) -> str:
+    """As `as_text`; in another encoding, what is not ASCII is replaced."""
+    try:
+        return as_text(data)
+    except UnicodeDecodeError:
+        return data.decode("utf-8-sig", "replace")
+
+
 def visible(paths: Iterable[Path]) -> list[Path]:
     """Those that a user means, by name: a Mac that copies to a stick puts a ``._NAME`` beside each
     NAME (AppleDouble), and a ``.NAME`` is hidden.

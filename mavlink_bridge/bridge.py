@@ -116,6 +116,7 @@ class Bridge:
             LookAt(config, geoid_separation_m, self.say),
             on_vehicle_text,
             clock,
+            self.report_alert,
         )
         self._fc = FlightControllerEnd(shared)
         make = _LinkMaker(config, self._recorder)

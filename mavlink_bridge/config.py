@@ -100,7 +100,6 @@ class SourceSwitchConfig(_Model):
     gnss_set: int = Field(default=1, ge=1, le=3)
     vision_set: int = Field(default=2, ge=1, le=3)
     bad_after_s: float = Field(1.5, exclude=True)
-    good_after_s: float = Field(20.0, exclude=True)
     return_to_gnss: bool = False
     inconsistency_sigmas: float = Field(5.0, exclude=True)
 

@@ -83,7 +83,7 @@ class FlightControllerEnd:
         self.origin = OriginExchange(config, shared.tracker, commander, teller, self.counters)
         self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
-        self.sources = SourceOrders(config.switch, commander, teller, self.counters)
+        self.sources = SourceOrders(config.switch, commander, teller, self.counters, shared.report)
         self._no_go = no_go = _no_go_memory(config)
         self._interlock = ShadowInterlock(
             config.injection.force,
@@ -314,4 +314,4 @@ class FlightControllerEnd:
             )
         held = came and may_inject
         self.news.held(self._interlock.reason if held else "", now_ns)
-        self.news.look(state, now_ns, injecting=good)
+        self.news.look(state, now_ns, injecting=good, refused=self.sources.gnss_refused)

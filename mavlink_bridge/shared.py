@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain, count
 
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.injection_enable import InjectionEnable
@@ -26,7 +27,7 @@ def clicked_numbers() -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Shared:
-    """What the bridge lends to its ends. say: tell the operator (severity, text).
+    """What the bridge lends to its ends. say: tell the operator (severity, text); report: an alert.
 
     gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
     """
@@ -45,6 +46,7 @@ class Shared:
     look: LookAt
     on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
     clock: Callable[[], int] = monotonic_ns
+    report: Callable[[Alert], None] = lambda _: None
     target_numbers: Iterator[int] = field(default_factory=clicked_numbers)
     """Of clicked targets, over all links; none is given twice."""
 

@@ -23,10 +23,14 @@ class VehicleEvents:
         self._armed = False
         self._held_ns: int | None = None
 
-    def look(self, state: VehicleState, now_ns: int, *, injecting: bool) -> None:
-        """Take in the vehicle's state. injecting: positions are being sent."""
+    def look(
+        self, state: VehicleState, now_ns: int, *, injecting: bool, refused: bool = False
+    ) -> None:
+        """Take in the vehicle's state. injecting: positions are being sent. refused: GNSS
+        contradicts vision, so that it is not back.
+        """
         healthy = gnss_healthy(state, now_ns)
-        self._follow_gnss(healthy, now_ns, injecting=injecting)
+        self._follow_gnss(healthy and not (refused and not self._gnss), now_ns, injecting=injecting)
         if state.armed and not self._armed and not healthy:
             what = "injecting" if injecting else "nothing is injected"
             self._teller.warn(f"armed without GNSS, {what}")

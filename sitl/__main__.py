@@ -39,13 +39,13 @@ from sitl.demo.scenario import (
 )
 from sitl.demo.script import FlightError
 from sitl.errors import SimulationError
-from sitl.operator.follow_run import FollowOptions, fly_follows
-from sitl.operator.run import ClickOptions, fly_clicks, summary
+from sitl.operator.follow_run import fly_follows
+from sitl.operator.run import fly_clicks, summary
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
 from sitl.suite.loop.report import as_data, markdown, print_loop_row, read_rows
-from sitl.suite.loop.runner import LoopOptions, fly_loop, parse_seeds
+from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
 from sitl.vehicles.process import VehicleKind
@@ -179,15 +179,8 @@ def suite(
     scenarios: Annotated[Path, typer.Option(help="folder of scenario files")] = SCENARIOS,
 ) -> None:
     """Fly every scenario and compare with what ArduPilot was measured to do; exit 1: one fails."""
-    if fc not in _SUITE_KINDS:
-        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
-    cases = load_cases(only or (), scenarios)
-    if out.exists() and not out.is_dir():
-        raise ScenarioError(f"{out}: is a file; give a folder as --out")
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)  # a log has no width of its own
-    rows = run_suite(cases, _SUITE_KINDS[fc], jobs, seed, lambda row: print_row(console, row))
+    cases, (console, options) = load_cases(only or (), scenarios), _runner(fc, out)
+    rows = run_suite(cases, options.vehicles, jobs, seed, lambda row: print_row(console, row))
     print_table(console, rows)
     write_report(rows, out)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
@@ -206,24 +199,11 @@ def loop(
     scenarios: Annotated[Path, typer.Option(help="folder of flights")] = LOOP_SCENARIOS,
 ) -> None:
     """Fly the whole companion through its faults, one flight after the other; exit 1: one fails."""
-    if fc not in _SUITE_KINDS:
-        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
-    cases = load_loop_cases(only or (), scenarios)
-    if out.exists() and not out.is_dir():
-        raise ScenarioError(f"{out}: is a file; give a folder as --out")
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)
-    options = LoopOptions(
-        _SUITE_KINDS[fc],
-        out,
-        parse_seeds(seeds),
-        worlds,
-        lambda line: console.print(f"[dim]{escape(line)}[/]"),
-        LogProgress(console),
-        lambda row: print_loop_row(console, row),
+    cases, (console, options) = (
+        load_loop_cases(only or (), scenarios),
+        _runner(fc, out, seeds, worlds),
     )
-    rows = fly_loop(cases, options)
+    rows = fly_loop(cases, options, lambda row: print_loop_row(console, row))
     console.print(escape(markdown(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
@@ -237,23 +217,8 @@ def targets(
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
     """Fly an operator who clicks, drags and stops; hold every report against what he pointed at."""
-    if fc not in _SUITE_KINDS:
-        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
-    if out.exists() and not out.is_dir():
-        raise ScenarioError(f"{out}: is a file; give a folder as --out")
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)
-    options = ClickOptions(
-        _SUITE_KINDS[fc],
-        parse_seeds(seeds),
-        out,
-        clicks,
-        worlds,
-        lambda line: console.print(escape(line), highlight=False),
-        LogProgress(console),
-    )
-    rows = fly_clicks(options)
+    console, options = _runner(fc, out, seeds, worlds)
+    rows = fly_clicks(options, clicks)
     console.print_json(json.dumps(summary(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
@@ -267,23 +232,8 @@ def follow(
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
     """Fly along with a car that an operator clicks at; it is hidden twice, for two seconds."""
-    if fc not in _SUITE_KINDS:
-        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
-    if out.exists() and not out.is_dir():
-        raise ScenarioError(f"{out}: is a file; give a folder as --out")
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)
-    options = FollowOptions(
-        _SUITE_KINDS[fc],
-        seed,
-        parse_seeds(draws),
-        out,
-        worlds,
-        lambda line: console.print(escape(line), highlight=False),
-        LogProgress(console),
-    )
-    rows = fly_follows(options)
+    _, options = _runner(fc, out, draws, worlds)
+    rows = fly_follows(options, seed)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 
@@ -297,6 +247,25 @@ def loop_table(
     if out is not None:
         out.write_text(json.dumps(as_data(rows), indent=1, allow_nan=False), encoding="utf-8")
     print(markdown(rows))
+
+
+def _runner(
+    fc: str, out: Path, seeds: str = "1", worlds: Path | None = None
+) -> tuple[Console, RunOptions]:
+    """Where a run of several flights prints, and its options, checked."""
+    if fc not in _SUITE_KINDS:
+        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
+    if out.exists() and not out.is_dir():
+        raise ScenarioError(f"{out}: is a file; give a folder as --out")
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)  # a log has no width of its own
+
+    def say(line: str) -> None:
+        console.print(f"[dim]{escape(line)}[/]", highlight=False)
+
+    vehicles = _SUITE_KINDS[fc]
+    return console, RunOptions(vehicles, out, parse_seeds(seeds), worlds, say, LogProgress(console))
 
 
 def _tell_page(console: Console, address: str) -> None:

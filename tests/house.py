@@ -48,6 +48,7 @@ _OUTSIDE_MODULES = {"numba.core.runtime"}
 
 _IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.M)
 _REACHES = re.compile(r"([\w\])]+)\._(?!_)\w|import[^\n]* _(?!_)\w|setattr\(.*\b_(?!_)[A-Za-z]")
+_SIGNATURE = re.compile(r"^ *(?:async )?def \w+\((.*?)\)(?: ->|:)", re.M | re.S)
 _WAITS = re.compile(r"thread\w*\.join\((?:None)?\)", re.IGNORECASE)
 _FLIES = ("companion/", "mavlink_bridge/", "localizer/tracking/", "localizer/map/cache/")
 _CLASS = re.compile(r"^class .*\n(?:(?:[ \t)].*)?\n)*", re.M)  # up to the next line at column 0
@@ -110,6 +111,7 @@ def long_signatures(files: Mapping[str, str]) -> list[str]:
         f"{path}: {node.name} takes {count} parameters; give it an object"
         for path, text in files.items()
         if path.split("/")[0] in PACKAGES
+        and any(m.group(1).count(",") >= MOST_PARAMETERS for m in _SIGNATURE.finditer(text))
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         and (count := _parameters(node)) > MOST_PARAMETERS

@@ -16,6 +16,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from localizer.geometry.pose import Array
+from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
@@ -25,7 +26,7 @@ _LEAST_IN_BLOCK = 20
 _BLOCKS = 30  # five minutes
 _LEAST_BLOCKS = 6
 _BIAS_FLOOR_M = 0.5  # per axis: of the receiver, for minutes, however good it says it is
-_UNTOLD_ACCURACY_M = 2.5  # of a receiver that does not say
+_UNTOLD_ACCURACY_M = SENSORS.gnss_m  # of a receiver that does not say
 _SIGNIFICANT = 11.83  # chi-square of two degrees of freedom, 99.73 %
 _WAITS_NS, _WAITING = 700_000_000, 64  # until the EKF's report of the exposure is there
 _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's matter

@@ -18,6 +18,7 @@ from companion.calibration_watch.observation import (
     CalibrationEstimate,
     CalibrationObservation,
 )
+from localizer.sensors.error_model import SENSORS
 
 Array = NDArray[np.float64]
 
@@ -29,7 +30,6 @@ _SIZE = 13
 _SIGMAS = np.array([1e3, 1e3, 15, 15, 0.3, 0.3, 2.0, 2.0, 0.03, 0.15, 100.0, 100.0, 0.04])
 # Random walks, per root second: tilt errors of turns; GNSS wander; the barometer's drift; a clock.
 _WALKS = np.array([0, 0, 0, 0, 0.02, 0.02, 0.15, 0.15, 3e-4, 0.006, 0.25, 0.15, 1e-4])
-_ACCELERATION = 0.1  # m/s^2/sqrt(Hz), of the IMU's integral
 _VISION_M = 0.25  # errors of vision that last longer than from one sighting to the next
 _GNSS_M, _GNSS_HEIGHT_M, _PRESSURE_M = 0.5, 1.0, 0.5
 _OUTLIER = 5.0  # sigmas; one is dropped, several in a row begin anew
@@ -75,7 +75,7 @@ class PositionFilter:
         h = seconds
         transition = np.eye(_SIZE)
         noise = np.diag(np.square(_WALKS) * h)
-        q = _ACCELERATION**2
+        q = SENSORS.imu_noise**2
         for axis in (0, 1):
             p, v, a = _P + axis, _V + axis, _A + axis
             transition[p, v], transition[p, a], transition[v, a] = h, -0.5 * h * h, -h

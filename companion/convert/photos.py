@@ -28,6 +28,7 @@ from localizer.plain_files import files_of
 _PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
 _HOME_STEP_M = 15.0  # of absolute less relative height, which drift by metres
 _RTK = {16, 34, 50}  # RtkFlag: single, float, fixed
+_DATUMS = {"rtkalt": "ellipsoidal", "gpsfusionalt": "amsl"}  # of DJI's AltitudeType
 _ANGLES = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
 _SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -60,7 +61,7 @@ def read_photos(
     """The pose of each photo of a folder, by name, or of one photo. tell: takes what is odd about
     the tags and does not make them wrong.
     """
-    lift = _known(path, heights).lift_m
+    known = _known(path, heights)
     photos = [path]
     if path.is_dir():
         photos = files_of(path, _PHOTO_SUFFIXES)
@@ -72,6 +73,12 @@ def read_photos(
     tags = {photo.name: _xmp_tags(photo) for photo in photos}
     _require_measured(path, tags)
     _require_one_datum(path, tags, tell)
+    stated = next(iter(tags.values())).get("AltitudeType", "")
+    if _DATUMS.get(stated.lower(), known.datum) != known.datum:
+        tell(
+            f"AltitudeType {stated}: such heights are {_DATUMS[stated.lower()]}, not {known.datum}"
+        )
+    lift = known.lift_m
     return tuple(_read_photo(photo, tags[photo.name], frame, lift) for photo in photos)
 
 
@@ -105,11 +112,11 @@ def _require_one_datum(
             "is above the ellipsoid, GpsFusionAlt above the geoid; put each kind into a folder of "
             "its own and convert it with its --heights"
         )
-    flags = {_number(tags, "RtkFlag") for tags in photos.values()} - {None}
+    flags = sorted({f for t in photos.values() if (f := _number(t, "RtkFlag")) is not None})
     if len(flags) > 1:
         tell(
-            f"RtkFlag {', '.join(f'{flag:.0f}' for flag in sorted(filter(None, flags)))}: not all "
-            "photos have an RTK fix (50); the others' places may be metres off"
+            f"RtkFlag {', '.join(f'{flag:.0f}' for flag in flags)}: not all photos have an RTK fix "
+            "(50); the others' places may be metres off"
         )
     for (_, before), (name, tags) in pairwise(photos.items()):
         step = _home_m(tags) - _home_m(before)

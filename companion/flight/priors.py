@@ -15,6 +15,7 @@ from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics, camera_rotation, vehicle_prior
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
+from localizer.sensors.error_model import SENSORS
 from localizer.tracking.engine import PriorProvider
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PoseEstimate, PosePrior
@@ -27,11 +28,6 @@ _ATTITUDE = 1
 _GLITCH = 32768  # EKF_GPS_GLITCHING
 _HORIZONTAL = 8 | 16  # EKF_POS_HORIZ_REL | EKF_POS_HORIZ_ABS
 
-# How an EKF without a position drifts: an unknown velocity error grows from the loss on, and a
-# bias of the accelerometers and of the tilt under it (0.3 degrees) on top. ArduPilot SITL was 0.8 m
-# off at most after 5 s without fixes; the model's sigma is 2.0 m then.
-_DRIFT_SPEED_M_S = 0.15
-_DRIFT_ACCELERATION_M_S2 = 0.05
 _LARGEST_SIGMA_M = 5000.0
 _AHEAD_S = 0.3  # by which a velocity carries a position on
 _RANGE_AGE_S = 0.5  # a rangefinder's reading on the way: 5 m at 10 m/s
@@ -62,8 +58,7 @@ class AutopilotSource(Protocol):
 
 def drift_sigma_m(seconds: float) -> float:
     """Sigma of an EKF's position, horizontal, so long after its last absolute measurement."""
-    t = max(seconds, 0.0)
-    return min(_DRIFT_SPEED_M_S * t + _DRIFT_ACCELERATION_M_S2 * t * t, _LARGEST_SIGMA_M)
+    return min(SENSORS.ekf_drift.sigma_m(seconds), _LARGEST_SIGMA_M)
 
 
 def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] | None:
@@ -254,8 +249,9 @@ class AutopilotPose:
             return None
         # The position's sigma now against that at the begin is what the velocity may be off.
         elapsed_s = (end_ns - begin_ns) * 1e-9
-        since_s = max(elapsed_s, math.sqrt(belief.sigma_m / _DRIFT_ACCELERATION_M_S2))
-        speed_error = _DRIFT_SPEED_M_S + 2.0 * _DRIFT_ACCELERATION_M_S2 * since_s
+        drift = SENSORS.ekf_drift
+        since_s = max(elapsed_s, math.sqrt(2.0 * belief.sigma_m / drift.acceleration_mps2))
+        speed_error = math.hypot(drift.speed_mps, drift.acceleration_mps2 * since_s)
         return way, 0.5 + speed_error * elapsed_s
 
     def _believed(self, state: VehicleState, now_ns: int) -> Belief:

@@ -17,13 +17,10 @@ from companion.integrity_monitor.inertial import InertialDisplacement, InertialT
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.relocalization.types import SearchRegion
+from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.messages import Attitude, InertialSample, VehicleState
 
-# What the free integral of an IMU is off: the velocity at its beginning, and a bias of the
-# accelerometers with the attitude's error under it (0.4 degrees), growing with the tilt's drift.
-_SPEED_SIGMA_M_S = 0.5
-_ACCELERATION_SIGMA_M_S2 = 0.07
 _SIGMAS = 3.0
 _LEAST_M = 15.0  # candidates of the search are metres off themselves
 _GUST_M_S = 8.0  # by which a wind carries an aircraft that holds nothing, beyond its own speed
@@ -95,8 +92,7 @@ class ReachableRegion:
         speed = float(np.linalg.norm(seen.velocity))
         farthest_m = _LEAST_M + (speed + _GUST_M_S) * t
         way = _way(seen, end) if run == seen.run else None
-        sigma_m = _SPEED_SIGMA_M_S * t + 0.5 * _ACCELERATION_SIGMA_M_S2 * t * t
-        radius_m = _LEAST_M + _SIGMAS * sigma_m
+        radius_m = _LEAST_M + _SIGMAS * SENSORS.inertial_drift.sigma_m(t)
         # An integral that lies beyond what can be flown is a wrong one.
         if way is None or radius_m > farthest_m or float(np.linalg.norm(way)) > farthest_m:
             return SearchRegion.circle(seen.place, farthest_m)

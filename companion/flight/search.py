@@ -17,26 +17,27 @@ import numpy as np
 from companion.flight.priors import AutopilotPose
 from localizer.config import LocalizerConfig
 from localizer.errors import LocalizerError
+from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
 from localizer.relocalization.types import PlaceQuery, Relocalization, SearchRegion
+from localizer.sensors.error_model import SENSORS
 from localizer.types import Frame, PosePrior
 from mavlink_bridge.messages import PlaceHint
 
 _log = logging.getLogger(__name__)
 NOT_READY, NO_SEARCH = "search not ready", "no search"
 _HINT_SIGMAS = 2.0
-_EARTH_M = 6.371e6
 _HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
 _STOP_S = 10.0
 _WHOLE_MAP_EVERY = 5  # searches
 
 # What the autopilot knows of the camera while it does not know where it is.
-_TILT_SIGMA_RAD = math.radians(2.0)  # with the gimbal's own error
-_HEADING_SIGMA_RAD = math.radians(10.0)  # of a compass over a town
-_HEIGHT_SIGMA_M = 6.0  # of the barometer since the take-off
+_TILT_SIGMA_RAD = math.radians(SENSORS.unaided_tilt_deg)
+_HEADING_SIGMA_RAD = math.radians(SENSORS.town_heading_deg)
+_HEIGHT_SIGMA_M = SENSORS.height_since_takeoff_m
 _SIGMAS = 3.0
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 2.0, math.radians(1.0)  # of a found place, at the least
 
@@ -47,7 +48,7 @@ _STALE_M = 5.0
 _SPEED_SIGMA_M_S, _UNKNOWN_SPEED_M_S = 2.0, 8.0  # with the EKF's velocity, and without
 _FOLLOWED_M, _LONGEST_S = 10.0, 10.0
 _FOLLOWED_TILT_RAD, _FOLLOWED_HEADING_RAD = math.radians(1.0), math.radians(2.0)
-_FOLLOWED_HEIGHT_M = 2.0  # of the barometer over seconds
+_FOLLOWED_HEIGHT_M = SENSORS.height_of_late_m
 _LEAST_BASE_S = 0.3  # between two places, for a velocity
 
 Event = Callable[[str, str], None]
@@ -124,7 +125,7 @@ def _on_plane(query: PlaceQuery) -> PlaceQuery:
     if query.region is None:
         return query
     away = query.region.centre
-    return replace(query, height_m=query.height_m - 0.5 * float(away @ away) / _EARTH_M)
+    return replace(query, height_m=query.height_m - 0.5 * float(away @ away) / EARTH_RADIUS_M)
 
 
 def _radius_m(circle: SearchRegion) -> float:

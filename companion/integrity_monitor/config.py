@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel, ConfigDict, Field
 
 from companion.calibration_watch.config import CalibrationLimits
+from localizer.sensors.error_model import SENSORS
 
 
 class _Model(BaseModel):
@@ -44,12 +45,12 @@ class ProtectionConfig(_Model):
     risk: float = Field(
         default=1e-3, gt=0.0, le=0.1, description="probability of an error beyond the level"
     )
-    map_m: float = Field(0.28, exclude=True)  # map, north and east
-    map_height_m: float = Field(0.4, exclude=True)  # map height
+    map_m: float = Field(SENSORS.map_m, exclude=True)  # map, north and east
+    map_height_m: float = Field(SENSORS.map_height_m, exclude=True)  # map height
     # camera, share of the height, without a recent `camera.calibrated`
     calibration_share: float = Field(0.003, exclude=True)
     calibrated_share: float = Field(0.001, exclude=True)  # the same with a recent calibration
-    time_bias_s: float = Field(0.01, exclude=True)  # time error, times the speed
+    time_bias_s: float = Field(SENSORS.time_bias_s, exclude=True)  # time error, times the speed
 
     def of_camera(self, *, calibrated: bool) -> ProtectionConfig:
         """The budget of a camera whose deployment states what its calibration left, or guesses."""
@@ -71,6 +72,6 @@ class IntegrityMonitorConfig(_Model):
     # time that a jumped position must agree in motion
     jump_hold_s: float = Field(5.0, exclude=True)
     # roll and pitch of gimbal and autopilot with mounting, 1 sigma an axis
-    tilt_deg: float = Field(0.9, exclude=True)
+    tilt_deg: float = Field(SENSORS.mounted_tilt_deg, exclude=True)
     gnss_accuracy_cap_m: float = Field(3.0, exclude=True)  # largest receiver error that is believed
     gnss_repeat_s: float = Field(10.0, exclude=True)  # interval of the GNSS report

@@ -11,16 +11,15 @@ import statistics
 from collections import deque
 from dataclasses import dataclass
 
+from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import wrap_pi
 
 _SPAN_NS = 1_000_000_000  # over which the heading is the median
 _LEAST = 3
 _SIGMAS = 4.0
-# What honest vision turned against the better of gyros and autopilot, medians of a second each: 0.6
-# degrees at most from one to the next, 1.5 over 5 s, 2.6 over 10 s (24 recorded flights).
-_OFF_RAD = math.radians(1.0)
-_DRIFT_RADPS = math.radians(0.25)
+_OFF_RAD = math.radians(SENSORS.heading_step_deg)
+_DRIFT_RADPS = math.radians(SENSORS.gyro_drift_deg_per_s)
 _KEPT = 64
 
 

@@ -20,7 +20,6 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, InertialSample
 
 Array = NDArray[np.float64]
-GRAVITY = 9.80665
 _LEAN_S = 20.0  # towards the autopilot's attitude
 _BIAS_S = 60.0  # of the gyros' bias
 _GAP_S = 0.3  # longer without samples the motion is unknown

@@ -13,6 +13,7 @@ from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.heading import HeadingChange, HeadingHistory, turn_of
 from companion.integrity_monitor.position_checks import LocalPlace
 from companion.integrity_monitor.step import PositionStep
+from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _SIGMAS = 4.0
@@ -20,10 +21,6 @@ _DRIFT_MPS2 = 0.2  # what a velocity carried on may be wrong by, as an accelerat
 _SPEED_MPS = 1.0  # and of its speed
 _FASTEST_MPS = 30.0
 _GAP_S = 1.0
-# What the EKF's velocity is off by without positions, one sigma. 5 s without them moved ArduPilot
-# and the embedded vehicle by 1.0 m in the mean, 1.8 at most (64 flights of dropout-5s).
-_RECKONED_MPS = 0.12
-_RECKONED_MPS2 = 0.04
 _RECKONS_S = 10.0  # afterwards an EKF without positions gives up: no evidence any more
 _HEADING_S = 60.0  # for which the gyros know the heading, as the yaw guard has it
 _TURNED_FIXES = 3  # in a row
@@ -260,7 +257,7 @@ class JumpCheck:
 def _reckoned_m(dt: float) -> float:
     """One sigma of the way that the EKF reckons without positions."""
     known_s = min(dt, _RECKONS_S)
-    return math.hypot(_RECKONED_MPS * known_s, 0.5 * _RECKONED_MPS2 * known_s * known_s)
+    return SENSORS.ekf_drift.sigma_m(known_s)
 
 
 def _seconds(a: VisionFix, b: VisionFix) -> float:

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from companion.integrity_monitor.config import MotionCheckConfig
 from companion.integrity_monitor.inertial import InertialDisplacement, InertialTrack
 from companion.integrity_monitor.position_checks import LocalPlace
+from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import VisionFix
 
 Array = NDArray[np.float64]
-_ACCELERATION = 0.03  # m/s^2/sqrt(Hz): of the IMU's integral
 _BIAS_WALK = 0.002  # m/s^2/sqrt(s): of tilt and accelerometer together, in north and east
 _SIGMA_FLOOR_M = 0.2
 _SIGMAS = 4.0
@@ -104,7 +104,7 @@ class MotionCheck:
         """Predict by the IMU, note the deviation, and take the fix in. Per axis: p, v, bias."""
         h = (moved.time_ns - last.time_ns) * 1e-9
         F = np.array([[1.0, h, -0.5 * h * h], [0.0, 1.0, -h], [0.0, 0.0, 1.0]])
-        q, b = _ACCELERATION**2, _BIAS_WALK**2
+        q, b = SENSORS.imu_noise**2, _BIAS_WALK**2
         Q = np.array(
             [[h**3 / 3 * q, h * h / 2 * q, 0.0], [h * h / 2 * q, h * q, 0.0], [0, 0, b * h]]
         )

@@ -9,6 +9,7 @@ import numpy as np
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import CheckResult
+from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east
@@ -22,7 +23,7 @@ _BARO_FRESH_NS = 1_000_000_000
 _FIX_FRESH_NS = 500_000_000
 _SIGMAS = 4.0
 _GNSS_FLOOR_M = 1.0
-_GNSS_SIGMA_M = 2.5  # where the receiver does not say
+_GNSS_SIGMA_M = SENSORS.gnss_m  # where the receiver does not say
 _GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cover
 
 

@@ -48,14 +48,16 @@ _KINDS = (
 _TICK_NS, _TURN_NS, _SCORE_NS = 50_000_000, 100_000_000, 1_000_000_000
 _BEGIN_NS = 1_000_000_000_000  # of the record on its clock: as CLOCK_MONOTONIC some time after boot
 _BEFORE_NS, _AFTER_NS = 10_000_000_000, 2_000_000_000  # of the log, about the images
-_TOLD_ONCE = ("HEARTBEAT", "AUTOPILOT_VERSION")
+_TOLD_BEFORE = ("HEARTBEAT", "AUTOPILOT_VERSION", "GPS_RAW_INT")
 _TRIED_FRAMES = 5  # with the autopilot's pose, before the map is searched
 _SEARCH_EVERY_NS = 5_000_000_000
 
 
 @dataclass(frozen=True)
 class ToldLine:
-    """What the operator would have read. at_s: since the first image; alert: its identifier."""
+    """What the operator would have read. at_s: since the first image, negative before it, when the
+    log begins to be played; alert: its identifier.
+    """
 
     at_s: float
     severity: int
@@ -136,7 +138,7 @@ def shadow_check(
 
 
 class _Messages:
-    """The log's messages about the images. before: what is told seldom, of earlier; origin: the
+    """The log's messages about the images. before: what is to be known at the begin; origin: the
     EKF's, GPS_GLOBAL_ORIGIN.
     """
 
@@ -152,7 +154,7 @@ class _Messages:
         self._within.sort(key=lambda one: one[0])
         if not self._within:
             raise RecordError(f"{path}: holds nothing of the time of the images")
-        self.before = tuple(m for (_, kind), m in before.items() if kind in _TOLD_ONCE)
+        self.before = tuple(m for (_, kind), m in before.items() if kind in _TOLD_BEFORE)
         every = (*before.values(), *(m for _, m in self._within))
         told = [m for m in every if m.get_type() == "GPS_GLOBAL_ORIGIN"]
         self.origin = told[-1] if told else self._origin(path)
@@ -223,6 +225,7 @@ class _Counts:
     passed: int = 0
     go_s: float = 0.0
     first_go_s: float | None = None
+    problem: str = ""
     held: Counter[str] = field(default_factory=Counter)
     lines: list[ToldLine] = field(default_factory=list)
 
@@ -274,7 +277,8 @@ class _Player:
         self._parts.channels.frames.send(frame)
         try:
             estimate = self._estimate(frame)
-        except (OutsideMapError, MapLoadingError):
+        except (OutsideMapError, MapLoadingError) as error:
+            self._counts.problem = str(error)
             return
         if estimate is None or self._reference is None:
             return
@@ -288,6 +292,8 @@ class _Player:
         """What came of all images."""
         c = self._counts
         seconds = (self._last_ns - (self._begun_ns or self._last_ns)) * 1e-9
+        if not c.localized:
+            notes = (*notes, f"no image was localized: {c.problem or 'no place is known'}")
         enough = [s for s in self._scores if s.samples >= MINIMUM_SAMPLES]
         held_s = {of: count * _TURN_NS * 1e-9 for of, count in c.held.most_common()}
         return ShadowCheck(
@@ -335,7 +341,7 @@ class _Player:
         self._counts.lines.append(ToldLine(self._since_s(), severity, text, name))
 
     def _since_s(self) -> float:
-        return (self.now_ns - (self._begun_ns or self.now_ns)) * 1e-9
+        return (self.now_ns - _BEGIN_NS) * 1e-9
 
 
 def _shadow(config: CompanionConfig) -> CompanionConfig:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from mavlink_bridge.mission.items import LoiterCircle
 
-_EARTH_M = 6.371e6
 _PIECES = 64  # of a spline or a circle
 # The vectors at both ends are shortened to so many times the distance between them
 # (SplineCurve::set_origin_and_destination).
@@ -25,6 +25,7 @@ class Course:
     points: Array
     leaves: Array
     nose_deg: float = 0.0
+    is_circle: bool = False
 
     @property
     def length_m(self) -> float:
@@ -41,7 +42,7 @@ class Course:
         east, north, _ = end - start
         part = (way - done[k]) / max(steps[k], 1e-9)
         # As high above the Earth as between the ends: a chord lies below.
-        bulge = 0.5 * part * (1.0 - part) * (east * east + north * north) / _EARTH_M
+        bulge = 0.5 * part * (1.0 - part) * (east * east + north * north) / EARTH_RADIUS_M
         position = start + part * (end - start) + (0.0, 0.0, bulge)
         return position, float(np.degrees(np.arctan2(east, north)) % 360.0)
 
@@ -84,4 +85,4 @@ def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
     turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)
     out = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
     nose_deg = float(np.sign(circle.radius_m)) * 90.0 if circle.inward else 0.0
-    return Course(centre + abs(circle.radius_m) * out, np.zeros(3), nose_deg)
+    return Course(centre + abs(circle.radius_m) * out, np.zeros(3), nose_deg, is_circle=True)

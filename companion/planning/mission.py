@@ -109,6 +109,7 @@ def _landing_pattern(entry: dict[str, Any], kind: str) -> Iterator[dict[str, Any
     ]
     loiters = entry.get("useLoiterToAlt", True)
     radius = float(entry.get("loiterRadius", 0.0)) if loiters else 0.0
+    radius *= 1.0 if entry.get("loiterClockwise", True) else -1.0
     command = mavlink.MAV_CMD_NAV_LOITER_TO_ALT if loiters else mavlink.MAV_CMD_NAV_WAYPOINT
     yield {"command": mavlink.MAV_CMD_DO_LAND_START, "frame": 2, "params": [0] * 7}
     if entry.get("useDoChangeSpeed"):

@@ -33,15 +33,19 @@ INSTEAD_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
 def verdict_words(plan: MissionForecast) -> str:
     """The answer in a sentence."""
     bad = [v for v in plan.verdicts if not v.holds]
-    count, limit = len(plan.verdicts), plan.question.limits.sigma_m
+    limit = plan.question.limits.sigma_m
+    circles = sum(v.leg.is_circle for v in plan.verdicts)
+    count = f"{len(plan.verdicts) - circles} legs"
+    if circles:
+        count += f" and {circles} {'circle' if circles == 1 else 'circles'}"
     if bad:
         lost = sum(s.length_m for s in plan.stretches)
         said = (
-            f"Vision will not do on {len(bad)} of {count} legs: {lost:.0f} of "
+            f"Vision will not do on {len(bad)} of {count}: {lost:.0f} of "
             f"{plan.length_m:.0f} m have to be bridged or flown otherwise"
         )
     else:
-        which = f"the {count} legs that could be judged" if plan.not_judged else f"all {count} legs"
+        which = f"the {count} that could be judged" if plan.not_judged else f"all {count}"
         said = (
             f"Vision should hold on {which} ({plan.length_m / 1000:.1f} km), sigma below "
             f"{limit:g} m"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from statistics import median
 
@@ -160,4 +161,11 @@ def _kind_notes(
     heights = [float(z) - ground_m for z, ground_m in below if ground_m is not None]
     half_view_deg = deployment.camera.model.camera().horizontal_fov_deg / 2
     advice = kind.advice(half_view_deg, median(heights)) if heights else ""
-    return (f"Map: {kind.line()}.", *([f"{advice[0].upper()}{advice[1:]}."] if advice else []))
+    notes = [f"Map: {kind.line()}."]
+    limit = deployment.map_max_age_days
+    age, recent = kind.imagery_age(datetime.now(timezone.utc).date(), limit)
+    if not recent:
+        notes.append(f"Imagery: {age}; map_max_age_days is {limit}.")
+    if advice:
+        notes.append(f"{advice[0].upper()}{advice[1:]}.")
+    return tuple(notes)

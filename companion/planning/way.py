@@ -60,7 +60,8 @@ class PathSample:
 class FlightLeg:
     """The way between two places. name: of their numbers, "home" and "take-off" too; step_m:
     of the way that each sample stands for; speed_m_s: None where the mission does not say; first:
-    index of the first leg that is flown alike, its own where there is none before it.
+    index of the first leg that is flown alike, its own where there is none before it; is_circle: a
+    round of loitering.
     """
 
     name: str
@@ -69,6 +70,7 @@ class FlightLeg:
     samples: tuple[PathSample, ...]
     speed_m_s: float | None = None
     first: int = 0
+    is_circle: bool = False
 
 
 class MapHeights:
@@ -124,6 +126,10 @@ def legs_of(
             key = (*alike, *arrived, beyond) if end.curved else alike
             log.add(key, f"{start.name} to {end.name}", end, course)
         log.circle(end, there, there - here)
+    if len(path) == 1 and not log.legs:
+        raise MissionFileError(
+            "the mission has one place and no home, so no way between places: set its home"
+        )
     if not log.legs:
         raise MissionFileError("the mission goes nowhere: its places lie on one another")
     return tuple(log.legs)
@@ -203,7 +209,8 @@ def _leg(
         pitch, turn = _look(end.gimbal, aim, position, heading + nose, looked_at)
         turn = (turn + nose + 180.0) % 360.0 - 180.0
         samples.append(PathSample(position, share * course.length_m, heading, pitch, turn))
-    return FlightLeg(name, course.length_m, step_m, tuple(samples), end.speed_m_s)
+    leg = FlightLeg(name, course.length_m, step_m, tuple(samples), end.speed_m_s)
+    return replace(leg, is_circle=course.is_circle)
 
 
 def _look(

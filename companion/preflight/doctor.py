@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timezone
 from pathlib import Path
 
 from companion.config import CompanionConfig
@@ -22,6 +23,7 @@ from localizer.features.extractor import load_extractor
 from localizer.geometry.geo import LocalFrame
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
+from localizer.map.kind import MapKind
 from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding, examine
@@ -88,16 +90,20 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[DoctorFi
     )
     return cache, [
         DoctorFinding("map", found, "a tile cache", "", True, True),
-        _check_kind(cache, config),
+        *_check_kind(map_kind(cache), config),
     ]
 
 
-def _check_kind(cache: TileCache, config: CompanionConfig) -> DoctorFinding:
+def _check_kind(kind: MapKind, config: CompanionConfig) -> list[DoctorFinding]:
     """What accuracy the map allows; a map without buildings is flown, with attitude and care."""
-    kind = map_kind(cache)
-    half_view_deg = config.camera.model.camera().horizontal_fov_deg / 2
-    why = kind.advice(half_view_deg)
-    return DoctorFinding("map's kind", kind.line(), "buildings in the heights", why, not why, False)
+    why = kind.advice(config.camera.model.camera().horizontal_fov_deg / 2)
+    limit = config.map_max_age_days
+    age, recent = kind.imagery_age(datetime.now(timezone.utc).date(), limit)
+    needed, cost = f"<= {limit} days", "what was built or felled since costs accuracy"
+    return [
+        DoctorFinding("map's kind", kind.line(), "buildings in the heights", why, not why, False),
+        DoctorFinding("map's imagery", age, needed, "" if recent else cost, recent, False),
+    ]
 
 
 def _check_mission(config: CompanionConfig, cache: TileCache) -> DoctorFinding:

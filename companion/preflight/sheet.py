@@ -21,7 +21,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
-_OLD_MAP_DAYS, _OLD_SHADOW_DAYS = 730, 7
+_OLD_SHADOW_DAYS = 7
 WHEN_VISION_ENDS = (
     ("degraded, bridging N s", "odometry carries it on: turn back over ground that the map knows"),
     ("lost; not sent: ...", "take over in ALT_HOLD or STABILIZE, or select GNSS if it is good"),
@@ -106,14 +106,8 @@ def _map(config: CompanionConfig, today: date) -> tuple[SheetRow, ...]:
         f"{box.south:.5f} to {box.north:.5f}, {box.west:.5f} to "
         f"{box.east:.5f}; {m.gsd_m:.2f} m a texel; {pinned}"
     )
-    stated = m.imagery_date or ""
-    try:
-        taken = date.fromisoformat(stated)
-    except ValueError:
-        dated = SheetRow("map's imagery", stated or "date not known", False if not stated else None)
-    else:
-        dated = SheetRow("map's imagery", f"{stated} ({_age(taken, today)})",
-                    (today - taken).days <= _OLD_MAP_DAYS)  # fmt: skip
+    text, recent = kind.imagery_age(today, config.map_max_age_days)
+    dated = SheetRow("map's imagery", text, recent)
     half_view_deg = config.camera.model.camera().horizontal_fov_deg / 2
     advice = kind.advice(half_view_deg)
     text = f"{kind.line()}; {advice}" if advice else kind.line()

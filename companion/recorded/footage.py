@@ -35,6 +35,7 @@ from companion.recorded.subtitles import Subtitles, read_subtitles
 from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import list_images
+from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.plain_files import files_of
 
@@ -108,7 +109,9 @@ def _read_folder(path: Path, options: FootageOptions, progress: Progress) -> Rec
             return _read_photos(path, ordered, options, progress)
     if files_of(path, RAW_SUFFIXES):
         raise FootageError(f"{path}: holds raw photos only, which are not read; give JPEGs")
-    raise FootageError(f"{path}: holds no photo and no video")
+    full = [f.name for f in sorted(path.iterdir()) if f.is_dir() and files_of(f, PHOTO_SUFFIXES)]
+    advice = f"; give one of its folders: {', '.join(full)}" if full else ""
+    raise FootageError(f"{path}: holds no photo and no video{advice}")
 
 
 def _read_photos(
@@ -118,11 +121,23 @@ def _read_photos(
     chosen = _spread(photos, options.frames)
     if len(chosen) < len(photos):
         notes.append(f"{len(chosen)} of {len(photos)} photos are used (--frames)")
-    tags = []
+    tags, damaged = [], []
     for number, photo in enumerate(chosen, 1):
-        tags.append(read_photo_tags(photo))
+        try:
+            tags.append(read_photo_tags(photo))
+        except FootageError as error:
+            damaged.append(error)
         progress(number, len(chosen))
+    if not tags:
+        raise damaged[0]
+    if damaged:
+        notes.append(f"{len(damaged)} photos are left out, the first: {damaged[0]}")
     tags = _of_one_camera(tags, notes)
+    if tags[0].was_turned:
+        raise FootageError(
+            f"{tags[0].path}: another program turned its pixels, and its angles are of the image "
+            "before that; give the camera's own files"
+        )
     camera = _photo_camera(folder, tags, options)
     frames = [RecordedFrame(t.path.name, t.path, t.time_ns, t.telemetry()) for t in tags]
     zero = sum(t.has_zero_view for t in tags)
@@ -185,7 +200,10 @@ def _given_camera(
     file = options.camera or folder / "camera.json"
     if options.camera is None and not file.is_file():
         return None
-    camera = fitted_camera(width, height, Camera.from_json(file), str(file))
+    try:
+        camera = fitted_camera(width, height, Camera.from_json(file), str(file))
+    except CameraError as error:
+        raise FootageError(f"{error}; or give the field of view alone, as --fov DEGREES") from error
     return camera_given(camera, file.name)
 
 
@@ -257,10 +275,18 @@ def _with_log(
     reach = _reach_s(frames, log, file, utc=utc)
     found = find_offset(frames, camera, log.track, reach)
     ahead_ns = round(1e9 * _offset(found, file, notes, utc=utc))
-    moved = []
-    for frame in frames:
-        said = log.track.at((frame.time_ns or 0) + ahead_ns)
-        moved.append(frame.with_telemetry(said) if said is not None else frame)
+    told = [log.track.at((frame.time_ns or 0) + ahead_ns) for frame in frames]
+    covered = sum(said is not None for said in told)
+    if not covered:
+        raise FootageError(
+            f"{file}: says nothing of the time of the images: is it this flight's, and complete?"
+        )
+    if covered < len(frames):
+        notes.append(f"{file.name} covers {covered} of {len(frames)} images: is it complete?")
+    moved = [
+        frame if said is None else frame.with_telemetry(said)
+        for frame, said in zip(frames, told, strict=True)
+    ]
     return moved, LogBeside(file, ahead_ns, log.has_gimbal)
 
 
@@ -329,6 +355,12 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
     beside = None
     if log is not None:
         frames, beside = _with_log(frames, camera.camera, log, options, notes, utc=False)
+    elif track is None and facts.has_dji_track:
+        notes.append(
+            "the telemetry inside DJI's video is not read: give its .SRT (the camera's setting "
+            "'video subtitles' writes it), or the aircraft's log (--log); every frame is searched "
+            "on the whole map"
+        )
     elif track is None:
         notes.append(
             "the video has no telemetry: no .SRT beside it, no KLV in it, no log; every frame is "

@@ -89,6 +89,14 @@ class PhotoTags:
         fraction = float(f"0.{part}") if part.isdigit() else 0.0
         return round((seconds + fraction) * 1e9)
 
+    @property
+    def was_turned(self) -> bool:
+        """Whether another program turned the pixels: its tags are of the image before that."""
+        width, height = self.exif_number("ExifImageWidth"), self.exif_number("ExifImageHeight")
+        if width is None or height is None or width == height or self.width == self.height:
+            return False
+        return (width > height) != (self.width > self.height)
+
     def telemetry(self) -> Telemetry:
         """Position, view and direction, as far as the tags say them."""
         return Telemetry(self.time_ns, self._position(), self.view(), self._course())

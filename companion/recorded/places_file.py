@@ -116,9 +116,10 @@ def _place(row: list[str], columns: dict[str, int], where: str) -> tuple[str, Te
         )
         if (value := number(key)) is not None
     ]  # fmt: skip
-    position = RecordedPosition(
-        latitude, longitude, number("accuracy") or _UNKNOWN_M, tuple(heights)
-    )
+    position = None
+    if latitude or longitude:  # 0, 0 is what is written without a fix
+        sigma_m = number("accuracy") or _UNKNOWN_M
+        position = RecordedPosition(latitude, longitude, sigma_m, tuple(heights))
     roll, pitch, yaw = number("roll"), number("pitch"), number("yaw")
     view = None
     if pitch is not None and yaw is not None:

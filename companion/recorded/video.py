@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,12 +34,15 @@ class ExtractedFrame:
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """What a video file says. width, height: of its frames; duration_s: 0 where it is not said."""
+    """What a video file says. width, height: of its frames; duration_s: 0 where it is not said;
+    has_dji_track: whether it holds DJI's own telemetry (protobuf, a layout for each model).
+    """
 
     width: int
     height: int
     duration_s: float
     rotation_deg: int
+    has_dji_track: bool
 
 
 def video_facts(path: Path) -> VideoFacts:
@@ -51,7 +55,9 @@ def video_facts(path: Path) -> VideoFacts:
             if frame is None:
                 raise FootageError(f"{path}: no frame in it can be decoded")
             rotation = round(getattr(frame, "rotation", 0) or 0)
-            return VideoFacts(frame.width, frame.height, float(duration), rotation)
+            names = [str(s.metadata.get("handler_name", "")) for s in container.streams.data]
+            has_track = any(re.search(r"(DJI|CAM)\W?meta", name, re.IGNORECASE) for name in names)
+            return VideoFacts(frame.width, frame.height, float(duration), rotation, has_track)
     except av.error.FFmpegError as error:
         raise FootageError(f"{path}: not a video, or damaged: {error}") from error
 

@@ -34,7 +34,7 @@ RIM = 1.5  # of dark about a track, both sides together
 
 @dataclass(frozen=True)
 class MapTrack:
-    """A way in the map's frame. points: (N, 2) east, north, m."""
+    """A way in the map's frame. points: (N, 2) east, north, m; a NaN ends a stretch."""
 
     name: str
     colour: str

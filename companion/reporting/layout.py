@@ -127,7 +127,8 @@ def _map(sheet: MapSheet) -> str:
     else:
         parts.append(f'<rect width="{width:.2f}" height="{height:.2f}" fill="#9aa3ad"/>')
     for track in sheet.tracks:
-        parts.append(_polyline(track, [xy(*p) for p in _thinned(track.points)]))
+        runs = [[xy(*p) for p in run] for run in _runs(track.points)]
+        parts += [_polyline(track, run) for run in runs]
     for mark in sheet.marks:
         x, y = mark.east_m - sheet.west, sheet.north - mark.north_m
         arm = size / 90
@@ -226,9 +227,12 @@ def _kept(count: int) -> np.ndarray:
     return np.asarray(np.unique(chosen))
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
-    points = points[np.isfinite(points).all(axis=1)]
-    return np.asarray(points[_kept(len(points))])
+def _runs(points: np.ndarray) -> list[np.ndarray]:
+    """The stretches between unknown points: what was not known is not drawn as if it were."""
+    known = np.isfinite(points).all(axis=1)
+    runs = np.split(np.arange(len(points)), np.flatnonzero(np.diff(known)) + 1)
+    step = -(-len(points) // _MOST_POINTS)
+    return [points[[*run[:-1:step], run[-1]]] for run in runs if len(run) and known[run[0]]]
 
 
 def _stanford(data: Stanford) -> str:

@@ -23,6 +23,7 @@ from localizer.pictures import GreyRange
 from localizer.types import Frame
 
 _log = logging.getLogger(__name__)
+_LEAST_SHARE = 10  # a film has at least a tenth of the pictures of the longest: thumbnails have few
 
 # What is said of 16-bit grey pictures without a range.
 GREY_RANGE_ADVICE = (
@@ -182,19 +183,25 @@ class PacketTaps:
 
 
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
-    """The video among a container's streams, not a cover picture, wherever they stand; of several
-    FFmpeg's choice, which is logged. `StreamOpenError` where there is none.
+    """The video among a container's streams, not a cover picture or a track of thumbnails, wherever
+    they stand; of several FFmpeg's choice, which is logged. `StreamOpenError` where there is none.
     """
+    films = [
+        s for s in container.streams.video
+        if s.codec_context is not None and not s.disposition & Disposition.attached_pic
+    ]  # fmt: skip
+    most = max((s.frames for s in films), default=0)  # 0 where the container does not say
+    films = [s for s in films if s.frames * _LEAST_SHARE >= most]
+    if not films:
+        raise StreamOpenError(f"{where}: has no video stream that can be read; give a video")
     best = container.streams.best("video")
-    if not isinstance(best, av.VideoStream) or best.disposition & Disposition.attached_pic:
-        raise StreamOpenError(f"{where}: has no video stream; give a video")
-    films = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    chosen = next((s for s in films if s is best), films[0])
     if len(films) > 1:
         _log.warning(
             "%s: holds %d video streams; number %d of %dx%d is read",
-            where, len(films), best.index, best.width, best.height,
+            where, len(films), chosen.index, chosen.width, chosen.height,
         )  # fmt: skip
-    return best
+    return chosen
 
 
 def has_times(container: av.container.InputContainer) -> bool:

@@ -1,7 +1,8 @@
 """What the datagrams of a video feed carry, and RTP's video (RFC 3550, 6184, 7798) as one stream.
 
 FFmpeg reads RTP only from sockets of its own, which listen on every interface; here the datagrams
-of one sender are put together and handed to it in IVF, which keeps RTP's times and adds no delay.
+of one sender are put together and handed to it in IVF (H.264) or MPEG-TS (H.265), which keep RTP's
+times and add no delay.
 """
 
 from __future__ import annotations
@@ -10,13 +11,16 @@ import struct
 from dataclasses import dataclass, field
 from typing import Literal
 
+from companion.sources.transport import TransportStream
+
 Kind = Literal["mpegts", "rtp h264", "rtp hevc", "rtp mpegts", "h264", "hevc"]
 FORMATS: dict[Kind, str] = {
-    "mpegts": "mpegts", "rtp mpegts": "mpegts", "rtp h264": "ivf", "rtp hevc": "ivf",
+    "mpegts": "mpegts", "rtp mpegts": "mpegts", "rtp h264": "ivf", "rtp hevc": "mpegts",
     "h264": "h264", "hevc": "hevc",
 }  # fmt: skip
 _PACKET, _SYNC = 188, 0x47  # an MPEG-TS packet's bytes, and the byte that it begins with
 _HEADER = 12  # bytes of RTP's
+_LEAST_SYNCS = 4  # of MPEG-TS that begins inside a packet: fewer stand in other data, too
 _MPEG_TS_TYPE = 33  # payload type; from 96 on they are dynamic
 _START = b"\x00\x00\x00\x01"
 # NAL unit types, and those of RTP packets that hold several or a part of one.
@@ -58,10 +62,10 @@ def named(data: bytes) -> str:
 
 def _is_transport(data: bytes) -> bool:
     """Whether MPEG-TS packets follow one another in it; a datagram may begin inside one."""
+    begins = 1 if data[:1] == bytes([_SYNC]) else _PACKET
+    least = 1 if begins == 1 else _LEAST_SYNCS
     return len(data) >= _PACKET and any(
-        all(data[k] == _SYNC for k in range(i, len(data), _PACKET))
-        for i in range(min(_PACKET, len(data)))
-        if data[i] == _SYNC
+        len(data[i::_PACKET]) >= least and set(data[i::_PACKET]) == {_SYNC} for i in range(begins)
     )
 
 
@@ -87,7 +91,7 @@ def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
 
 @dataclass
 class RtpPictures:
-    """Puts RTP packets of H.264 or H.265 together: IVF, each picture with its time.
+    """Puts RTP packets of H.264 or H.265 together: IVF or MPEG-TS, each picture with its time.
 
     A picture that lacks a packet is left out: a decoder would show the hole for seconds. sets:
     parameter sets that an SDP gives, put before the first picture.
@@ -104,9 +108,10 @@ class RtpPictures:
     _time: int | None = None  # RTP's, of the picture under way
     _since: int = 0  # RTP's times since the first picture
     _told: int | None = None  # RTP's time of the picture before
+    _transport: TransportStream = field(default_factory=TransportStream)
 
     def take(self, data: bytes) -> bytes:
-        """The bytes of IVF that a datagram completes, often none."""
+        """The bytes for FFmpeg that a datagram completes, often none."""
         payload = payload_of(data)
         if not payload:
             return b""
@@ -163,15 +168,16 @@ class RtpPictures:
             step = (time - self._told) % _WRAP
             self._since += step - _WRAP if step > _WRAP // 2 else step
         self._told = time
-        if not self._begun:
-            self._begun, units = True, self.sets + units
-            return _ivf_header(self.codec) + _ivf_frame(units, self._since)
-        return _ivf_frame(units, self._since)
+        begins, self._begun = not self._begun, True
+        if begins:
+            units = self.sets + units
+        if self.codec == "hevc":
+            return self._transport.picture(units, self._since)
+        return (_ivf_header() if begins else b"") + _ivf_frame(units, self._since)
 
 
-def _ivf_header(codec: str) -> bytes:
-    tag = b"H264" if codec == "h264" else b"HEVC"
-    return struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, tag, 16, 16, _RATE_HZ, 1, 0, 0)
+def _ivf_header() -> bytes:
+    return struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"H264", 16, 16, _RATE_HZ, 1, 0, 0)
 
 
 def _ivf_frame(data: bytes, time: int) -> bytes:

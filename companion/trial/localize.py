@@ -49,7 +49,7 @@ class FrameLocalizer:
         self, localizer: Localizer, relocalizer: Callable[[], Relocalizer], camera: Camera
     ) -> None:
         self._localizer, self._relocalizer, self._camera = localizer, relocalizer, camera
-        self._sequence = 0
+        self._loaded = 0
         self._height_m: float | None = None
 
     def load(self, recorded: RecordedFrame) -> Frame:
@@ -59,8 +59,9 @@ class FrameLocalizer:
         zoom = recorded.telemetry.zoom
         if zoom != 1.0:
             camera = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
-        self._sequence += 1
-        return Frame(image, self._sequence * _STEP_NS, camera, self._sequence)
+        self._loaded += 1
+        # One sequence number, which seeds the hypotheses: the order of photos changes nothing.
+        return Frame(image, self._loaded * _STEP_NS, camera, 0)
 
     def from_prior(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
         """By its own telemetry; what that lacks (heading, height) is searched about its place."""

@@ -152,6 +152,10 @@ def _tracks(trial: Trial) -> list[MapTrack]:
         one.pose.translation[:2] if one.accepted and one.pose is not None else nowhere
         for one in trial.best
     ]
+    if trial.flight.kind == "photos":  # between them nobody knows the way
+        pairs = [row for pair in zip(gnss, vision, strict=True) for row in (*pair, nowhere)]
+        return [MapTrack("from GNSS, with the estimated offset, to vision", _GNSS, INNER,
+                         np.array(pairs))]  # fmt: skip
     return [
         MapTrack("GNSS, with the estimated offset", _GNSS, OUTER, np.array(gnss)),
         MapTrack("vision", VISION, INNER, np.array(vision)),

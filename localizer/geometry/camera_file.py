@@ -29,6 +29,7 @@ _SINGLE_KEY = re.compile(r"[kpsb]\d+|tau_?[xy]|xi|alpha|beta|omega|skew", re.IGN
 _COLMAP = re.compile(r"\d+ +([A-Z_]+) +(\d+) +(\d+)((?: +[-+.\deE]+)+)")
 _OTHER_KEYS = {
     "w": "width", "image_width": "width", "h": "height", "image_height": "height",
+    "xresolution": "width", "yresolution": "height",
     "fl_x": "fx", "fl_y": "fy", "taux": "tau_x", "tauy": "tau_y",
 }  # fmt: skip
 
@@ -139,7 +140,10 @@ def _of_colmap(line: re.Match[str], count: int) -> dict[str, Any]:
 
 def _forms(flat: Mapping[str, Any]) -> dict[str, _Form]:
     """The lens models that are named, by their names."""
-    names = [str(v) for k, v in flat.items() if _MODEL_KEY.fullmatch(k) and v is not None]
+    named = {k: v for k, v in flat.items() if _MODEL_KEY.fullmatch(k) and v is not None}
+    if isinstance(named.get("lens"), int | float):  # CUAV's: the lens's focal length, mm
+        del named["lens"]
+    names = [str(v) for v in named.values()]
     forms = {name: form for name in names if (form := _model(name)) is not None}
     if len({model for model, _ in forms.values()}) > 1:
         raise ValueError(f"{' and '.join(forms)} are two lens models; give one")

@@ -15,6 +15,7 @@ from pyproj import Transformer
 from localizer.errors import GeoreferenceError
 from localizer.geometry.pose import Array, Pose
 
+EARTH_RADIUS_M = 6.371e6  # mean
 _ECEF_FROM_GEODETIC = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 
 

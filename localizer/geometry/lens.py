@@ -126,7 +126,8 @@ def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Proje
     if len(lost):
         return (
             f"the distortion cannot be undone on {len(lost) / len(pixels):.0%} of the picture, as "
-            f"at {lost[0][0]:.0f}, {lost[0][1]:.0f} px; {_CHECK}"
+            f"at {lost[0][0]:.0f}, {lost[0][1]:.0f} px; {_CHECK}. If all are right, calibrate "
+            "again with fewer coefficients: one too many (k3) folds the corners"
         )
     w, h = size
     corners = np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]], np.float64)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import date
 from typing import Literal
 
 Heights = Literal["surface", "terrain", "flat"]
@@ -81,6 +82,20 @@ class MapKind:
             f"no buildings in the heights: expect {expected:.0f} m at {height_m:.0f} m above the "
             f"ground, give attitude to {_GOOD_ATTITUDE_DEG:g} deg"
         )
+
+    def imagery_age(self, today: date, max_days: int) -> tuple[str, bool]:
+        """How old the imagery is, in words, and whether that is known and within a limit.
+
+        A year or a month stands for its first day, so that the age is the oldest possible one.
+        """
+        if not self.imagery_date:
+            return "date not known", False
+        year, month, day = (int(n) for n in f"{self.imagery_date}-01-01".split("-")[:3])
+        try:
+            days = (today - date(year, month, day)).days
+        except ValueError:  # a 31 June that a source stated
+            return f"{self.imagery_date} is no date", False
+        return f"{self.imagery_date} ({days} days ago)", days <= max_days
 
     def expected_error_m(
         self, height_m: float, half_view_deg: float, attitude_sigma_deg: float

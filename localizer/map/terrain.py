@@ -20,7 +20,7 @@ from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from localizer.errors import MapSourceError
-from localizer.geometry.geo import LocalFrame
+from localizer.geometry.geo import EARTH_RADIUS_M, LocalFrame
 from localizer.geometry.pose import Array
 from localizer.map.importers.height_crs import stated_heights
 from localizer.map.importers.raster_file import (
@@ -38,7 +38,6 @@ _MOST_CELLS = 2_000  # of a side
 _LEAST_CELL_M = 5.0
 _MOST_PIXELS = 100_000_000
 _STEEP, _STEEP_SHARE = 5.7, 0.25  # 80 degrees in so many cells is noise, as in a surface model
-_EARTH_M = 6.371e6
 _OUTLINE = 9  # places per side of the raster, to find its box
 
 
@@ -96,7 +95,7 @@ def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
     east, north = np.meshgrid(
         low[0] + cell_m * np.arange(columns), high[1] - cell_m * np.arange(rows)
     )
-    fallen = (east**2 + north**2) / (2 * _EARTH_M)
+    fallen = (east**2 + north**2) / (2 * EARTH_RADIUS_M)
     flat = np.stack([east, north, -fallen], axis=-1)
     latitude, longitude, _ = np.moveaxis(frame.geodetic_from_enu(flat), -1, 0)
     x, y = there.transform(longitude, latitude)

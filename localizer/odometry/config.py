@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from localizer.sensors.error_model import SENSORS
+
 
 @dataclass(frozen=True)
 class GrowthModel:
@@ -40,9 +42,9 @@ class OdometryConfig:
     longest_gap_s: float = 3.0  # time without a usable frame until it is lost
     longest_sigma_m: float = 15.0  # largest sigma of a propagated position
     acceleration_sigma: float = 2.0  # m/s², of the motion without usable frames
-    turn_sigma_deg: float = 0.2  # autopilot's tilt since the keyframe, per axis
-    heading_turn_sigma_deg: float = 0.6  # its heading since the keyframe
-    rise_sigma_m: float = 0.3  # barometer's climb since the keyframe
+    turn_sigma_deg: float = SENSORS.tilt_change_deg  # autopilot's tilt since the keyframe, per axis
+    heading_turn_sigma_deg: float = SENSORS.heading_change_deg  # its heading since the keyframe
+    rise_sigma_m: float = SENSORS.climb_m  # barometer's climb since the keyframe
     parallax_noise: float | None = 0.02  # sigma of a parallax cost, as a share; None: not used
     # growth with depth from the map
     with_map: GrowthModel = GrowthModel(

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
+from localizer.sensors.error_model import SENSORS
 
 _POINTS = 400  # enough for a mean
 _LEAST_EIGENVALUE = 1e-9  # of the scaled normal equations, below which no pose is determined
@@ -31,10 +32,10 @@ class CalibrationSigmas(BaseModel):
     distortion: float = Field(0.003, ge=0, le=1, description="of k1; k2 as much, p1, p2 a tenth")
     readout_ms: float = Field(1.0, ge=0, le=100, description="of a rolling shutter's readout")
     stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
-    map_m: float = Field(0.07, exclude=True)  # of the map's surface, per axis
-    # Ground that changed since the survey errs alike over more than a survey's own bumps: three
-    # flights over other visits were likeliest with 20 m (docs/results/errors.md).
-    map_length_m: float = Field(20.0, exclude=True)  # correlation length of that displacement
+    map_m: float = Field(SENSORS.map_patch_m, exclude=True)  # of the map's surface, per axis
+    map_length_m: float = Field(
+        SENSORS.map_patch_length_m, exclude=True
+    )  # correlation length of that displacement
 
     @classmethod
     def none(cls) -> CalibrationSigmas:

@@ -19,6 +19,7 @@ import numpy as np
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.registration.priors import PoseConstraint
+from localizer.sensors.error_model import SENSORS
 from localizer.tracking.motion import RotationAt
 
 _LEAST_LEVEL = 0.3  # of the camera's x axis that is horizontal: rolled further, there is no pitch
@@ -39,8 +40,10 @@ _APART, _LEAST_APART_M = 0.5, 20.0  # of the distance; between two places that s
 class AttitudePrior:
     """How well the autopilot's attitude and the gimbal's tell the camera's roll and pitch."""
 
-    tilt_sigma_deg: float = 0.4  # smallest error of roll and pitch, without the bias
-    alignment_sigma_deg: float = 1.0  # their bias before it is estimated in flight
+    tilt_sigma_deg: float = SENSORS.tilt_deg  # smallest error of roll and pitch, without the bias
+    alignment_sigma_deg: float = (
+        SENSORS.alignment_deg
+    )  # their bias before it is estimated in flight
 
 
 @dataclass(frozen=True)

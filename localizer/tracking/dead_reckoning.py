@@ -14,6 +14,7 @@ import numpy as np
 
 from localizer.errors import OdometryError
 from localizer.geometry.camera import Camera, followed
+from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry import (
@@ -40,7 +41,7 @@ def fallen_m(place: Array) -> float:
     """By how much the ground of a place (3,) lies below the plane through the world's origin, since
     the Earth is round: 7.8 m at 10 km, where 50 m further on are another 0.08 m.
     """
-    return float(place[:2] @ place[:2]) / (2.0 * _EARTH_M)
+    return float(place[:2] @ place[:2]) / (2.0 * EARTH_RADIUS_M)
 
 
 class PropagationResult(Enum):
@@ -65,7 +66,6 @@ class PropagatedPose:
 _NOTHING = PropagatedPose(PropagationResult.NONE)
 
 
-_EARTH_M = 6.371e6
 # Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5

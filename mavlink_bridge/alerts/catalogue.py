@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from mavlink_bridge.alerts.alert import PREFIX, Alert, AlertSpec, Severity, Value
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR
+from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
 
-CATALOGUE: dict[AlertId, AlertSpec] = {spec.id: spec for spec in (*INTEGRITY, *MONITOR)}
+CATALOGUE: dict[AlertId, AlertSpec] = {spec.id: spec for spec in (*INTEGRITY, *MONITOR, *SOURCES)}
 TEXT_LENGTH = 50  # STATUSTEXT.text
 
 

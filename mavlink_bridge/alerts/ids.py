@@ -28,6 +28,9 @@ class AlertId(enum.Enum):
     FIXES_NOT_CHECKED = "fixes_not_checked"
     COMPONENT_STALLED = "component_stalled"
 
+    # EKF source sets
+    GNSS_REFUSED = "gnss_refused"
+
     @property
     def words(self) -> str:
         """For a table."""

@@ -258,3 +258,21 @@ MONITOR = (
         repeat_s=10.0,
     ),
 )
+SOURCES = (
+    AlertSpec(
+        AlertId.GNSS_REFUSED,
+        Severity.WARNING,
+        "GNSS refused",
+        "GNSS refused: {size:.1f} {why}",
+        {"size": "m or m/s", "why": ""},
+        "GNSS is there while vision flies, and is away from vision, moves otherwise than vision or "
+        "the IMU, scatters, or claims more than 5 m",
+        "it agrees for 5 s",
+        "the receiver is jammed, spoofed or not settled, or the map is shifted; vision flies on",
+        "stay on vision; select GNSS only if landmarks confirm it",
+        cleared_text="GNSS agrees with vision",
+        raise_s=2.0,
+        clear_s=5.0,
+        repeat_s=10.0,
+    ),
+)

@@ -30,7 +30,7 @@ _SOURCE = {
     "vision_position_estimate": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
     "odometry": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
     "gps_input": "GPS1_TYPE=14 and EK3_SRCn_POSXY=3",
-    "global_position_sensor": "EKF2_AGP_CTRL",
+    "global_position_sensor": "EKF2_AGPn_ID=1 and bit 0 of EKF2_AGPn_CTRL, n = 0 to 3",
 }
 
 

@@ -12,11 +12,16 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, cleared, spec_of
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import SourceSwitchConfig
+from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
@@ -114,15 +119,15 @@ class SourceSwitch:
     """Decides; the caller sends and reports the acknowledgement. One thread.
 
     refusal: why GNSS that is bad is not left for vision; empty when that is not so. current: the
-    set in use; None where it is not known.
+    set in use; None where it is not known. returning: what is found of GNSS while it is not used.
     """
 
     def __init__(self, config: SourceSwitchConfig) -> None:
         self._config = config
         self.current: int | None = config.gnss_set
         self.refusal = ""
+        self.returning = GnssReturnCheck()
         self._bad_since_ns: int | None = None
-        self._good_since_ns: int | None = None
         self._sound_since_ns: int | None = None
         self._vision_ns: int | None = None
         self._ordered: int | None = None
@@ -132,7 +137,7 @@ class SourceSwitch:
     def reset(self) -> None:
         """The flight controller rebooted: it starts with its first set."""
         self.current, self._ordered = self._config.gnss_set, None
-        self._bad_since_ns = self._good_since_ns = self._sound_since_ns = None
+        self._bad_since_ns = self._sound_since_ns = None
         self._was_chosen = self._overruled = False
 
     def met_in_flight(self) -> None:
@@ -171,17 +176,18 @@ class SourceSwitch:
         the shadow score of this flight was a go.
         """
         self.refusal = ""
+        fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
+        if self.current == self._config.gnss_set:
+            self.returning.reset()
+        else:
+            self.returning.look(state, vision if fresh and good else None, now_ns)
         if not self._config.enabled:
             return None
-        fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
         fault = gnss_fault(
             state, vision if fresh else None, self._config.inconsistency_sigmas, now_ns
         )
         self._bad_since_ns = None if fault is None else self._bad_since_ns or now_ns
         self._overruled = self._overruled and fault is not None
-        # Without vision nobody contradicts a spoofed receiver that says it is well.
-        good_gnss = fault is None and fresh
-        self._good_since_ns = (self._good_since_ns or now_ns) if good_gnss else None
         # As far as GNSS alone is asked: vision's word against it does not count once that is gone.
         sound = fault is None or not fault.reason.startswith(("GNSS lost", "GNSS glitch"))
         self._sound_since_ns = (self._sound_since_ns or now_ns) if sound else None
@@ -190,7 +196,7 @@ class SourceSwitch:
         if now_ns < self._next_ns:
             return None
         order = self._to_vision(now_ns, fault, fresh and good, may_switch) or self._to_gnss(
-            now_ns, state
+            now_ns, state, fault
         )
         if order is not None:
             self._next_ns = now_ns + _RETRY_NS
@@ -215,12 +221,13 @@ class SourceSwitch:
             return SwitchOrder(self._config.vision_set, fault.reason)
         return None
 
-    def _to_gnss(self, now_ns: int, state: VehicleState) -> SwitchOrder | None:
+    def _to_gnss(
+        self, now_ns: int, state: VehicleState, fault: GnssFault | None
+    ) -> SwitchOrder | None:
         if self.current not in (self._config.vision_set, None) or self._was_chosen:
             return None
-        since = self._good_since_ns
-        waited = since is not None and now_ns - since >= self._config.good_after_s * 1e9
-        if waited and self._config.return_to_gnss and self.current is not None:
+        agrees = self.returning.accepted and fault is None
+        if agrees and self._config.return_to_gnss and self.current is not None:
             return SwitchOrder(self._config.gnss_set, "GNSS good again")
         if self._vision_ns is None or now_ns - self._vision_ns < _VISION_GONE_NS:
             return None
@@ -228,9 +235,10 @@ class SourceSwitch:
         if since is None or now_ns - since < _GNSS_BACK_NS:
             return None
         # Without any position the vehicle lands after 8 s. A receiver that is not where the EKF
-        # went by itself may be the one that was left.
+        # went by itself, or not where vision was while it could be asked, may be a wrong one.
         receiver, ekf = _receiver(state), _ekf(state)
-        if receiver is None or ekf is None or _apart_m(receiver, ekf) > _RETURN_M:
+        refused = self.returning.refusal is not None
+        if refused or receiver is None or ekf is None or _apart_m(receiver, ekf) > _RETURN_M:
             return None
         return SwitchOrder(self._config.gnss_set, "vision gone, GNSS is there")
 
@@ -244,8 +252,11 @@ class SourceOrders:
         commander: Commander,
         teller: StatusNotifier,
         counters: Counter[str],
+        report: Callable[[Alert], None],
     ) -> None:
         self._switch = SourceSwitch(config)
+        self._report = report
+        self._alerted_ns: int | None = None
         self._gnss_set = config.gnss_set
         self._commander = commander
         self._teller = teller
@@ -264,6 +275,11 @@ class SourceOrders:
     def on_gnss(self) -> bool:
         """Whether the flight controller is known to use the set of GNSS."""
         return self.current == self._gnss_set
+
+    @property
+    def gnss_refused(self) -> bool:
+        """Whether a receiver is there, is not used, and contradicts vision."""
+        return self._switch.returning.refusal is not None
 
     def met(self, state: VehicleState) -> None:
         """The vehicle is heard. An ArduPilot that was in the air before this process (it died, and
@@ -304,6 +320,7 @@ class SourceOrders:
     ) -> None:
         """Order a change if it is time for one. good: positions are sent and trusted."""
         order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
+        self._tell_refused(now_ns)
         refusal = self._switch.refusal
         if refusal and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
             self._refused_ns = now_ns  # again as long as it lasts: the operator decides
@@ -314,3 +331,15 @@ class SourceOrders:
         self._commander.send(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
         # Set 2 for a reason and set 1 for another differ by more than digits.
         self._teller.tell("switch", f"EKF source set {order.source_set}: {order.reason}")
+
+    def _tell_refused(self, now_ns: int) -> None:
+        returning, alerted_ns = self._switch.returning, self._alerted_ns
+        again_ns = spec_of(AlertId.GNSS_REFUSED).repeat_s * 1e9
+        if returning.refusal is not None:
+            if alerted_ns is None or now_ns - alerted_ns >= again_ns:
+                self._alerted_ns, why = now_ns, returning.refusal
+                self._report(alert(AlertId.GNSS_REFUSED, size=why.size, why=why.why))
+        elif alerted_ns is not None:
+            self._alerted_ns = None
+            if returning.accepted:
+                self._report(cleared(AlertId.GNSS_REFUSED))

@@ -24,6 +24,8 @@ from mavlink_bridge.preflight.rules import (
     ardupilot_rules,
     arming_rules,
     find_source_set,
+    gnss_rules,
+    missing_feature,
     px4_rules,
 )
 from mavlink_bridge.vehicle.profile import select_profile
@@ -277,17 +279,25 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
     if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
         return Diagnosis(tuple(findings), state)
     say("reading the vehicle's parameters")
+    px4 = state.autopilot == "px4"
     with ParameterClient(config) as client:
-        if state.autopilot == "px4":
-            rules: Sequence[ParameterRule] = px4_rules(config)
+        missing = missing_feature(config, client.read, px4=px4)
+        if missing is not None:
+            name, option = missing
+            why = f"another firmware, built with {option}"
+            found = DoctorFinding("firmware feature", f"no {name}", config.injection.message, why,
+                                  False, True)  # fmt: skip
+            return Diagnosis((*findings, found), state)
+        if px4:
+            rules: Sequence[ParameterRule] = px4_rules(config, client.read)
         else:
             source_set = find_source_set(config, client.read)
             rules = [
                 *ardupilot_rules(config, source_set),
                 *arming_rules(config, source_set, client.read),
+                *(gnss_rules(client.read) if source_set > 1 else ()),
             ]
         findings += check_parameters(rules, client.read)
-        px4 = state.autopilot == "px4"
         known = client.read_known(PX4_PARAMETERS if px4 else PARAMETERS)
         findings += check_failsafes(config, known.get, px4=px4)
     return Diagnosis(tuple(findings), state)

@@ -11,9 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.injection.encode import GLOBAL_SENSOR_ID
 
 _SOURCE_SETS = (1, 2, 3)
 _PX4_LATE_MS = 50.0
+_AGP_INSTANCES = 4
+_AGP_CONTROLS = ("EKF2_AGP0_CTRL", "EKF2_AGP_CTRL")
+_OWN_SOURCES = 0b1001  # FuseAllVelocities, UsePerCoreEKFSources
 _ALL_CHECKS = 1  # bit 0 of ARMING_CHECK, whatever the other bits say
 _EVERY_CHECK = (1 << 21) - 2  # bits 1 to 20, the last is OSD
 _VISION_CHECK = 1 << 18
@@ -122,7 +126,10 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
         ParameterRule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
         ParameterRule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
         ParameterRule(
-            (prefix + "POSZ",), (1.0,), "the barometer is smoother than vision", required=False
+            (prefix + "POSZ",),
+            (1.0,),
+            "vision is rougher, 3 follows wrong GNSS",
+            required=False,
         ),
         ParameterRule(
             (prefix + "YAW",), (1.0,), "a wrong vision yaw is taken unseen", required=False
@@ -217,7 +224,47 @@ def _horizon_rules(delay_ms: float) -> list[ParameterRule]:
     ]
 
 
-def px4_rules(config: BridgeConfig) -> list[ParameterRule]:
+def missing_feature(config: BridgeConfig, read: Read, *, px4: bool) -> tuple[str, str] | None:
+    """The parameter by whose absence firmware was built without what the injection needs, and the
+    build option that brings it; None where it is there.
+
+    Boards with 1 MB of flash come without it. No capability flag of MAVLink tells.
+    """
+    message = config.injection.message
+    parameters: tuple[str, ...]
+    if px4 and message == "global_position_sensor":
+        parameters, option = _AGP_CONTROLS, "CONFIG_EKF2_AUX_GLOBAL_POSITION=y (PX4 1.15 or later)"
+    elif px4:
+        parameters, option = ("EKF2_EV_CTRL",), "CONFIG_EKF2_EXTERNAL_VISION=y (PX4 1.14 or later)"
+    elif message == "gps_input":
+        return None
+    elif read("EK3_SRC1_POSXY") is None:
+        parameters, option = ("EK3_SRC1_POSXY",), "HAL_NAVEKF3_AVAILABLE (ArduPilot 4.1 or later)"
+    else:
+        parameters = ("VISO_TYPE",)
+        option = "HAL_VISUALODOM_ENABLED and EK3_FEATURE_EXTERNAL_NAV (custom.ardupilot.org: "
+        option += "Visual Odometry, External navigation for EKF3)"
+    return None if any(read(p) is not None for p in parameters) else (parameters[0], option)
+
+
+def gnss_rules(read: Read) -> list[ParameterRule]:
+    """ArduPilot with GNSS and vision: what lets it use GNSS by itself while vision is selected."""
+    if not (read("GPS1_TYPE") or read("GPS_TYPE")):
+        return []
+    rules = []
+    options = read("EK3_SRC_OPTIONS")
+    if options is not None:
+        why = "bit 0 fuses GNSS velocity in the vision set; bit 3 gives each EKF core a source "
+        why += "set, and a core that fails brings GNSS back"
+        kept = int(options) & ~_OWN_SOURCES if math.isfinite(options) else 0
+        rules.append(ParameterRule(("EK3_SRC_OPTIONS",), (float(kept),), why))
+    if read("SCR_ENABLE"):
+        why = "a script may select the source set (ahrs-source*.lua): remove it"
+        rules.append(ParameterRule(("SCR_ENABLE",), (0.0,), why, required=False, reboot=True))
+    return rules
+
+
+def px4_rules(config: BridgeConfig, read: Read) -> list[ParameterRule]:
     """What PX4 needs; from its documentation and parameter definitions, not flown here."""
     injection = config.injection
     horizon = ParameterRule(
@@ -229,12 +276,7 @@ def px4_rules(config: BridgeConfig) -> list[ParameterRule]:
         reboot=True,
     )
     if injection.message == "global_position_sensor":
-        return [
-            ParameterRule(
-                ("EKF2_AGP0_CTRL", "EKF2_AGP_CTRL"), (), "bit 0: horizontal position", bits=1
-            ),
-            horizon,
-        ]
+        return [*_agp_rules(read), horizon]
     odometry = injection.message == "odometry"
     stamped = "stamps are exposure times, mapped by TIMESYNC: a delay would count twice"
     why = "bit 0: horizontal position, bit 2: velocity"
@@ -253,4 +295,22 @@ def px4_rules(config: BridgeConfig) -> list[ParameterRule]:
             (f"EKF2_EV_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False
         )
         for axis in "XYZ"
+    ]
+
+
+def _agp_rules(read: Read) -> list[ParameterRule]:
+    """The instance that has our sensor's id, or the first; firmware of one instance has no ids."""
+    why = "bit 0: horizontal position"
+    if read("EKF2_AGP0_ID") is None:
+        return [ParameterRule(_AGP_CONTROLS, (), why, bits=1)]
+    ours = (n for n in range(_AGP_INSTANCES) if read(f"EKF2_AGP{n}_ID") == GLOBAL_SENSOR_ID)
+    prefix = f"EKF2_AGP{next(ours, 0)}_"
+    return [
+        ParameterRule(
+            (prefix + "ID",),
+            (float(GLOBAL_SENSOR_ID),),
+            "the id that the bridge sends",
+            reboot=True,
+        ),
+        ParameterRule((prefix + "CTRL",), (), why, bits=1),
     ]

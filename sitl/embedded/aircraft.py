@@ -25,6 +25,7 @@ from sitl.embedded.severity import CRITICAL, INFO
 from sitl.geodesy import Location
 
 _GPS_FIX_AFTER_S = 30.0  # a cold start; with the filter's 10 s of checks ArduPilot's 42 s
+_GPS_LAG_S = 0.1  # what the filter takes it for
 GPS_SIMULATED = (1, 2)  # GPS1_TYPE auto and u-blox read the simulated receiver
 _GUST_CORRELATION_S = 3.0
 
@@ -146,7 +147,15 @@ class Aircraft:
             self.estimator.add(Compass(self.sensors.compass(self.truth)), now)
         p = self.parameters
         powered = p["SIM_GPS1_ENABLE"] > 0 and p["GPS1_TYPE"] in GPS_SIMULATED
-        sample = self.sensors.gps(self.time_s, self.truth, p["SIM_GPS1_JAM"] > 0, self._glitch())
+        lag_s = p["SIM_GPS1_LAG_MS"] * 1e-3
+        sample = self.sensors.gps(
+            self.time_s,
+            self.truth,
+            p["SIM_GPS1_JAM"] > 0,
+            self._glitch(),
+            lag_s,
+            p["SIM_GPS1_ACC"],
+        )
         started = self.time_s >= _GPS_FIX_AFTER_S
         if powered and started and sample is not None and sample.fix:
             self.gps_sample, self._gps_sample_at = sample, self.time_s
@@ -164,7 +173,8 @@ class Aircraft:
                     sample.satellites,
                     hdop=1.2,
                 ),
-                round(sample.time_s * 1000),
+                # The autopilot does not know of a lag that is not the receiver's usual one.
+                round((sample.time_s + lag_s - _GPS_LAG_S) * 1000),
             )
 
     def _glitch(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -21,7 +21,7 @@ from sitl.operator.operator import LATE_S, LATE_SIGMA_S
 from sitl.operator.pursuer import SECONDS, Pursuer
 from sitl.suite.loop.case import LoopCase
 from sitl.suite.loop.flight import fly
-from sitl.suite.loop.runner import loop_assets
+from sitl.suite.loop.runner import RunOptions, loop_assets
 from sitl.vehicles.process import VehicleKind
 
 HEIGHT_M = 90.0
@@ -67,34 +67,22 @@ class FollowRow:
         return self.verdict is not None and self.verdict.is_followed
 
 
-@dataclass(frozen=True)
-class FollowOptions:
-    """draws: of the car, one flight each, over the world of `seed`."""
-
-    vehicles: tuple[VehicleKind, ...]
-    seed: int
-    draws: tuple[int, ...]
-    out: Path
-    worlds: Path | None = None
-    say: Callable[[str], None] = lambda _: None
-    building: Callable[[str, float], None] = lambda _phase, _share: None
-
-
-def fly_follows(options: FollowOptions) -> tuple[FollowRow, ...]:
-    """Fly them all; ``out/follow.json`` holds what was measured, from the first flight on."""
+def fly_follows(options: RunOptions, world: int) -> tuple[FollowRow, ...]:
+    """Fly along with the car of each seed; ``out/follow.json`` holds what was measured, from the
+    first flight on. world: the seed of the world.
+    """
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[FollowRow] = []
-    for kind, draw in product(options.vehicles, options.draws):
-        options.say(f"following a car on {kind}, world {options.seed}, draw {draw}")
-        rows.append(_flown(kind, draw, options))
+    for kind, draw in product(options.vehicles, options.seeds):
+        options.say(f"following a car on {kind}, world {world}, draw {draw}")
+        rows.append(_flown(kind, draw, options, world))
         text = json.dumps([asdict(row) for row in rows], indent=1, default=str)
         (options.out / "follow.json").write_text(text, encoding="utf-8")
         options.say(line_of(rows[-1]))
     return tuple(rows)
 
 
-def _flown(kind: VehicleKind, draw: int, options: FollowOptions) -> FollowRow:
-    seed = options.seed
+def _flown(kind: VehicleKind, draw: int, options: RunOptions, seed: int) -> FollowRow:
     assets = loop_assets(FLIGHT, seed, options.worlds, options.building)
     folder = options.out / f"{kind}-{seed}-{draw}"
     shutil.rmtree(folder, ignore_errors=True)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from sitl.operator.truth import GroundTruth
 from sitl.operator.wishes import draw_wishes
 from sitl.suite.loop.case import LoopCase
 from sitl.suite.loop.flight import fly
-from sitl.suite.loop.runner import loop_assets
+from sitl.suite.loop.runner import RunOptions, loop_assets
 from sitl.vehicles.process import VehicleKind
 
 # Honest: another visit's world, the demo's camera, errors drawn; about 140 m of ground in view.
@@ -36,19 +35,6 @@ FLIGHT = LoopCase(
         }
     },
 )
-
-
-@dataclass(frozen=True)
-class ClickOptions:
-    """On which vehicles and seeds (world, errors and wishes); clicks: in each flight."""
-
-    vehicles: tuple[VehicleKind, ...]
-    seeds: tuple[int, ...]
-    out: Path
-    clicks: int = 14
-    worlds: Path | None = None
-    say: Callable[[str], None] = lambda _: None
-    building: Callable[[str, float], None] = lambda _phase, _share: None
 
 
 @dataclass(frozen=True)
@@ -68,22 +54,24 @@ class ClickRow:
         return self.verdict is not None and not self.verdict.problems
 
 
-def fly_clicks(options: ClickOptions) -> tuple[ClickRow, ...]:
-    """Fly them all; ``out/targets.json`` holds what was measured, from the first flight on."""
+def fly_clicks(options: RunOptions, clicks: int) -> tuple[ClickRow, ...]:
+    """Fly them all, so many clicks in each; ``out/targets.json`` holds what was measured, from the
+    first flight on.
+    """
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[ClickRow] = []
     for kind, seed in product(options.vehicles, options.seeds):
-        options.say(f"flying {options.clicks} clicks on {kind}, seed {seed}")
-        rows.append(_flown(kind, seed, options))
+        options.say(f"flying {clicks} clicks on {kind}, seed {seed}")
+        rows.append(_flown(kind, seed, options, clicks))
         text = json.dumps(as_data(rows), indent=1, default=str)
         (options.out / "targets.json").write_text(text, encoding="utf-8")
         options.say(line_of(rows[-1]))
     return tuple(rows)
 
 
-def _flown(kind: VehicleKind, seed: int, options: ClickOptions) -> ClickRow:
-    operator = Operator(draw_wishes(seed, options.clicks), seed)
-    case = replace_seconds(FLIGHT, operator.seconds)
+def _flown(kind: VehicleKind, seed: int, options: RunOptions, clicks: int) -> ClickRow:
+    operator = Operator(draw_wishes(seed, clicks), seed)
+    case = FLIGHT.model_copy(update={"seconds": operator.seconds})
     assets = loop_assets(case, seed, options.worlds, options.building)
     folder = options.out / f"{kind}-{seed}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -98,11 +86,6 @@ def _flown(kind: VehicleKind, seed: int, options: ClickOptions) -> ClickRow:
     left = {"asked": [asdict(a) for a in operator.asked], "heard": asdict(operator.heard)}
     (folder / "operator.json").write_text(json.dumps(left, indent=1), encoding="utf-8")
     return ClickRow(kind, seed, verdict, "", record.pace, record.stall_s)
-
-
-def replace_seconds(case: LoopCase, seconds: float) -> LoopCase:
-    """The flight at a length."""
-    return case.model_copy(update={"seconds": seconds})
 
 
 def summary(rows: Sequence[ClickRow]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
@@ -80,26 +81,41 @@ class CaseEvent(_Model):
     """Something that happens at_s seconds after the take-off height is reached.
 
     fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
-    vehicle: parameters set by the ground station. source_set: ordered by the ground station.
+    vehicle: parameters set by the ground station; ramp: parameters that go from one value to
+    another in over_s; scattered: drawn at each step, up to the value that is due, of either sign.
+    source_set: ordered by the ground station.
     """
 
     at_s: float = Field(ge=0)
     fixes: dict[str, Any] = {}
     reset: bool = False
     vehicle: dict[str, float] = {}
+    ramp: dict[str, tuple[float, float]] = {}
+    over_s: float = Field(0.0, ge=0, le=300)
+    scattered: tuple[str, ...] = ()
     source_set: int | None = Field(None, ge=1, le=3)
     reboot: bool = False
 
     @model_validator(mode="after")
     def _does_something(self) -> CaseEvent:
-        if not (self.fixes or self.vehicle or self.source_set or self.reboot):
-            raise ValueError("nothing happens: give fixes, vehicle, source_set or reboot")
+        if not (self.fixes or self.vehicle or self.ramp or self.source_set or self.reboot):
+            raise ValueError("nothing happens: give fixes, vehicle, ramp, source_set or reboot")
+        if not set(self.scattered) <= set(self.ramp) or bool(self.ramp) != (self.over_s > 0):
+            raise ValueError("over_s belongs to a ramp, and `scattered` names parameters of it")
         return self
+
+    def ramped(self, share: float, rng: np.random.Generator) -> dict[str, float]:
+        """The parameters of the ramp after a share of over_s."""
+        due = {name: first + share * (last - first) for name, (first, last) in self.ramp.items()}
+        return {
+            name: value * float(rng.uniform(-1, 1)) if name in self.scattered else value
+            for name, value in due.items()
+        }
 
     @property
     def label(self) -> str:
         """For the plot."""
-        parts = [f"{k}={v}" for k, v in {**self.fixes, **self.vehicle}.items()]
+        parts = [f"{k}={v}" for k, v in {**self.fixes, **self.vehicle, **self.ramp}.items()]
         if self.reset:
             parts.append("reset")
         if self.source_set is not None:

@@ -33,6 +33,7 @@ _SETTLE_S = 3.0
 _REBOOT_S = 60.0  # within which the ports of the next boot are open; a tenth of a second is usual
 _NEAR_M = 3.0
 _STEP_S = 0.1
+_RAMP_STEP_S = 0.4
 _LONGEST_S = 240.0
 _ARMING_TRIES = 3
 
@@ -65,6 +66,8 @@ class _CaseFlight:
         side = case.flight.side_m
         self._corners = [(side, 0.0), (side, side), (0.0, side), (0.0, 0.0)] if side else []
         self._waiting = list(case.timeline)
+        self._ramp: tuple[CaseEvent, float, float] | None = None
+        self._rng = np.random.default_rng(seed)
         self._ticks: list[tuple[float, float]] = []
 
     def run(self) -> CaseRecord:
@@ -81,6 +84,7 @@ class _CaseFlight:
         self._send_to_corner()
         while not self._over():
             self._happen()
+            self._ramp_on()
             self._sample()
             self._steer()
             self._pilot.link.sleep(_STEP_S)
@@ -188,12 +192,23 @@ class _CaseFlight:
             self._record.events.append((self._now_s, event.label))
             self._do(event)
 
+    def _ramp_on(self) -> None:
+        event, begun_s, due_s = self._ramp or (None, 0.0, math.inf)
+        if event is None or self._now_s < due_s:
+            return
+        share = min((self._now_s - begun_s) / event.over_s, 1.0)
+        self._ramp = (event, begun_s, due_s + _RAMP_STEP_S) if share < 1.0 else None
+        for name, value in event.ramped(share, self._rng).items():
+            self._pilot.link.set_parameter(name, value)
+
     def _do(self, event: CaseEvent) -> None:
         if event.fixes:
             self._model = Case.changed(self._model, event)
             self._feed.change(self._model, reset=event.reset)
         for name, value in event.vehicle.items():
             self._pilot.link.set_parameter(name, value)
+        if event.ramp:
+            self._ramp = (event, self._now_s, self._now_s)
         if event.source_set is not None:
             self._pilot.use_source_set(event.source_set)
         if event.reboot:

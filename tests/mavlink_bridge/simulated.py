@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.alerts.catalogue import text as alert_text
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd
@@ -101,6 +102,7 @@ class Flight:
             LookAt(config, GEOID, say),
             lambda *told: self.vehicle_texts.append(told),
             lambda: self.now_ns,
+            lambda alert: self.texts.append(alert_text(alert)),
         )
         self.shared = shared
         self.end = FlightControllerEnd(shared)

@@ -246,33 +246,6 @@ def test_command_gates_injection(
     assert told == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
 
 
-def test_rotated_frame_is_refused_and_told_once(autopilot: Any, run: Callable[..., Bridge]) -> None:
-    autopilot.origin = (*HOME, 488.0)
-    bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-
-    def told() -> list[str]:
-        return [m.text for m in list(autopilot.of("STATUSTEXT")) if "yaw differs" in m.text]
-
-    def refused() -> int:
-        return int(bridge.counters().get("inject_fixes_yaw_refused", 0))
-
-    def rotated() -> bool:
-        """One more fix, of a time whose attitude is known; true when the refusal was told."""
-        then_ns = time.monotonic_ns()
-        # The buffer looks 0.1 s ahead: it has an attitude after that time, too.
-        assert sleep_until(lambda: bridge.attitude_at(then_ns + 101_000_000) is not None, 30.0)
-        bridge.submit(make_fix(time_ns=then_ns, yaw_rad=math.radians(5.0)))
-        return bool(told())
-
-    assert sleep_until(rotated, 30.0)
-    enough = refused() + 10
-    assert sleep_until(lambda: bool(rotated() and refused() >= enough), 30.0)
-    assert autopilot.of("VISION_POSITION_ESTIMATE") == []
-    assert len(told()) == 1
-    assert len([text for text in bridge.texts() if "yaw differs" in text]) == 1
-
-
 def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
     autopilot: Any, run: Callable[..., Bridge]
 ) -> None:
@@ -312,44 +285,6 @@ def test_streams_are_asked_for_until_they_come(autopilot: Any, run: Callable[...
         return {int(m.param1) for m in commands if m.command == wanted}
 
     assert sleep_until(lambda: asked() >= {30, 32, 33, 24, 193, 285}, 30.0), asked()
-
-
-def test_reboot_in_flight_is_survived(autopilot: Any, run: Callable[..., Bridge]) -> None:
-    bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-    feed(bridge, more(autopilot, 3))
-    autopilot.reboot()
-    assert sleep_until(lambda: bridge.state().reboots == 1, 30.0)
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-    feed(bridge, more(autopilot, 5))
-    assert sleep_until(
-        lambda: bridge.attitude_at(time.monotonic_ns() - 100_000_000) is not None, 30.0
-    )
-
-
-def test_silence_is_a_lost_vehicle_and_injection_resumes(
-    autopilot: Any, run: Callable[..., Bridge]
-) -> None:
-    autopilot.origin = (*HOME, 488.0)
-    bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-    autopilot.streaming = False
-    assert sleep_until(lambda: not bridge.state().connected, 30.0)
-    autopilot.streaming = True
-    assert sleep_until(lambda: bridge.state().connected, 30.0)
-    feed(bridge, more(autopilot, 4))
-
-
-def test_noise_on_the_link_does_not_stop_it(autopilot: Any, run: Callable[..., Bridge]) -> None:
-    autopilot.origin = (*HOME, 488.0)
-    bridge = run(config(autopilot.port), autopilot)
-    rng = np.random.default_rng(6)
-    for _ in range(300):
-        autopilot.send_bytes(rng.bytes(int(rng.integers(1, 300))))
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-    feed(bridge, more(autopilot, 4))
-    assert sleep_until(lambda: int(bridge.counters()["fc_bad_bytes"]) > 10_000, 30.0)
-    assert bridge.counters()["fc_handler_errors"] == 0
 
 
 def test_timesync_requests_are_answered_on_our_clock(

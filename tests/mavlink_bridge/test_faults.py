@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
-from mavlink_bridge.flight_controller import FC_WANTED
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.injection_enable import InjectionEnable
@@ -389,45 +388,6 @@ def _payload(kind: Any, values: list[float]) -> bytes:
         one = bytes([int(value)]) if code == "c" else struct.pack(f"<{code}", value)
         packed += one * max(count, 1)
     return bytes(packed)
-
-
-def extreme_messages() -> Iterator[Any]:
-    """Every message that is listened to, with each field at each of its extremes, and all at once:
-    from the vehicle, from a ground station.
-    """
-    reader = FrameReader()
-    for number in sorted(FC_WANTED):
-        kind = mavlink.mavlink_map[number]
-        codes = kind.native_format.decode().lstrip("<")
-        plain = [0.5 if code in _EXTREMES else 1 for code in codes]
-        cases = [[*plain[:i], v, *plain[i + 1 :]]
-                 for i, code in enumerate(codes) for v in _extremes(code)]  # fmt: skip
-        cases += [[_extremes(c)[k % len(_extremes(c))] for c in codes] for k in range(7)]
-        for values in cases:
-            payload = _payload(kind, values)
-            for system, component in ((1, 1), (255, 190)):
-                header = bytes([0xFD, len(payload), 0, 0, 0, system, component])
-                header += number.to_bytes(3, "little")
-                crc = mavlink.x25crc(header[1:] + payload)
-                crc.accumulate(bytes([kind.crc_extra]))
-                yield from reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
-
-
-def test_every_field_of_every_message_at_its_extremes_raises_nothing(flight: Flight) -> None:
-    ground, link = GroundEnd(flight.shared), SimulatedLink(system_id=1)
-    count = 0
-    for message in extreme_messages():
-        count += 1
-        flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
-        ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
-        if count % 8 == 0:
-            flight.run(0.02)
-            ground.on_tick(link, flight.now_ns)  # type: ignore[arg-type]
-    assert count > 1000
-    flight.reboot()
-    flight.run(30.0)
-    assert len(flight.vision(flight.now_ns - 10 * SECOND)) > 90
-    assert flight.attitude_error() < 0.005
 
 
 @pytest.mark.parametrize("jumps", [1, 2, 3])

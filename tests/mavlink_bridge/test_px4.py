@@ -136,7 +136,11 @@ def test_global_position_sensor_says_when_it_was_sent_and_how_old_it_is() -> Non
 
 def rules(message: Any, parameters: dict[str, float]) -> dict[str, float | None]:
     config = BridgeConfig(injection=InjectionConfig(message=message, delay_ms=150, rate_hz=30))
-    return {f.name: f.fix for f in check_parameters(px4_rules(config), parameters.get) if not f.ok}
+    return {
+        f.name: f.fix
+        for f in check_parameters(px4_rules(config, parameters.get), parameters.get)
+        if not f.ok
+    }
 
 
 GOOD = {"EKF2_EV_CTRL": 5.0, "EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0, "EKF2_EV_QMIN": 0.0}
@@ -155,11 +159,21 @@ def test_parameters_of_external_vision() -> None:
     assert rules("odometry", quality) == {}
 
 
-def test_parameters_of_the_global_sensor_in_old_and_new_names() -> None:
-    for name in ("EKF2_AGP_CTRL", "EKF2_AGP0_CTRL"):
-        assert rules("global_position_sensor", {name: 1.0, "EKF2_DELAY_MAX": 200.0}) == {}
-        found = rules("global_position_sensor", {name: 2.0, "EKF2_DELAY_MAX": 200.0})
-        assert found == {name: 3.0}
+@pytest.mark.parametrize(
+    ("parameters", "fixes"),
+    [
+        ({"EKF2_AGP_CTRL": 1.0}, {}),  # PX4 of one instance
+        ({"EKF2_AGP_CTRL": 2.0}, {"EKF2_AGP_CTRL": 3.0}),
+        ({"EKF2_AGP0_ID": 1.0, "EKF2_AGP0_CTRL": 1.0}, {}),
+        ({"EKF2_AGP0_ID": 0.0, "EKF2_AGP0_CTRL": 1.0}, {"EKF2_AGP0_ID": 1.0}),
+        ({"EKF2_AGP0_ID": 1.0, "EKF2_AGP0_CTRL": 2.0}, {"EKF2_AGP0_CTRL": 3.0}),
+        ({"EKF2_AGP0_ID": 3.0, "EKF2_AGP2_ID": 1.0, "EKF2_AGP2_CTRL": 1.0}, {}),
+    ],
+)  # fmt: skip
+def test_parameters_of_the_global_sensor_in_each_instance(
+    parameters: dict[str, float], fixes: dict[str, float]
+) -> None:
+    assert rules("global_position_sensor", {**parameters, "EKF2_DELAY_MAX": 200.0}) == fixes
 
 
 def test_profile_is_chosen_from_1_15_on() -> None:

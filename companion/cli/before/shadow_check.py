@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -63,7 +66,8 @@ def shadow_check_command(
             deployment = _deployment(flight, map_cache, mount_pitch)
         else:
             deployment = load_config(config).model_copy(update={"map": map_cache})
-        with shown_count(console, "playing the flight, s", begins=COMPILES) as count:
+        playing = shown_count(console, "playing the flight, s", begins=COMPILES)
+        with playing as count, _quiet("mavlink_bridge.status"):
             found = shadow_check(
                 flight, video, deployment, rate_hz, lambda s, total: count(round(s), round(total))
             )
@@ -71,6 +75,18 @@ def shadow_check_command(
         report.write_text(json.dumps(asdict(found) | {"go": found.go}, indent=1), encoding="utf-8")
     _show(found)
     raise typer.Exit(0 if found.go else 1)
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Without that logger's warnings: what the operator is told stands in the table."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _deployment(flight: RecordedFlight, map_cache: Path, mount_pitch: float) -> CompanionConfig:

@@ -25,11 +25,12 @@ from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_pl
 from localizer.map.importers.textures import palette_mesh, require_readable
 from localizer.map.importers.tiles3d import inside, read_file
 from localizer.map.source import SourceMesh
+from localizer.plain_files import legible
 
 _LINE_BYTES = 1 << 16  # of an OBJ
-_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
-_USE = re.compile(rb"^[ \t]*usemtl[ \t]", re.MULTILINE)
-_MENTIONS_LIBRARY = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]", re.MULTILINE)
+_FACE = re.compile(rb"(?m)^[ \t]*f[ \t]")
+_USE = re.compile(rb"(?im)^[ \t]*usemtl[ \t]+([^\r\n]*)")
+_MENTIONS_LIBRARY = re.compile(rb"(?im)^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]")
 _OWN_LIBRARY = "materials.mtl"
 _OPAQUE = 128
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -96,6 +97,13 @@ def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         if not libraries and _MENTIONS_LIBRARY.search(text):
             doubts.append("its material library is not there: it has no picture")
+        used = {legible(match[1]).strip() for match in _USE.finditer(text)}
+        unknown = sorted(used - {m.name for m in found} - {""})
+        if unknown:
+            doubts.append(
+                f"{len(unknown)} of its materials are in no library (newmtl), first "
+                f"{unknown[0]!r}: their faces have no picture"
+            )
         if len(found) > 1 and not _names_first_face(text):
             doubts.append(
                 f"faces name no material (usemtl) and its library has {len(found)}: they are grey"
@@ -139,7 +147,7 @@ def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:
 
 def _with_materials(text: bytes, materials: Mapping[str, MtlMaterial]) -> bytes:
     """An OBJ that names its own library first; faces before any usemtl get the only material."""
-    text = text.removeprefix(b"\xef\xbb\xbf")
+    text = _USE.sub(rb"usemtl \1", text.removeprefix(b"\xef\xbb\xbf"))
     if len(materials) == 1 and not _names_first_face(text) and (face := _FACE.search(text)):
         (name,) = materials
         text = text[: face.start()] + f"usemtl {name}\n".encode() + text[face.start() :]

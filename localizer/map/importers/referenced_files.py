@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from localizer.plain_files import legible
+
 _LONGEST_JSON = 1 << 30
 _LONGEST_PACKED = 64 << 20  # of a compressed header
 _B3DM_HEADER = 28
-_LIBRARY = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
-_PICTURE = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)",
-                      re.MULTILINE | re.IGNORECASE)  # fmt: skip
+_LIBRARY = re.compile(rb"(?im)^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]+([^\r\n]+)")
+_PICTURE = re.compile(r"(?im)^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)")
 
 
 def file_of(folder: Path, name: str) -> Path:
@@ -86,25 +87,26 @@ def _of_obj(path: Path) -> Iterator[Path]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         libraries = [match[1] for match in _LIBRARY.finditer(text)]
     for names in libraries:
-        for library in {*_named(path.parent, names), *_each(path.parent, names)}:
+        line = legible(names)
+        for library in {*_named(path.parent, line), *_each(path.parent, line)}:
             yield library
             if library.is_file():
-                for match in _PICTURE.finditer(library.read_bytes()):
+                for match in _PICTURE.finditer(legible(library.read_bytes())):
                     yield from _named(path.parent, match[1])
 
 
-def _named(folder: Path, text: bytes) -> Iterator[Path]:
+def _named(folder: Path, text: str) -> Iterator[Path]:
     """The file of the whole line, which may have blanks, and that of its last word: before it may
     stand options.
     """
-    line = text.decode("utf-8", "replace").strip()
+    line = text.strip()
     for name in {line, line.split()[-1]} if line else ():
         yield file_of(folder, name)
 
 
-def _each(folder: Path, text: bytes) -> Iterator[Path]:
+def _each(folder: Path, text: str) -> Iterator[Path]:
     """The files of the line's words: a line may name several libraries."""
-    for name in text.decode("utf-8", "replace").split():
+    for name in text.split():
         yield file_of(folder, name)
 
 

@@ -224,11 +224,11 @@ class _Reader:
         return node
 
     def _require_version(self, version: Any, path: Path) -> None:
-        """1.0 and 1.1; several exporters write 0.0 or nothing for 1.0."""
+        """1.0 and 1.1; several exporters write 0.0, 0, 1 or nothing for 1.0."""
         text = "" if version is None else str(version).strip()
         if text in ("1.0", "1.1"):
             return
-        if text and not text.startswith("0."):
+        if text not in ("", "0", "1") and not text.startswith("0."):
             raise MapSourceError(f"{path}: 3D Tiles version {version!r}; 1.0 and 1.1 are read")
         said = f"version {version!r}" if text else "no version"
         self.warnings.append(f"{path.name}: {said}, read as 1.0")

@@ -116,8 +116,7 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
         _holes_finding(mosaic, holes),
         _blank_finding(mosaic, blank),
         *_source_finding(cache),
-        _texels(cache, use),
-        _detail(kind, use),
+        *_sharpness(cache, kind, use),
         _date(kind),
         _seam_finding(seams),
         _shift(shift),
@@ -282,10 +281,14 @@ def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> MapFinding:
     return MapFinding("without picture", found, Grade.GOOD, "as it should be")
 
 
+def _sharpness(cache: TileCache, kind: MapKind, use: Use) -> list[MapFinding]:
+    if not len(_leaf_gsd(cache)) and not cache.manifest.gsd_m:
+        return [MapFinding("texel size", "none", Grade.BAD, "no tile has a picture")]
+    return [_texels(cache, use), _detail(kind, use)]
+
+
 def _texels(cache: TileCache, use: Use) -> MapFinding:
     gsd = _leaf_gsd(cache)
-    if not len(gsd) and not cache.manifest.gsd_m:
-        return MapFinding("texel size", "none", Grade.BAD, "no tile has a picture")
     typical = float(np.median(gsd)) if len(gsd) else cache.manifest.gsd_m
     ratio = typical / use.pixel_m
     found = f"{typical:.2f} m (median), a working pixel {use.pixel_m:.2f} m at {use.height_m:.0f} m"

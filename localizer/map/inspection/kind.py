@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
@@ -17,7 +18,6 @@ from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import TopView, render_top_view
 from localizer.types import Float32
 
-_EARTH_M = 6.371e6
 _CELL_M, _CELLS = 1.0, 256  # of a square of heights
 _SQUARES = 9
 _WINDOW_CELLS = 61  # wider than most buildings: what an opening of this size takes off stands up
@@ -123,7 +123,7 @@ def objects(height: Float32, cell_m: float) -> NDArray[np.bool_]:
 
 def _from_plane_m(points: Array) -> float:
     """Deviation of points (N, 3) from a plane that follows the Earth's curve."""
-    level = points[:, 2] + (points[:, :2] ** 2).sum(axis=1) / (2 * _EARTH_M)
+    level = points[:, 2] + (points[:, :2] ** 2).sum(axis=1) / (2 * EARTH_RADIUS_M)
     design = np.column_stack([points[:, :2], np.ones(len(points))])
     return float(np.std(level - design @ np.linalg.lstsq(design, level, rcond=None)[0]))
 

@@ -1,4 +1,4 @@
-"""Sensor models: IMU with bias and random walk, barometer, compass, GNSS receiver with latency.
+"""Sensor models: IMU with bias and random walk, barometer, compass, GNSS receiver with lag.
 
 Levels are those of a good consumer autopilot, so that dead reckoning over a 5 s gap stays under a
 metre, as measured on ArduPilot SITL. Everything is drawn from one seeded generator.
@@ -21,7 +21,7 @@ _GYRO_BIAS, _GYRO_WALK = 0.0008, 1e-5  # rad/s at start; rad/s/sqrt(s)
 _ACCEL_BIAS, _ACCEL_WALK = 0.03, 1e-3  # m/s²; m/s²/sqrt(s)
 _BARO_NOISE, _BARO_WALK = 0.12, 0.015  # m; m/sqrt(s)
 _COMPASS_NOISE, _COMPASS_OFFSET = 0.02, 0.01  # rad of heading
-_GPS_PERIOD_S, _GPS_LATENCY_S = 0.2, 0.1
+_GPS_PERIOD_S = 0.2
 _GPS_WANDER_S = 60.0  # correlation time of the slowly moving part
 _GPS_HORIZONTAL, _GPS_VERTICAL, _GPS_WHITE, _GPS_SPEED = 0.25, 0.25, 0.08, 0.05
 
@@ -119,19 +119,29 @@ class Sensors:
         yaw = euler(x[ATTITUDE : ATTITUDE + 4])[2]
         return wrap_pi(yaw + self._compass_offset + float(self._rng.normal()) * _COMPASS_NOISE)
 
-    def gps(self, time_s: float, x: Array, jammed: bool, glitch: Array) -> GpsSample | None:
-        """The solution that arrives now, if one does; it is `_GPS_LATENCY_S` old.
+    def gps(
+        self,
+        time_s: float,
+        x: Array,
+        jammed: bool,
+        glitch: Array,
+        lag_s: float = 0.1,
+        accuracy_m: float = 0.5,
+    ) -> GpsSample | None:
+        """The solution that arrives now, if one does; it is lag_s old and claims accuracy_m.
 
         glitch: (3,) NED metres added to its position.
         """
         if time_s >= self._gps_next_s:
             self._gps_next_s = time_s + _GPS_PERIOD_S
-            self._gps_pending.append(self._measure(time_s, x, jammed, glitch))
-        if self._gps_pending and time_s >= self._gps_pending[0].time_s + _GPS_LATENCY_S:
+            self._gps_pending.append(self._measure(time_s, x, jammed, glitch, accuracy_m))
+        if self._gps_pending and time_s >= self._gps_pending[0].time_s + lag_s:
             return self._gps_pending.popleft()
         return None
 
-    def _measure(self, time_s: float, x: Array, jammed: bool, glitch: Array) -> GpsSample:
+    def _measure(
+        self, time_s: float, x: Array, jammed: bool, glitch: Array, accuracy_m: float
+    ) -> GpsSample:
         keep = exp(-_GPS_PERIOD_S / _GPS_WANDER_S)
         draw = self._rng.standard_normal(9)
         step = sqrt(1 - keep**2) * self._gps_sigma * draw[0:3]
@@ -140,7 +150,7 @@ class Sensors:
             time_s,
             x[POSITION : POSITION + 3] + glitch + self._gps_wander + _GPS_WHITE * draw[3:6],
             x[VELOCITY : VELOCITY + 3] + _GPS_SPEED * draw[6:9],
-            horizontal_accuracy=0.5,
+            horizontal_accuracy=accuracy_m,
             vertical_accuracy=0.8,
             speed_accuracy=0.3,
         )

@@ -25,10 +25,10 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 
 
 @dataclass(frozen=True)
-class LoopOptions:
-    """On which vehicles, over which worlds (one for each seed), and where records and worlds are
+class RunOptions:
+    """On which vehicles, with which seeds (world, light, errors), and where records and worlds are
     kept. say: progress, one line at a time; building: how far a world is that is being made (what,
-    share done); landed: every flight's outcome as it comes.
+    share done).
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -37,12 +37,13 @@ class LoopOptions:
     worlds: Path | None = None
     say: Callable[[str], None] = lambda _: None
     building: Callable[[str, float], None] = lambda _phase, _share: None
-    landed: Callable[[LoopRow], None] = lambda _: None
 
 
-def fly_loop(cases: Sequence[LoopCase], options: LoopOptions) -> tuple[LoopRow, ...]:
+def fly_loop(
+    cases: Sequence[LoopCase], options: RunOptions, landed: Callable[[LoopRow], None]
+) -> tuple[LoopRow, ...]:
     """Fly all cases with every seed; ``out/VEHICLE-NAME-SEED`` holds each flight, ``out/loop.json``
-    and ``out/loop.md`` the table.
+    and ``out/loop.md`` the table. landed: every flight's outcome as it comes.
     """
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[LoopRow] = []
@@ -50,7 +51,7 @@ def fly_loop(cases: Sequence[LoopCase], options: LoopOptions) -> tuple[LoopRow, 
         options.say(f"flying {case.name} on {kind}, seed {seed}: {case.title}")
         row = _flown(case, kind, seed, options)
         rows.append(row)
-        options.landed(row)
+        landed(row)
         report = json.dumps(as_data(rows), indent=1, allow_nan=False)
         (options.out / "loop.json").write_text(report, encoding="utf-8")
         (options.out / "loop.md").write_text(markdown(rows), encoding="utf-8")
@@ -85,7 +86,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
-def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: LoopOptions) -> LoopRow:
+def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: RunOptions) -> LoopRow:
     assets = loop_assets(case, seed, options.worlds, options.building)
     folder = options.out / f"{kind}-{case.name}-{seed}"
     shutil.rmtree(folder, ignore_errors=True)

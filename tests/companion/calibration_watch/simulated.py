@@ -13,8 +13,9 @@ from companion.calibration_watch.config import CalibrationLimits
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.integrity_monitor.inertial import GRAVITY, InertialTrack
+from companion.integrity_monitor.inertial import InertialTrack
 from localizer.geometry.pose import matrix_from_euler, so3_exp
+from localizer.sensors.error_model import GRAVITY_MPS2
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, GimbalAttitude, InertialSample, VehicleState
 from mavlink_bridge.vehicle.origin import offset
@@ -183,7 +184,7 @@ class Flown:
         """Of the true, level body; the autopilot's tilt is what is wrong."""
         noise = self._rng.standard_normal(6)
         yaw = float(self.route.yaw[k])
-        ned = np.array([acceleration[0], acceleration[1], -acceleration[2] - GRAVITY])
+        ned = np.array([acceleration[0], acceleration[1], -acceleration[2] - GRAVITY_MPS2])
         north, east, down = matrix_from_euler(0.0, 0.0, yaw).T @ ned + 0.1 * noise[:3]
         rates = (0.003 * noise[3], 0.003 * noise[4], rate + 0.003 * noise[5])
         return InertialSample(round(self._at_s * 1e9), (north, east, down), rates)

@@ -208,9 +208,11 @@ def test_what_is_odd_about_a_flights_tags_is_told(tmp_path):
     flags = (50, 34, 50)
     for k, (height, above) in enumerate(((520, 80), (521, 81), (569, 81))):
         more = f'drone-dji:RtkFlag="{flags[k]}" drone-dji:RelativeAltitude="{above:+}"'
+        more += ' drone-dji:AltitudeType="GpsFusionAlt"'
         _placed(tmp_path / f"DJI_{k}.JPG", height=height, more=more)
     told = _convert(tmp_path, tmp_path / "o", *PHOTOS).output
     assert "RtkFlag 34, 50: not all photos have an RTK fix" in told
+    assert "AltitudeType GpsFusionAlt: such heights are amsl, not ellipsoidal" in told
     assert "DJI_2.JPG: AbsoluteAltitude less RelativeAltitude steps by +48.0 m" in told
     assert "DJI_1.JPG" not in told
 

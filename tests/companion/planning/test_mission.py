@@ -6,6 +6,7 @@ import pytest
 
 from companion.errors import MissionFileError
 from companion.planning.mission import HeightAbove, read_mission
+from mavlink_bridge.mission.items import LoiterCircle
 
 HOME = (47.2, 8.2, 20)
 PATTERN = {
@@ -64,11 +65,13 @@ def test_a_landing_pattern_is_flown_over_its_approach_to_its_landing(tmp_path, k
 
 
 def test_a_landing_pattern_of_an_older_file(tmp_path):
-    old = PATTERN | {"complexItemType": "fwLandingPattern", "loiterAltitudeRelative": False}
+    old = PATTERN | {"complexItemType": "fwLandingPattern", "loiterAltitudeRelative": False,
+                     "loiterClockwise": False}  # fmt: skip
     del old["landingApproachCoordinate"]
     old["loiterCoordinate"] = [47.2009, 8.2009, 480]
     mission = plan(tmp_path, waypoint(47.201, 80), old, vehicleType=1)
     approach, landing = mission.path[-2:]
+    assert approach.circle == LoiterCircle(-75)
     assert (approach.height_m, approach.above) == (480, HeightAbove.SEA)
     assert (landing.height_m, landing.above) == (0, HeightAbove.HOME)
     slow = PATTERN | {"complexItemType": "fwLandingPattern", "useLoiterToAlt": False,

@@ -198,6 +198,7 @@ def test_a_loiter_circle_is_judged_as_a_leg(tmp_path, cache):
     names = ["home to 1", *["circle 1"] * 3, "1 to 2"]
     assert [(leg.name, leg.first) for leg in legs] == list(zip(names, (0, 1, 1, 1, 4), strict=True))
     circle = legs[1]
+    assert [leg.is_circle for leg in legs] == [False, True, True, True, False]
     assert circle.length_m == pytest.approx(2 * math.pi * 40, rel=2e-3)
     away = np.array([s.position[:2] for s in circle.samples]) - (60, 0)
     assert np.linalg.norm(away, axis=1) == pytest.approx(40, abs=0.2)
@@ -230,6 +231,11 @@ def test_missions_that_cannot_be_placed_are_named(tmp_path, cache):
         legs_of(read_mission(beside), cache, ground, GIMBAL, 25.0)
     spot = plan_file(tmp_path / "s.plan", cache, waypoint(cache, 0, 0, 50))
     with pytest.raises(MissionFileError, match="goes nowhere"):
+        legs_of(read_mission(spot), cache, ground, GIMBAL, 25.0)
+    nowhere = json.loads(spot.read_text())
+    nowhere["mission"]["plannedHomePosition"] = [0, 0, 0]
+    spot.write_text(json.dumps(nowhere))
+    with pytest.raises(MissionFileError, match="one place and no home"):
         legs_of(read_mission(spot), cache, ground, GIMBAL, 25.0)
     local = plan_file(tmp_path / "l.plan", cache, waypoint(cache, 0, 0, 50, frame=1))
     with pytest.raises(MissionFileError, match="frame 1"):
@@ -339,22 +345,24 @@ def test_no_verdict_is_given_for_what_was_not_judged(tmp_path, cache):
     path = plan_file(
         tmp_path / "a.plan", cache, item(178, 1, 18, -1, 0, 0, 0, 0), waypoint(cache, 60, 0, 60),
         waypoint(cache, 60, 60, 60), item(177, 2, 1, 0, 0, 0, 0, 0), scan,
-        waypoint(cache, 0, 60, 60),
+        item(18, 1, 0, 30, 0, *place(cache, 0, 60), 60),
     )  # fmt: skip
     out = tmp_path / "report"
     done = run(path, "--config", config, "--out", out, "--no-alternatives", "--spacing", 60)
     assert done.exit_code == 1, done.output
     words = " ".join(done.output.split())
     assert "Not judged: StructureScan (item 5)" in words
+    assert "3 legs and 1 circle" in words
     assert "all 3 legs" not in words
+    assert "Imagery: date not known; map_max_age_days is 730." in words
     assert "StructureScan (item 5)" in (out / "plan.html").read_text()
     made = json.loads((out / "plan.json").read_text())
     assert not made["holds"]
     assert made["speed_m_s"] == 18
     assert [(leg["name"], leg["times"]) for leg in made["legs"]] == [
-        ("home to 1", 1), ("1 to 2", 2), ("2 to 1", 1),
+        ("home to 1", 1), ("1 to 2", 2), ("2 to 1", 1), ("circle 3", 1),
     ]  # fmt: skip
-    assert made["length_m"] == pytest.approx(60 * 4, abs=1)
+    assert made["length_m"] == pytest.approx(60 * 4 + math.tau * 30, abs=1)
 
 
 def test_a_mission_over_the_edge_is_told_with_pictures_and_exit_code_1(tmp_path, cache):

@@ -43,12 +43,21 @@ def _findings(map_cache, source, model=MODEL, rate_hz=20.0, **settings):
 
 def test_a_good_deployment(map_cache, feed):
     findings = _findings(map_cache, feed)
-    assert set(findings) == {"map", "map's kind", "localizer", "camera", "power mode"}
+    assert set(findings) == {
+        "map",
+        "map's kind",
+        "map's imagery",
+        "localizer",
+        "camera",
+        "power mode",
+    }
     assert all(findings[name].ok for name in ("map", "localizer", "camera"))
     assert findings["localizer"].found.startswith("tiny (onnxruntime, ")
     assert "numba" in findings["localizer"].found
     assert findings["camera"].found == "160x120, 20.0 Hz"
     assert "tiles" in findings["map"].found
+    imagery = findings["map's imagery"]
+    assert (imagery.found, imagery.ok, imagery.required) == ("date not known", False, False)
 
 
 def test_a_scaled_feed_is_advice_and_a_slow_or_cropped_one_is_wrong(map_cache, feed):

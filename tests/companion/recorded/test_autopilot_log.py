@@ -143,6 +143,12 @@ def test_photos_beside_a_log_take_its_telemetry(tmp_path):
     north, east, *_ = swaying(4.0)
     first = flight.frames[0].telemetry.position
     assert (first.latitude_deg, first.longitude_deg) == pytest.approx(place(north, east), abs=1e-5)
+    write_dataflash(tmp_path / "flight.bin", swaying, 8.0)
+    flight = read_footage(tmp_path, FootageOptions(tmp_path / "work", fov_deg=60.0))
+    assert any(note.startswith("flight.bin covers 6 of 10 images") for note in flight.notes)
+    write_dataflash(tmp_path / "flight.bin", swaying, 2.0)
+    with pytest.raises(FootageError, match="says nothing of the time of the images"):
+        read_footage(tmp_path, FootageOptions(tmp_path / "work", fov_deg=60.0))
     later = rows.replace(f"{frames[0].time_ns / 1e9:.3f}"[:6], "153999")
     (tmp_path / "times.csv").write_text("name,latitude,longitude,utc\n" + later)
     with pytest.raises(FootageError, match="another day"):

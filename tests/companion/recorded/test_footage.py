@@ -101,6 +101,34 @@ def test_zero_angles_other_lenses_and_rotated_photos_are_told(tmp_path):
     assert "4 photos are marked as rotated" in notes
 
 
+def test_what_cannot_be_used_is_left_out_or_refused(tmp_path):
+    folder = _survey(tmp_path / "p")
+    (folder / "DJI_0001.JPG").write_bytes((folder / "DJI_0001.JPG").read_bytes()[:200])
+    flight = read_footage(folder, FootageOptions(tmp_path / "w"))
+    assert len(flight.frames) == 3
+    assert "1 photos are left out, the first" in flight.notes[0]
+    for photo in folder.iterdir():
+        photo.write_bytes(b"no photo")
+    with pytest.raises(FootageError, match="not an image that can be read"):
+        read_footage(folder, FootageOptions(tmp_path / "w"))
+    with pytest.raises(FootageError, match="give one of its folders: p"):
+        read_footage(tmp_path, FootageOptions(tmp_path / "w"))
+
+
+def test_photos_that_another_program_turned_are_refused(tmp_path):
+    folder = tmp_path / "p"
+    folder.mkdir()
+    exif = {_FOCAL_35: 24, 0xA002: 4000, 0xA003: 3000}
+    write_photo(folder / "a.jpg", exif=exif, size=(30, 40))
+    with pytest.raises(FootageError, match="another program turned its pixels"):
+        read_footage(folder, FootageOptions(tmp_path / "w"))
+    write_photo(folder / "a.jpg", exif=exif, size=(40, 30))
+    (folder / "places.csv").write_text("name,lat,lon\na.jpg,0.0,0.0\n")
+    flight = read_footage(folder, FootageOptions(tmp_path / "w"))
+    assert flight.located == 0
+    assert "1 of 1 frames have no position" in flight.notes
+
+
 def test_several_files_of_places_are_asked_about(tmp_path):
     folder = _survey(tmp_path / "p")
     for name in ("a.csv", "b.csv"):
@@ -156,6 +184,22 @@ def test_a_video_without_telemetry_or_with_anothers_is_named(tmp_path):
     (tmp_path / "b.mp4").write_bytes(video.read_bytes()[:200])
     with pytest.raises(FootageError, match="not a video, or damaged"):
         read_footage(tmp_path / "b.mp4", FootageOptions(tmp_path / "w", fov_deg=70.0))
+
+
+def test_djis_own_track_in_a_video_is_named(tmp_path):
+    video = tmp_path / "DJI_0002.MP4"
+    with av.open(str(video), "w") as out:
+        stream = out.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        stream.metadata["timecode"] = "01:00:00:00"  # its track becomes DJI's below
+        image = np.zeros((120, 160, 3), np.uint8)
+        for _ in range(5):
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        out.mux(stream.encode(None))
+    made = video.read_bytes().replace(b"mhlrtmcd", b"mhlrmeta")
+    video.write_bytes(made.replace(b"TimeCodeHandler", b"DJI meta".ljust(15, b"\0")))
+    flight = read_footage(video, FootageOptions(tmp_path / "w", fov_deg=70.0))
+    assert any("telemetry inside DJI's video is not read: give its .SRT" in n for n in flight.notes)
 
 
 def test_the_sample_of_the_tutorial_is_complete(tmp_path):

@@ -195,6 +195,14 @@ def test_tracks_that_coincide_are_seen_one_inside_the_other():
         assert below.width - rim >= 2.0  # a pixel on each side
 
 
+def test_a_track_is_not_drawn_where_it_is_not_known():
+    points = np.array([[0.0, 0.0], [10.0, 0.0], [np.nan, np.nan], [30.0, 0.0], [40.0, 0.0]])
+    sheet = MapSheet(None, 0.0, 100.0, 0.0, 100.0, (MapTrack("way", "#123456", INNER, points),))
+    page = render(Report("", "", "", sheet=sheet))
+    drawn = re.findall(r'<polyline points="([^"]*)" stroke="#123456"', page)
+    assert drawn == ["0.00,100.00 10.00,100.00", "30.00,100.00 40.00,100.00"]
+
+
 @pytest.mark.parametrize(
     ("at", "anchor", "above"),
     [((50, 50), "start", True), ((98, 50), "end", True), ((50, 99), "start", False)],

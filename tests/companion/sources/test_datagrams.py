@@ -223,6 +223,8 @@ def test_what_a_feed_is_of_is_seen_by_a_datagram(data: bytes, kind: str) -> None
     [
         (bytes.fromhex("fd09000001010000000000000000000403"), "MAVLink"),
         (RTP.replace(b"\x60", b"\x1a") + bytes(40), "RTP of payload type 26, JPEG"),
+        # A byte that is MPEG-TS's, by chance.
+        (RTP.replace(b"\x60", b"\x1a") + bytes(88) + b"G" + bytes(99), "payload type 26, JPEG"),
         (b"GET / HTTP/1.1\r\n", "begin with 47 45 54 20"),
     ],
 )

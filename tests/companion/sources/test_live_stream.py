@@ -66,7 +66,7 @@ def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
     assert np.abs(errors).max() < 0.5e6
 
 
-@pytest.mark.parametrize("form", ["rtp", "h264", "sdp"])
+@pytest.mark.parametrize("form", ["rtp", "rtp hevc", "h264", "sdp"])
 def test_rtp_and_raw_video_are_received_as_transport_streams_are(
     form: str, url: str, tmp_path: Path
 ) -> None:
@@ -82,10 +82,12 @@ def test_rtp_and_raw_video_are_received_as_transport_streams_are(
         Watch(source) as watch,
         av.open(target, "w", format="h264" if form == "h264" else "rtp") as out,
     ):
-        stream = out.add_stream("libx264", rate=20)
+        coder = "x265" if form == "rtp hevc" else "x264"
+        stream = out.add_stream(f"lib{coder}", rate=20)
         stream.width, stream.height, stream.pix_fmt = CAMERA.width, CAMERA.height, "yuv420p"
+        more = ":keyint=10:log-level=none" if coder == "x265" else ""
         stream.options = {"preset": "ultrafast", "tune": "zerolatency", "g": "10",
-                          "x264-params": "repeat-headers=1"}  # fmt: skip
+                          f"{coder}-params": f"repeat-headers=1{more}"}  # fmt: skip
         for number in range(600):
             picture = av.VideoFrame.from_ndarray(counter_image(number), format="rgb24")
             picture.pts, picture.time_base = number, Fraction(1, 20)

@@ -95,17 +95,22 @@ def test_a_raw_stream_plays_at_its_own_rate_or_the_given_one(
     assert by in told[0]
 
 
+@pytest.mark.parametrize("marked", [True, False])
 @pytest.mark.parametrize("cover_first", [True, False])
-def test_a_cover_picture_is_not_the_video(tmp_path: Path, video: Path, cover_first: bool) -> None:
-    """Skydio writes one, and it may be stream 0."""
+def test_a_cover_picture_is_not_the_video(
+    tmp_path: Path, video: Path, cover_first: bool, marked: bool
+) -> None:
+    """Skydio writes one, and it may be stream 0; others write it as a track."""
+    w, h = (64, 48) if marked else (640, 480)
     path = tmp_path / "covered.mp4"
     with av.open(str(video)) as source, av.open(str(path), "w") as container:
         cover = container.add_stream("mjpeg") if cover_first else None
         film = container.add_stream_from_template(source.streams.video[0])
         cover = cover or container.add_stream("mjpeg")
-        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
-        cover.disposition = Disposition.attached_pic
-        picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+        cover.width, cover.height, cover.pix_fmt = w, h, "yuvj420p"
+        if marked:
+            cover.disposition = Disposition.attached_pic
+        picture = av.VideoFrame.from_ndarray(np.zeros((h, w, 3), np.uint8), format="rgb24")
         container.mux(cover.encode(picture) + cover.encode())
         for packet in source.demux(source.streams.video[0]):
             if packet.dts is not None:

@@ -1,6 +1,7 @@
 """``companion try`` on photos of a generated world whose tags are wrong by known amounts."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,17 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.convert.angles import gimbal_of_pose
+from companion.recorded.footage import FootageOptions, read_footage
+from companion.trial.localize import FrameLocalizer
+from companion.trial.priors import priors_of
+from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
+from localizer.relocalization.relocalizer import Relocalizer
+from localizer.tracking.opening import MapStack, build_localizer
 from tests.companion.recorded.photos import dji, write_photo
 
 _EAST_M, _UP_DEG, _FOCAL_35 = 5.0, 4.0, 0xA405
@@ -66,6 +73,42 @@ def test_photos_tell_what_is_wrong_with_their_tags(small_assets, small_sequence,
     config = load_config(report / "deployment.yaml")
     assert config.bridge.camera.mount == "gimbal"
     assert config.bridge.camera.mount_pitch_deg == pytest.approx(_UP_DEG, abs=1.0)
+
+
+def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequence, tmp_path):
+    """Each photo's result is the same alone, in another order, and after photos that show
+    nothing.
+    """
+    config = LocalizerConfig()
+    stack = MapStack(small_assets.map_cache, config)
+    camera = Camera.from_json(small_sequence / "camera.json")
+    flight = read_footage(
+        _photos(tmp_path / "photos", small_sequence, stack.cache.frame, camera),
+        FootageOptions(tmp_path, camera=small_sequence / "camera.json"),
+    )
+    priors = priors_of(flight, stack.cache).priors
+    good = list(zip(flight.frames, priors, strict=True))[:3]
+    Image.new("RGB", (camera.width, camera.height)).save(tmp_path / "black.png")
+    black = [(replace(frame, path=tmp_path / "black.png"), prior) for frame, prior in good]
+
+    def localized(shots):
+        def no_search() -> Relocalizer:
+            raise AssertionError("every prior is complete")
+
+        loader = FrameLocalizer(build_localizer(stack, camera, config), no_search, camera)
+        return [loader.from_prior(frame, prior) for frame, prior in shots]
+
+    alone = [localized([shot])[0] for shot in good]
+    assert all(one.accepted for one in alone)
+    backwards = localized(good[::-1])[::-1]
+    mixed = localized([shot for pair in zip(black, good, strict=True) for shot in (*pair,)])
+    assert not any(one.accepted for one in mixed[::2])
+    for other in (backwards, mixed[1::2]):
+        for one, same in zip(other, alone, strict=True):
+            assert one.accepted
+            assert one.pose.distance_to(same.pose)[0] < 1e-6
+            assert one.quality == pytest.approx(same.quality, abs=0.01)
+    stack.close()
 
 
 def test_without_a_map_the_needed_one_is_named(tmp_path):

@@ -58,6 +58,9 @@ def keys(values, names=NAMES):
           "distortion_model": "rational_polynomial",
           "distortion_coefficients": {"rows": 1, "cols": 8, "data": MILD},
           "projection_matrix": {"rows": 3, "cols": 4, "data": [0.0] * 12}}, "opencv", MILD),
+        # CUAV
+        ({"xresolution": 640, "yresolution": 480, "K": [MATRIX[:3], MATRIX[3:6], MATRIX[6:]],
+          "D": [BROWN], "lens": 3.0, "sensorwidth": 3.68, "version": 0}, "opencv", BROWN),
         ({"width": 640, "height": 480, "distortion_model": "plumb_bob", "d": BROWN, "k": MATRIX,
           "r": [0.0] * 9, "p": [0.0] * 12}, "opencv", BROWN),
     ],

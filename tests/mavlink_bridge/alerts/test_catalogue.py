@@ -9,7 +9,12 @@ from mavlink_bridge.alerts.catalogue import CATALOGUE, TEXT_LENGTH, alert, clear
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
 
-WORDS = {"direction": "short", "axis": "pitch", "component": "integrity monitor"}
+WORDS = {
+    "direction": "short",
+    "axis": "pitch",
+    "component": "integrity monitor",
+    "why": "m/s off vision",
+}
 
 
 def example(spec: AlertSpec) -> Alert:

@@ -323,7 +323,7 @@ def test_shadow_mode_orders_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -
 def test_what_the_pilot_chooses_is_followed_and_not_undone(
     monkeypatch: pytest.MonkeyPatch, echo: bool
 ) -> None:
-    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True, good_after_s=2)
+    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True)
     flight = on_gnss(monkeypatch, switch=switch)
     flight.run(20.0)
     chosen(flight, 2)  # before a denial that is meant
@@ -355,7 +355,7 @@ def test_what_the_pilot_chooses_is_followed_and_not_undone(
 
 
 def test_the_echo_of_our_own_order_is_nobodys_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True, good_after_s=2)
+    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True)
     flight = on_gnss(monkeypatch, switch=switch)
     flight.run(20.0)
     flight.gnss_north_m = None
@@ -363,8 +363,26 @@ def test_the_echo_of_our_own_order_is_nobodys_choice(monkeypatch: pytest.MonkeyP
     accept(flight, echo=True)
     chosen(flight, 2)  # heard twice, the second time after the acknowledgement
     flight.gnss_north_m = 0.0
-    flight.run(5.0)
+    flight.run(8.0)
     assert orders(flight)[-1] == 1.0
+
+
+def test_a_receiver_that_returns_wrong_is_refused_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = on_gnss(monkeypatch, switch=SourceSwitchConfig(enabled=True, return_to_gnss=True))
+    flight.run(20.0)
+    flight.gnss_north_m = None
+    flight.run(4.0)
+    accept(flight, echo=True)
+    flight.gnss_north_m = 300.0
+    flight.run(15.0)
+    assert set(orders(flight)) == {2.0}
+    assert len(told(flight, "GNSS refused")) == 2  # again after 10 s
+    assert told(flight, "GNSS refused")[0].endswith(" m off vision")
+    assert told(flight, "GNSS is back") == []
+    flight.gnss_north_m = 0.0
+    flight.run(9.0)
+    assert orders(flight)[-1] == 1.0
+    assert told(flight, "GNSS agrees") == ["GNSS agrees with vision"]
 
 
 def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

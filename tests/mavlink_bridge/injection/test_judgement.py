@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from mavlink_bridge.config import SourceSwitchConfig
+from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScorer
@@ -192,7 +194,7 @@ def test_a_jump_after_one_that_was_given_up_is_repeated_again() -> None:
 
 # --- source switch ------------------------------------------------------------------------------
 
-CONFIG = SourceSwitchConfig(enabled=True, bad_after_s=1.5, good_after_s=10.0)
+CONFIG = SourceSwitchConfig(enabled=True, bad_after_s=1.5)
 
 
 def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) -> list[Any]:
@@ -258,7 +260,7 @@ def test_order_is_repeated_until_acknowledged() -> None:
     assert 4 <= len(orders) <= 6
 
 
-def test_back_to_gnss_only_if_configured_and_after_long_health() -> None:
+def test_back_to_gnss_only_if_configured_and_once_it_was_compared() -> None:
     never = SourceSwitch(CONFIG)
     drive(never, 5.0, gps=False)
     assert drive(never, 60.0, 5.0) == []
@@ -266,9 +268,9 @@ def test_back_to_gnss_only_if_configured_and_after_long_health() -> None:
     drive(back, 5.0, gps=False)
     for i in range(5):
         # A receiver that comes and goes does not bring it back.
-        assert drive(back, 9.0, 5.0 + 10 * i) == []
-        assert drive(back, 1.0, 14.0 + 10 * i, gps=False) == []
-    orders = drive(back, 12.0, 55.0)
+        assert drive(back, 4.5, 5.0 + 10 * i) == []
+        assert drive(back, 5.5, 9.5 + 10 * i, gps=False) == []
+    orders = drive(back, 10.0, 55.0)
     assert [order.source_set for _, order in orders] == [1]
 
 
@@ -321,3 +323,71 @@ def test_back_to_sound_gnss_once_vision_is_gone() -> None:
 
 def test_disabled_does_nothing() -> None:
     assert drive(SourceSwitch(SourceSwitchConfig()), 10.0, gps=False) == []
+
+
+# --- a receiver that returns --------------------------------------------------------------------
+
+
+def returned(
+    error: Callable[[float], float],
+    *,
+    claimed: float | None = 1.0,
+    speed: float = 0.0,
+    ekf_speed: float | None = None,
+    seconds: float = 10.0,
+) -> GnssReturnCheck:
+    """What is found of a receiver that is error(t) metres off, north, in a flight northwards.
+
+    ekf_speed: where it differs from vision's.
+    """
+    check, rng = GnssReturnCheck(), np.random.default_rng(4)
+    for i in range(int(seconds * 10)):
+        t = i / 10
+        now = int(t * SECOND) + SECOND
+        report = 2 * (i // 2) / 10
+        at = speed * (report - 0.15) + error(report) + float(rng.normal(0, 0.1))
+        state = vehicle(
+            int(report * SECOND) + SECOND,
+            gps_latitude_deg=HOME[0] + at * METRE,
+            gps_h_accuracy_m=claimed,
+            local_velocity_ned=(speed if ekf_speed is None else ekf_speed, 0.0, 0.0),
+        )
+        seen = position(now - 100 * MS, speed * (t - 0.1) + float(rng.normal(0, 0.3)), speed=speed)
+        check.look(state, seen, now)
+    return check
+
+
+@pytest.mark.parametrize("speed", [0.0, 15.0])
+@pytest.mark.parametrize("claimed", [0.3, None, 4.0])
+def test_a_right_receiver_is_accepted(speed: float, claimed: float | None) -> None:
+    assert returned(lambda _: 1.0, speed=speed, claimed=claimed, seconds=5.5).accepted
+    assert not returned(lambda _: 1.0, speed=speed, claimed=claimed, seconds=4.5).accepted
+
+
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [
+        ({"error": lambda _: 300.0}, "m off vision"),
+        ({"error": lambda _: 20.0, "claimed": 4.9}, "m off vision"),
+        ({"error": lambda t: max(8.0 - t, -2.0)}, "m/s off vision"),
+        ({"error": lambda t: (-1.0) ** round(5 * t) * (3.0 + t)}, "m noise"),
+        ({"error": lambda _: 0.0, "claimed": 8.0}, "m claimed"),
+        ({"error": lambda _: -12.0, "speed": 10.0}, "m off vision"),  # 1.2 s late
+        ({"error": lambda _: 0.0, "ekf_speed": 2.0}, "m/s off IMU"),
+    ],
+)
+def test_a_wrong_receiver_is_refused_with_its_reason(how: dict[str, Any], why: str) -> None:
+    check = returned(**how)
+    assert not check.accepted
+    assert check.refusal is not None
+    assert check.refusal.why == why
+
+
+def test_what_was_refused_is_not_taken_when_vision_ends() -> None:
+    """20 m from where the EKF came by itself would do, but vision had said that it is wrong."""
+    switch = SourceSwitch(CONFIG)
+    drive(switch, 5.0, gps=False)
+    drive(switch, 5.0, 5.0, north=20.0)
+    assert drive(switch, 20.0, 10.0, north=20.0, seen=False) == []
+    drive(switch, 5.0, 30.0, gps=False, seen=False)
+    assert [o.source_set for _, o in drive(switch, 8.0, 35.0, seen=False)] == [1]

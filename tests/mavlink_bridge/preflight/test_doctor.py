@@ -22,7 +22,14 @@ from mavlink_bridge.preflight.doctor import (
     repair,
 )
 from mavlink_bridge.preflight.parameters import ParameterClient, decode_value, encode_value
-from mavlink_bridge.preflight.rules import ardupilot_rules, arming_rules, find_source_set, px4_rules
+from mavlink_bridge.preflight.rules import (
+    ardupilot_rules,
+    arming_rules,
+    find_source_set,
+    gnss_rules,
+    missing_feature,
+    px4_rules,
+)
 
 ORIGIN = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
 GOOD = {
@@ -161,6 +168,57 @@ def test_odometry_wants_velocity_noise_that_is_true() -> None:
     assert failures(config(message="odometry"), parameters) == {"VISO_VEL_M_NSE"}
 
 
+@pytest.mark.parametrize(
+    ("more", "fixes"),
+    [
+        ({"EK3_SRC_OPTIONS": 0.0}, {}),
+        ({"EK3_SRC_OPTIONS": 2.0}, {}),  # of optical flow
+        ({"EK3_SRC_OPTIONS": 1.0}, {"EK3_SRC_OPTIONS": 0.0}),
+        ({"EK3_SRC_OPTIONS": 10.0}, {"EK3_SRC_OPTIONS": 2.0}),
+        ({"SCR_ENABLE": 1.0}, {"SCR_ENABLE": 0.0}),
+        ({"GPS1_TYPE": 0.0, "EK3_SRC_OPTIONS": 9.0}, {}),  # no receiver
+    ],
+)
+def test_what_lets_the_autopilot_use_gnss_by_itself_is_found(
+    more: dict[str, float], fixes: dict[str, float]
+) -> None:
+    parameters = {"GPS1_TYPE": 1.0, "EK3_SRC_OPTIONS": 0.0} | more
+    found = check_parameters(gnss_rules(parameters.get), parameters.get)
+    assert {f.name: f.fix for f in found if not f.ok} == fixes
+    assert gnss_rules({"GPS1_TYPE": 1.0}.get) == []  # firmware that has no options
+
+
+@pytest.mark.parametrize(
+    ("px4", "message", "parameters", "option"),
+    [
+        (False, "odometry", {"EK3_SRC1_POSXY": 3.0}, "HAL_VISUALODOM_ENABLED"),
+        (False, "odometry", {}, "ArduPilot 4.1"),
+        (True, "odometry", {"EKF2_AGP0_CTRL": 1.0}, "CONFIG_EKF2_EXTERNAL_VISION"),
+        (True, "global_position_sensor", {"EKF2_EV_CTRL": 1.0}, "CONFIG_EKF2_AUX_GLOBAL_POSITION"),
+        (True, "global_position_sensor", {"EKF2_AGP_CTRL": 1.0}, None),
+        (False, "gps_input", {}, None),
+    ],
+)
+def test_firmware_that_was_built_without_the_feature_names_the_build_option(
+    px4: bool, message: Any, parameters: dict[str, float], option: str | None
+) -> None:
+    found = missing_feature(config(message=message), parameters.get, px4=px4)
+    assert (found is None) if option is None else (found is not None and option in found[1])
+
+
+def test_a_small_board_is_one_required_failure_and_no_list_of_missing_parameters(
+    autopilot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavlink_bridge.preflight.parameters._ANSWER_S", 0.1)
+    link = DoctorFinding("connection", "ardupilot", "a heartbeat", "", True, True)
+    known = ([link], VehicleState(autopilot="ardupilot"))
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
+    autopilot.parameters = {"EK3_SRC1_POSXY": 3.0}
+    diagnosis = examine(config(autopilot.port))
+    assert [f.name for f in diagnosis.findings] == ["connection", "firmware feature"]
+    assert diagnosis.exit_code == 2
+
+
 @pytest.mark.parametrize("kind", [mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_INT8])
 @pytest.mark.parametrize("value", [0, 1, 9, -3, 100])
 def test_px4_integers_travel_as_bytes(kind: int, value: int) -> None:
@@ -207,7 +265,7 @@ def test_parameters_that_are_no_numbers_are_wrong_and_can_be_written(
 ) -> None:
     config = BridgeConfig(injection=InjectionConfig(message=message))
     for rules in (ardupilot_rules(config, find_source_set(config, lambda _: value)),
-                  px4_rules(config)):  # fmt: skip
+                  px4_rules(config, lambda _: value)):  # fmt: skip
         for finding in check_parameters(rules, lambda _: value):
             assert not finding.ok
             assert finding.fix is not None
@@ -363,7 +421,7 @@ def test_px4_is_asked_for_its_own_failsafes(
     autopilot.autopilot = mavlink.MAV_AUTOPILOT_PX4
     autopilot.version = (1, 16, 0)
     settings = config(autopilot.port)
-    rules = {rule.names[0]: 0.0 for rule in px4_rules(settings)}
+    rules = {rule.names[0]: 0.0 for rule in px4_rules(settings, {}.get)}
     autopilot.parameters = {**rules, **PX4_GOOD, "COM_POSCTL_NAVL": 1.0, "FS_EKF_ACTION": 0.0}
     found = {f.name: f.found for f in examine(settings).findings}
     assert found["when vision ends"].startswith("LAND")

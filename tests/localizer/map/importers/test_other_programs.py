@@ -97,7 +97,13 @@ def test_what_compressed_content_refers_to_belongs_to_the_source(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "told"),
-    [("0.0", "'0.0', read as 1.0"), (None, "no version"), (1.0, ""), ("1.1", "")],
+    [
+        ("0.0", "'0.0', read as 1.0"),
+        (0, "0, read as 1.0"),
+        (None, "no version"),
+        (1.0, ""),
+        ("1.1", ""),
+    ],
 )
 def test_versions_that_mean_1_0_are_read(tmp_path, content, version, told):
     asset = {"gltfUpAxis": "Y"} | ({} if version is None else {"version": version})
@@ -372,6 +378,7 @@ def built(path, out):
         ("map_Kd textures\\Tex.jpg", "textures/tex.jpg"),
         ("map_Kd C:\\Users\\me\\out\\tex.jpg", "tex.jpg"),
         ('map_kd "tex.jpg"', "tex.jpg"),
+        ("map_Kd\ttex.jpg", "tex.jpg"),
         ("map_Ka tex.jpg", "tex.jpg"),
         ("map_Ka none.jpg\nmap_Kd tex.jpg\nmap_Ke none.jpg", "tex.jpg"),
     ],
@@ -403,6 +410,9 @@ def test_a_scale_and_an_offset_of_a_picture_are_applied(tmp_path, make):
         ("newmtl a\nmap_Kd tex.jpg\nnewmtl b\nKd 1 0 0", ("mtllib m.mtl",), None,
          "faces name no material (usemtl) and its library has 2"),
         ("", ("mtllib other.mtl", "usemtl a"), None, "its material library is not there"),
+        ("newmtl A\nmap_Kd tex.jpg", ("mtllib m.mtl", "usemtl a"), None,
+         "1 of its materials are in no library (newmtl), first 'a'"),
+        ("newmtl a\nmap_Kd tex.jpg", ("usemtl a",), None, "are in no library"),
     ],
 )  # fmt: skip
 def test_an_obj_without_a_picture_is_told(tmp_path, make, library, lines, colour, told):
@@ -414,6 +424,8 @@ def test_an_obj_without_a_picture_is_told(tmp_path, make, library, lines, colour
 
 def test_faces_that_name_no_material_have_the_only_one(tmp_path, make):
     source = obj(tmp_path, make, "newmtl a\nmap_Kd tex.jpg\n", ("mtllib M.MTL",))
+    library = tmp_path / "m.mtl"
+    library.write_bytes(library.read_text().encode("utf-16"))  # as PowerShell writes it
     manifest, tile = built(source, tmp_path / "c")
     assert not manifest.warnings
     assert tile.mips[0].std() > 20

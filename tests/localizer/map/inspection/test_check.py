@@ -198,6 +198,7 @@ def test_a_map_of_colours_has_no_picture(tmp_path, make):
     made = built_from(tmp_path / "a", make, materials=green)
     del made["usable"]
     assert {n for n, f in made.items() if f.grade is Grade.BAD} == {"without picture", "texel size"}
+    assert "imagery detail" not in made
     assert made["without picture"].found.startswith("100.00 %")
     plain = cv2.imencode(".png", np.full((64, 64, 3), (40, 120, 60), np.uint8))[1].tobytes()
     made = built_from(tmp_path / "b", make, image=plain)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import date
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import MANIFEST_NAME, TileCache
 from localizer.map.inspection.kind import map_kind
+from localizer.map.kind import MapKind
 
 STEP_M, TEXEL_M, SIDE_M = 1.0, 0.25, 200.0
 LEFT, TOP = 500_100.0, 5_228_300.0
@@ -110,6 +112,21 @@ def test_a_cache_of_an_older_build_is_read_and_measured_when_asked(tmp_path):
     found = map_kind(old)
     assert (found.heights, found.imagery_date) == ("surface", "2019-05")
     assert found.effective_resolution_m == cache.manifest.kind.effective_resolution_m
+
+
+@pytest.mark.parametrize(
+    ("stated", "words", "recent"),
+    [
+        ("2024-06-30", "2024-06-30 (100 days ago)", True),
+        ("2024-06", "2024-06 (129 days ago)", True),  # by the first of the month
+        ("2024", "2024 (281 days ago)", False),
+        ("2024-02-31", "2024-02-31 is no date", False),
+        (None, "date not known", False),
+    ],
+)
+def test_the_imagerys_age(stated, words, recent):
+    kind = MapKind("surface", 0.3, 0.1, stated)
+    assert kind.imagery_age(date(2024, 10, 8), 200) == (words, recent)
 
 
 @pytest.mark.real

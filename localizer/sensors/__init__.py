@@ -1,0 +1,1 @@
+"""What the sensors beside the image err by."""

@@ -1,0 +1,165 @@
+"""Whether a GNSS receiver that comes back says where the vehicle is, while vision flies it."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.injection.shadow import gnss_healthy
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.origin import north_east
+
+_WINDOW_NS = 6_000_000_000
+_ACCEPTED_NS = 5_000_000_000  # that the reports must span
+_REFUSED_NS = 2_000_000_000
+_REPORTS = 8
+_GAP_NS = 1_500_000_000
+_SIGMAS = 3.0
+_SIGMA_M = 2.5  # where the receiver does not say
+_SIGMA_FLOOR_M, _SIGMA_CAP_M = 1.0, 3.0
+_CLAIM_M = 5.0  # EKF3 does not use a receiver that claims to be worse, either
+_LAG_S = 0.15  # of a report when it comes
+_LAG_ERROR_S = 0.15
+_DRIFT_MPS = 0.5
+_SCATTER_M = 1.0
+
+_Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GnssRefusal:
+    """Why a receiver is not believed. why: the unit of size, and what it measures."""
+
+    size: float
+    why: str
+
+
+@dataclass(frozen=True)
+class _Report:
+    """One report; differences are north and east, metres. off_m: from vision at its time.
+
+    slipped_m: from the integral of the EKF's velocity, with an arbitrary zero. claimed_m: None
+    where the receiver does not say.
+    """
+
+    time_ns: int
+    off_m: tuple[float, float]
+    slipped_m: tuple[float, float]
+    claimed_m: float | None
+    sigma_m: float
+    speed_mps: float
+
+
+class GnssReturnCheck:
+    """Compares the receiver with vision and with the inertial motion over some seconds.
+
+    It is accepted after 5 s in which it is near vision, keeps still against vision and the EKF's
+    velocity, scatters no more than it claims and claims enough. One thread.
+    """
+
+    def __init__(self) -> None:
+        self.refusal: GnssRefusal | None = None
+        self.accepted = False
+        self._reports: deque[_Report] = deque()
+        self._anchor: tuple[float, float] | None = None
+        self._moved = np.zeros(2)
+        self._looked_ns = 0
+
+    def reset(self) -> None:
+        """Nothing is known of the receiver."""
+        self._reports.clear()
+        self.refusal, self.accepted, self._anchor = None, False, None
+
+    def look(self, state: VehicleState, vision: PropagatedFix | None, now_ns: int) -> None:
+        """Take in the newest report; ten times a second. vision: None while it is not trusted, and
+        then what was found before stands.
+        """
+        velocity = np.array((state.local_velocity_ned or (0.0, 0.0))[:2])
+        passed_s = min((now_ns - self._looked_ns) * 1e-9, 1.0)
+        self._moved, self._looked_ns = self._moved + velocity * passed_s, now_ns
+        if not gnss_healthy(state, now_ns):
+            self.reset()
+            return
+        if vision is None:
+            self._reports.clear()
+            self.accepted = False
+            return
+        last_ns = self._reports[-1].time_ns if self._reports else 0
+        if state.gps_time_ns <= last_ns:
+            return
+        if state.gps_time_ns - last_ns > _GAP_NS:
+            self._reports.clear()
+        self._add(state, vision)
+        self._judge()
+
+    def _add(self, state: VehicleState, vision: PropagatedFix) -> None:
+        latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
+        if latitude is None or longitude is None:
+            return
+        self._anchor = anchor = self._anchor or (latitude, longitude)
+        older_s = (vision.time_ns - state.gps_time_ns) * 1e-9 + _LAG_S
+        seen = north_east(vision.latitude_deg, vision.longitude_deg, latitude, longitude)
+        off = np.array(seen) + vision.velocity_ned[:2] * older_s
+        slipped = np.array(north_east(*anchor, latitude, longitude)) - self._moved
+        if state.local_velocity_ned is None:
+            slipped = off
+        self._reports.append(
+            _Report(
+                state.gps_time_ns,
+                (float(off[0]), float(off[1])),
+                (float(slipped[0]), float(slipped[1])),
+                state.gps_h_accuracy_m,
+                vision.horizontal_sigma_m,
+                math.hypot(*vision.velocity_ned[:2]),
+            )
+        )
+        while state.gps_time_ns - self._reports[0].time_ns > _WINDOW_NS:
+            self._reports.popleft()
+
+    def _judge(self) -> None:
+        span_ns = self._reports[-1].time_ns - self._reports[0].time_ns
+        if len(self._reports) < _REPORTS or span_ns < _REFUSED_NS:
+            return
+        fault = self._fault()
+        self.accepted = fault is None and span_ns >= _ACCEPTED_NS
+        if fault is not None or self.accepted:
+            self.refusal = fault
+
+    def _fault(self) -> GnssRefusal | None:
+        reports = self._reports
+        claims = [_SIGMA_M if r.claimed_m is None else r.claimed_m for r in reports]
+        if max(claims) > _CLAIM_M:
+            return GnssRefusal(max(claims), "m claimed")
+        accuracy = min(max(float(np.mean(claims)), _SIGMA_FLOOR_M), _SIGMA_CAP_M)
+        sigma = math.hypot(accuracy, float(np.mean([r.sigma_m for r in reports])))
+        speed = float(np.mean([r.speed_mps for r in reports]))
+        off = np.array([r.off_m for r in reports])
+        apart = float(np.hypot(*off.mean(axis=0)))
+        if apart > _SIGMAS * sigma + speed * _LAG_ERROR_S:
+            return GnssRefusal(apart, "m off vision")
+        times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
+        drift, drift_sigma, scatter = _motion(times, off)
+        if scatter > _SCATTER_M + sigma:
+            return GnssRefusal(scatter, "m noise")
+        slip, slip_sigma, _ = _motion(times, np.array([r.slipped_m for r in reports]))
+        for rate, rate_sigma, what in ((drift, drift_sigma, "vision"), (slip, slip_sigma, "IMU")):
+            if rate > _DRIFT_MPS + _SIGMAS * rate_sigma:
+                return GnssRefusal(rate, f"m/s off {what}")
+        return None
+
+
+def _motion(times: _Array, positions: _Array) -> tuple[float, float, float]:
+    """Speed of the straight line through positions (n, 2), its sigma, and the rms distance to it;
+    m/s and m.
+    """
+    t = times - times.mean()
+    spread = float(t @ t)
+    rate = t @ positions / spread
+    left = positions - positions.mean(axis=0) - np.outer(t, rate)
+    scatter = float(np.sqrt((left**2).sum(axis=1).mean()))
+    return float(np.hypot(*rate)), scatter / math.sqrt(2 * spread), scatter
