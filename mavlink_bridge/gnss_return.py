@@ -17,16 +17,16 @@ from mavlink_bridge.vehicle.origin import north_east
 _WINDOW_NS = 6_000_000_000
 _ACCEPTED_NS = 5_000_000_000  # that the reports must span
 _REFUSED_NS = 2_000_000_000
-_REPORTS = 8
+_REPORTS = 5  # of a stream of 1 Hz, too
 _GAP_NS = 1_500_000_000
 _SIGMAS = 3.0
 _SIGMA_M = 2.5  # where the receiver does not say
-_SIGMA_FLOOR_M, _SIGMA_CAP_M = 1.0, 3.0
+_SIGMA_FLOOR_M, _SIGMA_CAP_M = 1.0, 2.5
 _CLAIM_M = 5.0  # EKF3 does not use a receiver that claims to be worse, either
 _LAG_S = 0.15  # of a report when it comes
 _LAG_ERROR_S = 0.15
-_DRIFT_MPS = 0.5
-_SCATTER_M = 1.0
+_DRIFT_MPS = 0.4
+_SCATTER_M = 0.7
 
 _Array = NDArray[np.float64]
 
@@ -144,7 +144,7 @@ class GnssReturnCheck:
             return GnssRefusal(apart, "m off vision")
         times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
         drift, drift_sigma, scatter = _motion(times, off)
-        if scatter > _SCATTER_M + sigma:
+        if scatter > _SCATTER_M + sigma / 2:
             return GnssRefusal(scatter, "m noise")
         slip, slip_sigma, _ = _motion(times, np.array([r.slipped_m for r in reports]))
         for rate, rate_sigma, what in ((drift, drift_sigma, "vision"), (slip, slip_sigma, "IMU")):

@@ -25,7 +25,7 @@ from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.pictures import read_rgb
 from localizer.plain_files import files_of, plain_text
 from localizer.tracking.pipeline import Localizer
-from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
+from localizer.types import Frame, PoseEstimate, PosePrior
 
 PriorMode = Literal["first", "each"]
 # (frame, its truth, its index) -> the prior to begin from, None where no place is found.
@@ -196,6 +196,18 @@ def evaluate(
     `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
     whenever it is lost or led nowhere, instead of the perturbed truth.
     """
+
+    def begin(frame: Frame, index: int) -> bool:
+        """Give the localizer a prior of the frame; False where no place is found."""
+        truth = sequence.truth[index]
+        if find is None:
+            localizer.set_prior(perturbation.prior(truth, index, frame.exposure_time_ns))
+            return True
+        prior = find(frame, truth, index)
+        if prior is not None:
+            localizer.offer(prior)
+        return prior is not None
+
     frames: list[EvaluatedFrame] = []
     errors: list[LocalizerError] = []
     has_prior = False
@@ -212,61 +224,33 @@ def evaluate(
             started = time.perf_counter()
             lost = not has_prior or localizer.tracker.track_status.wants_prior
             fresh = (mode == "each" or not has_prior) if find is None else lost
-            if fresh:
-                truth = sequence.truth[index]
-                if find is None:
-                    prior = perturbation.prior(truth, index, frame.exposure_time_ns)
-                else:
-                    found = find(frame, truth, index)
-                    if found is None:
-                        seconds += time.perf_counter() - started
-                        name = sequence.images[index].name
-                        frames.append(EvaluatedFrame(name, None, searching=True))
-                        progress(index)
-                        continue
-                    prior = found
-                if find is None:
-                    localizer.set_prior(prior)
-                else:
-                    localizer.offer(prior)
+            pending = pool.submit(localizer.extract_query, frame)  # beside the reference
+            outcome: PoseEstimate | None = None
+            for anew in (True,) if fresh else (False, True):
+                if anew and not begin(frame, index):
+                    break
                 has_prior = True
-            try:
-                # Reference and query features side by side.
-                pending = pool.submit(localizer.extract_query, frame)
-                outcome = localizer.track(
-                    frame, passes=passes if fresh else 1, query=pending.result
-                )
-            except OutsideMapError as error:
-                if (
-                    mode == "first" and fresh and find is None
-                ):  # every other frame hangs on this prior
-                    raise
-                errors.append(error)
-                outcome = _not_localized(localizer, frame)
+                try:
+                    outcome = localizer.track(
+                        frame, passes=passes if anew else 1, query=pending.result
+                    )
+                except OutsideMapError as error:
+                    if mode == "first" and anew and find is None:
+                        raise  # every other frame hangs on this prior
+                    errors.append(error)
+                    outcome = localizer.localize(frame, pending.result(), None)
+                if find is None or not localizer.tracker.track_status.wants_prior:
+                    break  # else it is searched for in the same frame
             seconds += time.perf_counter() - started
-            frames.append(_measure(sequence, index, outcome))
+            if outcome is None:
+                name = sequence.images[index].name
+                frames.append(EvaluatedFrame(name, None, searching=True))
+            else:
+                frames.append(_measure(sequence, index, outcome))
             progress(index)
     if len(errors) == len(frames):
         raise errors[0]
     return frames, _summary(frames, seconds)
-
-
-def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:
-    """The prediction, as the answer for a frame whose prediction is outside the map."""
-    prior = localizer.predict(frame.exposure_time_ns)
-    if prior is None:
-        raise SequenceError("no prior was set before localizing")
-    return PoseEstimate(
-        world_from_camera=prior.world_from_camera,
-        covariance=prior.covariance,
-        quality=0.0,
-        state=localizer.tracker.track_status.state,
-        status=RegistrationStatus.TOO_FEW_ANCHORS,
-        accepted=False,
-        exposure_time_ns=frame.exposure_time_ns,
-        sequence=frame.sequence,
-        camera=frame.camera,
-    )
 
 
 def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> EvaluatedFrame:

@@ -22,7 +22,14 @@ from localizer.tracking.engine_health import EngineHealth, HealthBook
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
 from localizer.tracking.prefetch import FeaturePrefetcher, PrefetchedFrame
-from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from localizer.types import (
+    Frame,
+    PoseEstimate,
+    PosePrior,
+    ReferenceBundle,
+    RegistrationStatus,
+    TrackingState,
+)
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.2
@@ -35,7 +42,8 @@ PriorProvider = Callable[[int], PosePrior | None]
 Searcher = Callable[[Frame, Callable[[], bool]], PosePrior | None]
 
 _FIX_THREADS = ("render", "extract", "localize")
-_TRIED_FRAMES = 5  # with what is known outside, before a search begins
+# With what is known outside, before a search begins: so many frames, or so long at a low rate.
+_TRIED_FRAMES, _TRIED_NS = 5, 1_000_000_000
 # While a search runs, one frame in so many is tried with what is known outside: what led nowhere
 # for `_TRIED_FRAMES` seldom does, and takes half a processor from the search, which then answers
 # for where the vehicle was seconds ago.
@@ -71,6 +79,7 @@ class DualThreadEngine:
         self._sought: Mailbox[Frame] = Mailbox()
         self._found: PosePrior | None = None
         self._unknown_frames = self._left_frames = 0
+        self._unknown_since_ns = 0
         self._clock = clock
         self._search_alive_ns: int | None = None  # while one is under way: when it last said so
         self._ahead = FeaturePrefetcher(localizer.extract_query, self._may_extract_ahead)
@@ -223,9 +232,10 @@ class DualThreadEngine:
         try:
             if bundle is None:
                 return False
-            # Where the map ends there is no reference of now: the odometry may carry on.
+            # Where the map ends there is no reference of now: the odometry may carry on, and
+            # without it the prediction is judged alone.
             anchors = None if self._is_stale(bundle, frame) else bundle.anchors
-            if anchors is None and not self._localizer.can_carry:
+            if anchors is None and not self._localizer.tracker.track_status.trusts_prediction:
                 return False
             query, stage_ms["extract"] = prepared.features, prepared.extract_ms
             if query is None:
@@ -265,7 +275,10 @@ class DualThreadEngine:
             return
         wanting = self._localizer.tracker.track_status.wants_prior
         self._unknown_frames = self._unknown_frames + 1 if wanting else 0
-        if self._unknown_frames > _TRIED_FRAMES:
+        if self._unknown_frames <= 1:
+            self._unknown_since_ns = frame.exposure_time_ns
+        tried_ns = frame.exposure_time_ns - self._unknown_since_ns
+        if self._unknown_frames > _TRIED_FRAMES or tried_ns >= _TRIED_NS:
             self._sought.put(frame)
 
     def _is_left_to_search(self) -> bool:
@@ -295,7 +308,8 @@ class DualThreadEngine:
         return frame.exposure_time_ns + self._interval_ns
 
     def _publish(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
-        self._book.clear_error()
+        if estimate.status is not RegistrationStatus.NO_OVERLAP:  # the reference's error stands
+            self._book.clear_error()
         self._book.count(localized=1, accepted=int(estimate.accepted))
         for subscriber in self._subscribers:
             subscriber(estimate, bundle)

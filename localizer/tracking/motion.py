@@ -25,6 +25,7 @@ RotationAt = Callable[[int], "Array | None"]
 
 _MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are reached
 _MAX_SIGMA_RAD = float(np.radians(8.0))
+_FULL = 0.99  # of these limits: a prediction that they cut
 _LONGEST_S = 10.0  # a camera's clock that jumped, or a gap that no velocity bridges
 _LEAST_RATE_NS = 15_000_000  # to both sides of an exposure: sensors report every 20 ms
 _H = np.hstack([np.eye(6), np.zeros((6, 6))])
@@ -149,6 +150,12 @@ def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0
 def place_sigma_m(prior: PosePrior) -> float:
     """Sigma of the prior's horizontal place along its least known axis."""
     return float(np.sqrt(max(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1], 0.0)))
+
+
+def is_beyond_capture(prior: PosePrior) -> bool:
+    """Whether a prediction is so unsure that no registration is expected to find the camera."""
+    turn = float(np.sqrt(prior.covariance.diagonal()[3:].max()))
+    return place_sigma_m(prior) >= _FULL * _MAX_SIGMA_M or turn >= _FULL * _MAX_SIGMA_RAD
 
 
 def pose_difference(a: Pose, b: Pose) -> Array:

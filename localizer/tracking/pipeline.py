@@ -249,11 +249,6 @@ class Localizer:
         return self._fusion.height_error.sigma_m
 
     @property
-    def can_carry(self) -> bool:
-        """Whether `localize` can answer without a reference (anchors None)."""
-        return self._tracker.can_carry
-
-    @property
     def reference_age_s(self) -> float:
         """Largest usable age of a reference view, seconds."""
         return self._config.integrity.reference_age_s
@@ -384,7 +379,7 @@ class Localizer:
     ) -> PoseEstimate:
         """Register the frame against the anchors, test the result and update the filter.
 
-        anchors: None where no reference can be had: the odometry answers, if it can (`can_carry`).
+        anchors: None where no reference can be had: the odometry answers, if it can.
         """
         seen = self.tracker
         ahead = self._tracker.at_frame(seen, frame.exposure_time_ns)

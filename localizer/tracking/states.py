@@ -66,7 +66,9 @@ class TrackStatus:
 @dataclass(frozen=True)
 class RegistrationOutcome:
     """A registration that was judged. covariance: (6, 6); time_ns: the frame's exposure; carry:
-    what the odometry made of a frame that the map rejected.
+    what the odometry made of a frame that the map rejected; beyond_capture: whether the prediction
+    was too unsure for a registration; counts: False where there was nothing to register against
+    and no odometry.
     """
 
     acceptable: bool
@@ -74,6 +76,8 @@ class RegistrationOutcome:
     covariance: Array
     time_ns: int
     carry: PropagationResult = PropagationResult.NONE
+    beyond_capture: bool = False
+    counts: bool = True
 
 
 _NO_EVIDENCE = IndependentEvidence()
@@ -85,9 +89,9 @@ def judge(
     outcome: RegistrationOutcome,
     evidence: IndependentEvidence = _NO_EVIDENCE,
 ) -> TrackStatus:
-    """The machine after one more frame; witness: what other sensors say, for a place on trial."""
+    """The machine after one more frame; evidence: what other sensors say, for a place on trial."""
     if not outcome.acceptable:
-        return _after_rejection(track_status, config, outcome.carry)
+        return _after_rejection(track_status, config, outcome)
     if track_status.tentative:
         return _tentative(track_status, config, outcome, evidence)
     count = track_status.accepted_in_row + 1
@@ -126,9 +130,8 @@ def _tentative(
         config,
     )
     if verdict is Consistency.CONTRADICTED:
-        return _after_rejection(
-            replace(track_status, tentative_track=None), config, PropagationResult.NONE
-        )
+        refused = replace(outcome, carry=PropagationResult.NONE, beyond_capture=False)
+        return _after_rejection(replace(track_status, tentative_track=None), config, refused)
     if verdict is Consistency.PENDING or count < config.confirmations:
         return tried
     return replace(
@@ -141,10 +144,10 @@ def _tentative(
 
 
 def _after_rejection(
-    track_status: TrackStatus, config: IntegrityConfig, carry: PropagationResult
+    track_status: TrackStatus, config: IntegrityConfig, outcome: RegistrationOutcome
 ) -> TrackStatus:
-    count = track_status.rejected_in_row + 1
-    state = _worse(track_status.state, count, config, carry)
+    count = track_status.rejected_in_row + int(outcome.counts)
+    state = _worse(track_status.state, count, config, outcome)
     trial = track_status.tentative or state is TrackingState.LOST
     return replace(
         track_status,
@@ -158,15 +161,20 @@ def _after_rejection(
 
 
 def _worse(
-    state: TrackingState, count: int, config: IntegrityConfig, carry: PropagationResult
+    state: TrackingState, count: int, config: IntegrityConfig, outcome: RegistrationOutcome
 ) -> TrackingState:
-    """The state after `count` rejections in a row."""
+    """The state after `count` rejections in a row. At a low frame rate the prediction is lost long
+    before they are many.
+    """
+    carry = outcome.carry
     if state is TrackingState.BRIDGING:
         holds = carry in (PropagationResult.CARRIED, PropagationResult.GAP)
         return TrackingState.BRIDGING if holds else TrackingState.LOST
-    if state in _SEES and count >= config.degraded_after and carry is PropagationResult.CARRIED:
+    is_due = count >= config.degraded_after or outcome.beyond_capture
+    if state in _SEES and is_due and carry is PropagationResult.CARRIED:
         return TrackingState.BRIDGING
-    if count >= config.lost_after:
+    beyond = state in _SEES and outcome.beyond_capture
+    if beyond or count >= config.lost_after:
         return TrackingState.LOST
     if state is TrackingState.TRACKING and count >= config.degraded_after:
         return TrackingState.DEGRADED

@@ -73,12 +73,6 @@ class Tracker:
         with self._lock:
             return self._state
 
-    @property
-    def can_carry(self) -> bool:
-        """Whether a frame without any reference can be carried on to."""
-        trusted = self.state.track_status.trusts_prediction
-        return trusted and self._dead_reckoning is not None and self._dead_reckoning.is_ready
-
     def set_prior(self, prior: PosePrior) -> None:
         """Begin (again) from a pose known from outside."""
         state = motion.start(prior, self._config.motion)
@@ -130,8 +124,10 @@ class Tracker:
         else:
             measured, covariance = ahead.prior.world_from_camera, ahead.prior.covariance
         outcome = RegistrationOutcome(
-            acceptable, measured, covariance, frame.exposure_time_ns, carried.status
-        )
+            acceptable, measured, covariance, frame.exposure_time_ns, carried.status,
+            motion.is_beyond_capture(ahead.prior),
+            result is not None or carried.status is not PropagationResult.NONE,
+        )  # fmt: skip
         evidence = self._evidence(seen.track_status, outcome)
         track_status = judge(seen.track_status, self._config.integrity, outcome, evidence)
         bridges = track_status.state is TrackingState.BRIDGING

@@ -53,6 +53,26 @@ def test_rejections_degrade_then_lose() -> None:
     assert run(tracking, "-----").state is TrackingState.LOST
 
 
+def test_a_prediction_beyond_capture_is_lost_at_once_unless_the_odometry_carries() -> None:
+    """One frame a second: ten rejections were ten seconds."""
+    tracking = run(TrackStatus(), "+++")
+    far = replace(outcome(False, 3), beyond_capture=True)
+    assert judge(tracking, CONFIG, far).state is TrackingState.LOST
+    carried = replace(far, carry=PropagationResult.CARRIED)
+    assert judge(tracking, CONFIG, carried).state is TrackingState.BRIDGING
+    assert judge(TrackStatus(), CONFIG, far).state is TrackingState.INITIALIZING
+
+
+def test_frames_without_a_reference_end_tracking_by_their_prediction_alone() -> None:
+    machine = run(TrackStatus(), "+++")
+    blind = replace(outcome(False, 3), counts=False)
+    for _ in range(2 * CONFIG.lost_after):
+        machine = judge(machine, CONFIG, blind)
+    assert machine.state is TrackingState.TRACKING
+    machine = judge(machine, CONFIG, replace(blind, beyond_capture=True))
+    assert machine.state is TrackingState.LOST
+
+
 def test_lost_lasts_however_often_it_is_tried_again() -> None:
     """280 bad frames after 20 good ones were "initializing" for 270, lost for one."""
     machine = run(TrackStatus(), "+" * 20)

@@ -344,6 +344,7 @@ def returned(
     speed: float = 0.0,
     ekf_speed: float | None = None,
     seconds: float = 10.0,
+    hz: int = 5,
 ) -> GnssReturnCheck:
     """What is found of a receiver that is error(t) metres off, north, in a flight northwards.
 
@@ -353,7 +354,7 @@ def returned(
     for i in range(int(seconds * 10)):
         t = i / 10
         now = int(t * SECOND) + SECOND
-        report = 2 * (i // 2) / 10
+        report = i * hz // 10 / hz
         at = speed * (report - 0.15) + error(report) + float(rng.normal(0, 0.1))
         state = vehicle(
             int(report * SECOND) + SECOND,
@@ -371,6 +372,7 @@ def returned(
 def test_a_right_receiver_is_accepted(speed: float, claimed: float | None) -> None:
     assert returned(lambda _: 1.0, speed=speed, claimed=claimed, seconds=5.5).accepted
     assert not returned(lambda _: 1.0, speed=speed, claimed=claimed, seconds=4.5).accepted
+    assert returned(lambda _: 1.0, speed=speed, claimed=claimed, seconds=6.5, hz=1).accepted
 
 
 @pytest.mark.parametrize(
@@ -380,6 +382,8 @@ def test_a_right_receiver_is_accepted(speed: float, claimed: float | None) -> No
         ({"error": lambda _: 20.0, "claimed": 4.9}, "m off vision"),
         ({"error": lambda t: max(8.0 - t, -2.0)}, "m/s off vision"),
         ({"error": lambda t: (-1.0) ** round(5 * t) * (3.0 + t)}, "m noise"),
+        # It jumps to and fro by less than it claims to be wrong.
+        ({"error": lambda t: 6.0 * (t // 3 % 2), "claimed": 3.0, "seconds": 7.5}, "m noise"),
         ({"error": lambda _: 0.0, "claimed": 8.0}, "m claimed"),
         ({"error": lambda _: -12.0, "speed": 10.0}, "m off vision"),  # 1.2 s late
         ({"error": lambda _: 0.0, "ekf_speed": 2.0}, "m/s off IMU"),
