@@ -36,7 +36,8 @@ FRAME = LocalFrame(Geodetic(47.0, 8.0, 400.0))
 def _shown():
     instruments = Instruments(
         lambda: {"level": "ok", "text": "", "rate_hz": float("nan")}, VehicleState,
-        lambda: ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),)), lambda: None, lambda: False,
+        lambda: ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),)),
+        lambda: None, lambda: False,
     )  # fmt: skip
     return Shown(FRAME, 48.0, instruments, {"mode": "shadow"})
 
