@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 
 
-class AlertId(enum.Enum):
+class AlertId(str, enum.Enum):
     """See `mavlink_bridge.alerts.catalogue` for what each one means."""
 
     # integrity monitor

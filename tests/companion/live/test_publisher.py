@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import json
 import os
 import socket
 import stat
@@ -24,8 +25,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import Frame, PoseEstimate, RegistrationStatus, TrackingState
-from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
 
@@ -37,7 +39,7 @@ def _shown():
     instruments = Instruments(
         lambda: {"level": "ok", "text": "", "rate_hz": float("nan")}, VehicleState,
         lambda: ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),)),
-        lambda: None, lambda: False,
+        lambda: LoopVerdict(False, alert(AlertId.EKF_NO_SOURCE), None), lambda: False,
     )  # fmt: skip
     return Shown(FRAME, 48.0, instruments, {"mode": "shadow"})
 
@@ -381,3 +383,9 @@ def test_without_control_and_beyond_the_rate_nothing_is_done():
     orders.take({"do": "stop"})
     assert len(ship.tracked) == 11
     assert issubclass(OrderError, CompanionError)
+
+
+def test_alerts_reach_the_console_as_ids_and_their_text():
+    document = json.loads(json.dumps(_shown().state(0)[0]))
+    assert document["follows"]["reason"] == body(alert(AlertId.EKF_NO_SOURCE))
+    assert document["shadow"]["reasons"][0]["id"] == AlertId.SHADOW_NOT_COMPARED.value
