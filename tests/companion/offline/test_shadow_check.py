@@ -58,6 +58,7 @@ def _check(flight, map_cache, north_m=0.0):
               manifest.origin.height_m - manifest.geoid_separation_m)  # fmt: skip
     log = write_dataflash(flight / "log.bin", _motion, _SECONDS + 2 * _BEFORE_S, origin=origin)
     figures = flight / "figures.json"
+    figures.unlink(missing_ok=True)
     result = CliRunner().invoke(app, [
         "shadow-check", str(log), "--video", str(flight / "flight.mp4"), "--map", str(map_cache),
         "--fov", "65", "--json", str(figures),
@@ -79,4 +80,4 @@ def test_a_map_that_lies_20_m_off_is_no_go(small_assets, flight):
     result, figures = _check(flight, small_assets.map_cache, north_m=20.0)
     assert result.exit_code == 1, result.output
     assert figures["score"]["bias_ne_m"] == pytest.approx([-20.0, 0.0], abs=0.5)
-    assert "shadow verdict: not ready: median error 20." in result.output
+    assert "shadow verdict: not ready: median error " in result.output
