@@ -53,7 +53,7 @@ class Flight:
     control: bool = True
     armed: bool = False
     hz: float = 5.0
-    said: list[str] = field(default_factory=list)
+    said: list[Alert] = field(default_factory=list)
     hints: list[tuple[float, float, float]] = field(default_factory=list)
     targets: dict[str, np.ndarray] = field(default_factory=dict)
     sent: int = 0
