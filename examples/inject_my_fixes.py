@@ -22,6 +22,7 @@ import sys
 import numpy as np
 
 from mavlink_bridge import Bridge, BridgeConfig, BridgeError, VisionFix
+from mavlink_bridge.alerts.catalogue import text
 
 DELAY_MS = 100.0  # a little over your localizer's latency, and the same in VISO_DELAY_MS
 
@@ -49,7 +50,7 @@ def main(connection: str, latitude: str, longitude: str, altitude: str, geoid: s
     )
     # What the operator reads, on the ground station and here: "injecting", "not sent: ...", ...
     with Bridge(
-        config, float(geoid), on_text=lambda _, text, _alert: print(text, flush=True)
+        config, float(geoid), on_alert=lambda alert: print(text(alert), flush=True)
     ) as bridge:
         for line in sys.stdin:
             try:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
 from mavlink_bridge.camera.look_at import LookAt
@@ -65,7 +66,7 @@ class Bridge:
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
-    on_text: called likewise with every line for the operator (severity, text, its alert).
+    on_alert: called likewise with every alert for the operator.
     on_vehicle_text: called likewise with every STATUSTEXT of the autopilot (severity, text, sender
     as "system/component"), long ones in their parts.
     clock: CLOCK_MONOTONIC, ns; for a recorded flight, which `play` and `tick` go through instead of
@@ -80,19 +81,19 @@ class Bridge:
         *,
         on_track: Callable[[TrackRequest], None] | None = None,
         on_hint: Callable[[PlaceHint], bool] | None = None,
-        on_text: Callable[[int, str, Alert | None], None] = lambda _severity, _text, _alert: None,
+        on_alert: Callable[[Alert], None] = lambda _alert: None,
         on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._config, self._clock = config, clock
         self._started = self._stopped = False
         self._utc = SteadyUtc()
-        self._status = OperatorStatus(self._tell_text, on_text, clock)
-        teller = StatusNotifier(self.say)
+        self._status = OperatorStatus(self._send_text, on_alert, clock)
+        teller = StatusNotifier(self.report_alert)
         self._recorder = None
         if config.tlog is not None:
             self._recorder = TlogRecorder(
-                config.tlog, lambda why: teller.warn(f"tlog is incomplete: {why}")
+                config.tlog, lambda why: teller.report(alert(AlertId.TLOG_INCOMPLETE, why=why))
             )
         self._tracker = VehicleTracker(
             config.system_id,
@@ -108,15 +109,16 @@ class Bridge:
             self._tracker,
             self._clock(),
             lambda: self._status.level,
-            self.say,
+            self.report_alert,
             on_track,
             on_hint,
-            VehicleWatch(self.say, enable.announce if enable is not None else lambda: None, clock),
+            VehicleWatch(
+                self.report_alert, enable.announce if enable is not None else lambda: None, clock
+            ),
             enable,
-            LookAt(config, geoid_separation_m, self.say),
+            LookAt(config, geoid_separation_m, self.report_alert),
             on_vehicle_text,
             clock,
-            self.report_alert,
         )
         self._fc = FlightControllerEnd(shared)
         make = _LinkMaker(config, self._recorder)
@@ -239,20 +241,18 @@ class Bridge:
         self._ground.show(item)
         self._ground_link.wake()
 
-    def set_health(self, level: HealthLevel, text: str = "", *, tell: bool = True) -> None:
-        """The localizer's health; a change of level or text (but for its figures) is told once.
+    def set_health(
+        self, level: HealthLevel, alerts: Sequence[Alert] = (), *, tell: bool = True
+    ) -> None:
+        """The localizer's health, and the alerts that are true now, worst first; each is sent once.
 
-        tell: false for what the bridge tells by itself.
+        tell: false for what was sent already.
         """
-        self._status.set_health(level, text, tell=tell)
+        self._status.set_health(level, alerts, tell=tell)
 
     def report_alert(self, alert: Alert) -> None:
         """An alert for the operator: STATUSTEXT on the ground side, and the log."""
         self._status.report(alert)
-
-    def say(self, severity: int, text: str) -> None:
-        """A line for the operator: STATUSTEXT on the ground side, and the log."""
-        self._status.say(severity, text)
 
     def tell_figures(self, figures: Mapping[str, float]) -> None:
         """NAMED_VALUE_FLOAT for each figure, names of at most 10 characters, where
@@ -263,7 +263,7 @@ class Bridge:
             for message in named_values(figures, uptime_ms):
                 self._ground_link.send(message, self._config.companion_component)
 
-    def _tell_text(self, severity: int, message: Any) -> None:
+    def _send_text(self, severity: int, message: Any) -> None:
         component = self._config.companion_component
         if self._config.texts_as_autopilot and severity <= _WARNING:
             component = self.state().component_id or _AUTOPILOT
@@ -320,9 +320,9 @@ class Bridge:
         mission.wanted = True
         return mission.waypoints
 
-    def texts(self) -> list[str]:
-        """The last lines told to the operator, oldest first."""
-        return self._status.texts()
+    def alerts(self) -> list[Alert]:
+        """The last alerts for the operator, oldest first."""
+        return self._status.alerts()
 
     def last_ticks_ns(self) -> dict[str, int]:
         """When each link's thread began its newest turn, CLOCK_MONOTONIC ns, by the link's name."""
@@ -348,9 +348,9 @@ class Bridge:
         return self._fc.sender.reaches_ekf(self._clock())
 
     @property
-    def injection_fault(self) -> str:
+    def injection_fault(self) -> Alert | None:
         """Why the EKF does not have what it should while injecting: positions are not sent, or not
-        followed; empty while all is well. The operator was told.
+        followed; None while all is well. The operator was told.
         """
         return self._fc.injection_fault
 
@@ -376,7 +376,7 @@ class Bridge:
 
     def waiting(self) -> dict[str, int]:
         """Messages and bytes that wait anywhere in the bridge, by where they do."""
-        result = {"texts": len(self._status.texts()), **self._fc.waiting()}
+        result = {"alerts": len(self._status.alerts()), **self._fc.waiting()}
         if self._ground is not self._fc.components:
             result.update({f"ground {name}": n for name, n in self._ground.waiting().items()})
         for link in self._links:
@@ -422,7 +422,7 @@ def _enable(config: BridgeConfig, teller: StatusNotifier) -> InjectionEnable | N
         return None
     file = config.state_file
     memory = None if file is None else InjectionEnableMemory(RestartMemory(file))
-    return InjectionEnable(config.rc, teller.notice, memory)
+    return InjectionEnable(config.rc, teller.report, memory)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

@@ -8,6 +8,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.component import TRACKING, CameraComponent
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.injection.injection_enable import COMMANDS
@@ -71,7 +73,7 @@ class Components:
         signing = self._config.ground_signing if ground else self._config.signing
         self._is_trusted = signing is not None or self._config.signing is None
         self._refused: set[int] = set()
-        self._hints_told: dict[int, int] = {}  # when, by severity
+        self._hints_told: dict[AlertId, int] = {}  # when
 
     def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
         """Queue what the ground is to be told; the oldest go first when it is full."""
@@ -157,10 +159,10 @@ class Components:
         link.send(ack, message.target_component)
         if system not in self._refused and len(self._refused) < _MOST_REFUSED:
             self._refused.add(system)
-            why = "not in ground_systems" if self._is_trusted else "link not signed"
-            more = len(self._refused) == _MOST_REFUSED
-            text = f"PiLoT: system {system}{' and more' if more else ''} refused: {why}"
-            self._shared.say(mavlink.MAV_SEVERITY_WARNING, text)
+            why = "not allowed" if self._is_trusted else "not signed"
+            is_last = len(self._refused) == _MOST_REFUSED
+            refused = AlertId.SENDERS_REFUSED if is_last else AlertId.SENDER_REFUSED
+            self._shared.report(alert(refused, system=system, why=why))
 
     def _localizer_command(self, link: Link, message: Any, time_ns: int) -> None:
         """What gates injection and what hints at the place; others are refused in the protocol's
@@ -182,11 +184,10 @@ class Components:
         if hint is None:
             return int(mavlink.MAV_RESULT_DENIED)
         taken = on_hint(hint)
-        severity, text = mavlink.MAV_SEVERITY_WARNING, "hint refused: not on the map"
+        news = alert(AlertId.HINT_REFUSED)
         if taken:
-            severity = mavlink.MAV_SEVERITY_NOTICE
-            text = f"search {hint.radius_m:.0f} m about the place given"
-        if time_ns - self._hints_told.get(severity, -_HINT_NS) >= _HINT_NS:
-            self._hints_told[severity] = time_ns
-            self._shared.say(severity, f"PiLoT: {text}")
+            news = alert(AlertId.HINT_TAKEN, metres=hint.radius_m)
+        if time_ns - self._hints_told.get(news.id, -_HINT_NS) >= _HINT_NS:
+            self._hints_told[news.id] = time_ns
+            self._shared.report(news)
         return int(mavlink.MAV_RESULT_ACCEPTED if taken else mavlink.MAV_RESULT_DENIED)

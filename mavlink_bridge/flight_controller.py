@@ -8,8 +8,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.alerts.alert import Inhibits
-from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.alert import Alert, Inhibits
+from mavlink_bridge.alerts.catalogue import CATALOGUE, alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
@@ -74,16 +74,14 @@ class FlightControllerEnd:
         self.components = Components(shared, ground=False)
         self._shared = shared
         self._tracker = shared.tracker
-        self._teller = teller = StatusNotifier(
-            shared.say, {"inject": "nothing yet", "loop": "nothing yet"}
-        )
+        self._teller = teller = StatusNotifier(shared.report, {"inject": None, "loop": None})
         self._commander = commander = Commander(config.companion_component)
         self.requests = VehicleRequests(config, commander)
         self.time_sync = TimeSync(shared.tracker, config.companion_component, teller, shared.clock)
         self.origin = OriginExchange(config, shared.tracker, commander, teller, self.counters)
         self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
-        self.sources = SourceOrders(config.switch, commander, teller, self.counters, shared.report)
+        self.sources = SourceOrders(config.switch, commander, teller, self.counters)
         self._no_go = no_go = _no_go_memory(config)
         self._interlock = ShadowInterlock(
             config.injection.force,
@@ -145,14 +143,14 @@ class FlightControllerEnd:
         return self._mode == self._shared.mode() == "inject"
 
     @property
-    def injection_fault(self) -> str:
+    def injection_fault(self) -> Alert | None:
         """Why the EKF does not have what it should, as it was told: positions are not sent, or are
-        not followed. Empty while all is well, and in other modes than ``inject``.
+        not followed. None while all is well, and in other modes than ``inject``.
         """
         if not self.injecting:
-            return ""
+            return None
         verdict = self.outcome.verdict
-        return self.sender.refusal or (verdict.reason if verdict is not None else "")
+        return self.sender.refusal or (verdict.reason if verdict is not None else None)
 
     def figures(self) -> Figures:
         """Counters and measures for a record, None where one is not known; keys are prefixed by
@@ -163,7 +161,7 @@ class FlightControllerEnd:
         result.update({f"inject_{k}": v for k, v in dict(injector.counters).items()})
         result.update({f"bridge_{k}": v for k, v in dict(self.counters).items()})
         result.update({f"rx_{k}": v for k, v in dict(self.requests.streams.counts).items()})
-        result["inject_reason"] = injector.reason
+        result["inject_reason"] = "" if injector.reason is None else injector.reason.id.value
         result["reset_counter"] = injector.reset_counter
         yaw = injector.yaw_difference_rad
         result["yaw_difference_deg"] = None if yaw is None else math.degrees(yaw)
@@ -230,7 +228,7 @@ class FlightControllerEnd:
         self.sender.injector.guard.reset()
         self.sources.rebooted()
         self.requests.reset()
-        self._teller.warn("flight controller rebooted")
+        self._teller.report(alert(AlertId.FC_REBOOTED))
 
     # --- the clockwork --------------------------------------------------------------------------
 
@@ -313,5 +311,5 @@ class FlightControllerEnd:
                 link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
             )
         held = came and may_inject
-        self.news.held(self._interlock.reason if held else "", now_ns)
+        self.news.held(self._interlock.reason if held else None, now_ns)
         self.news.look(state, now_ns, injecting=good, refused=self.sources.gnss_refused)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.shared import Shared
@@ -18,7 +20,7 @@ class GroundEnd:
     def __init__(self, shared: Shared) -> None:
         self.components = Components(shared, ground=True)
         self._shared = shared
-        self._teller = StatusNotifier(shared.say)
+        self._teller = StatusNotifier(shared.report)
 
     def on_open(self, link: Link) -> None:
         """Announce at once."""
@@ -40,7 +42,7 @@ class GroundEnd:
         link.system_id = config.system_id or state.system_id or 0
         self._shared.watch.check(state)
         if link.stranger:
-            self._teller.tell("foreign", f"MAVLink of {link.stranger} ignored")
+            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=link.stranger))
         if link.system_id:
             self.components.heartbeat(link, now_ns)
             if config.camera.announce:

@@ -36,11 +36,6 @@ Figures = dict[str, int | float | str | None]
 """Counters and measures by name, for a record; None where one is not known."""
 
 
-def without_figures(text: str) -> str:
-    """A line for the operator without its numbers: what changes in them only is no news."""
-    return "".join(c for c in text if not c.isdigit() and c not in "+-.")
-
-
 def or_nan(value: float | None) -> float:
     """A MAVLink field's value: NaN says there what None says here."""
     return math.nan if value is None else value

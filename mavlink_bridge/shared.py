@@ -27,7 +27,7 @@ def clicked_numbers() -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Shared:
-    """What the bridge lends to its ends. say: tell the operator (severity, text); report: an alert.
+    """What the bridge lends to its ends. report: tell the operator.
 
     gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
     """
@@ -38,7 +38,7 @@ class Shared:
     tracker: VehicleTracker
     begun_ns: int
     health: Callable[[], HealthLevel]
-    say: Callable[[int, str], None]
+    report: Callable[[Alert], None]
     on_track: Callable[[TrackRequest], None] | None
     on_hint: Callable[[PlaceHint], bool] | None
     watch: VehicleWatch
@@ -46,7 +46,6 @@ class Shared:
     look: LookAt
     on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
     clock: Callable[[], int] = monotonic_ns
-    report: Callable[[Alert], None] = lambda _: None
     target_numbers: Iterator[int] = field(default_factory=clicked_numbers)
     """Of clicked targets, over all links; none is given twice."""
 

@@ -1,139 +1,118 @@
-"""The lines for the operator and the localizer's health, as they go to the ground side."""
+"""Alerts and the localizer's health, as they go to the ground side: here alerts become text."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.alerts.alert import Alert
-from mavlink_bridge.alerts.catalogue import severity
-from mavlink_bridge.alerts.catalogue import text as alert_text
+from mavlink_bridge.alerts.alert import Alert, AlertKey
+from mavlink_bridge.alerts.catalogue import TEXT_LENGTH, severity, text
 from mavlink_bridge.link.clock import monotonic_ns
-from mavlink_bridge.messages import HealthLevel, without_figures
+from mavlink_bridge.messages import HealthLevel
 from mavlink_bridge.status_notifier import Hysteresis
 
 _log = logging.getLogger(__name__)
 
-_TEXTS = 64
-_TEXT_LENGTH = 50  # STATUSTEXT.text
+_KEPT = 64
 _NAME_LENGTH = 10  # NAMED_VALUE_FLOAT.name
-_MAX_CHUNKS = 4
 _AGAIN_NS = 10_000_000_000
-_SAME_NS = 1_000_000_000  # within it the same line is not said twice in a row
-_SEVERITY = {
-    HealthLevel.STARTING: mavlink.MAV_SEVERITY_INFO,
-    HealthLevel.OK: mavlink.MAV_SEVERITY_INFO,
-    HealthLevel.DEGRADED: mavlink.MAV_SEVERITY_WARNING,
-    HealthLevel.FAILED: mavlink.MAV_SEVERITY_ERROR,
-}
+_SAME_NS = 1_000_000_000  # within it the same alert is not sent twice in a row
 
 
 class OperatorStatus:
     """Tells the operator. Every method may be called from any thread.
 
-    send: a line's severity and message to the ground; on_text: every line (severity, text, its
-    alert), for a
-    record.
+    send: an alert's severity and message to the ground; on_alert: every alert, for a record.
     """
 
     def __init__(
         self,
         send: Callable[[int, Any], None],
-        on_text: Callable[[int, str, Alert | None], None],
+        on_alert: Callable[[Alert], None],
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._send, self._clock = send, clock
-        self._on_text = on_text
+        self._on_alert = on_alert
         self._health_lock = threading.Lock()
-        self._text_lock = threading.Lock()
-        self._health = (HealthLevel.STARTING, "")
+        self._newest_lock = threading.Lock()
+        self._level = HealthLevel.STARTING
         self._settling = Hysteresis()
-        self._told_ns: dict[tuple[HealthLevel, str], int] = {}
-        self._last_told = self._health
-        self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
-        self._newest = (-_SAME_NS, 0, "")  # line, and when it was said
-        self._text_id = 0
+        self._reported_ns: dict[AlertKey, int] = {}
+        self._last_reported: tuple[AlertKey, ...] = ()
+        self._alerts: deque[Alert] = deque(maxlen=_KEPT)
+        self._newest: tuple[int, Alert | None] = (-_SAME_NS, None)  # when it was sent
 
     @property
     def level(self) -> HealthLevel:
         """The localizer's health, as the heartbeats tell it."""
-        return self._health[0]
+        return self._level
 
     def set_health(
-        self, level: HealthLevel, text: str, *, tell: bool, now_ns: int | None = None
+        self, level: HealthLevel, alerts: Sequence[Alert], *, tell: bool, now_ns: int | None = None
     ) -> None:
-        """A change of level or text (but for its figures) is told, if at all; to be called again
-        and again.
+        """What is true now, worst first; to be called again and again. Alerts that are new are
+        sent, if any are told at all.
 
-        What comes and goes by turns is told once in 10 s, and its end once it has lasted: an
+        A condition that comes and goes is sent once in 10 s, and its end once it has lasted: an
         overloaded computer is well and ill every other second. now_ns: CLOCK_MONOTONIC.
         """
         now_ns = self._clock() if now_ns is None else now_ns
-        key = (level, without_figures(text))
+        keys = tuple(alert.key for alert in alerts)
         bad = level in (HealthLevel.DEGRADED, HealthLevel.FAILED)
         with self._health_lock:
-            self._health = key
+            self._level = level
             over = self._settling.is_over(now_ns, bad=bad)
-            lately = now_ns - self._told_ns.get(key, -_AGAIN_NS) < _AGAIN_NS
-            news = key != self._last_told and (not lately if bad else over)
-            if news:
-                self._last_told, self._told_ns[key] = key, now_ns
-        if news and tell:
-            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}", now_ns)
+            if keys == self._last_reported or not (bad or over):
+                return
+            due = [
+                alert for alert in alerts
+                if alert.key not in self._last_reported and self._is_due(alert, now_ns, bad=bad)
+            ]  # fmt: skip
+            if due or not bad:
+                self._last_reported = keys
+                self._reported_ns |= {alert.key: now_ns for alert in due}
+        if tell:
+            for alert in due:
+                self.report(alert, now_ns)
+
+    def _is_due(self, alert: Alert, now_ns: int, *, bad: bool) -> bool:
+        return not bad or now_ns - self._reported_ns.get(alert.key, -_AGAIN_NS) >= _AGAIN_NS
 
     def report(self, alert: Alert, now_ns: int | None = None) -> None:
-        """An alert: its text, and the alert itself for who records it. As `say`."""
-        self.say(severity(alert), alert_text(alert), now_ns, alert)
-
-    def say(
-        self, severity: int, text: str, now_ns: int | None = None, alert: Alert | None = None
-    ) -> None:
-        """STATUSTEXT, and the log. A line that is said again within a second is left out: a flood
+        """STATUSTEXT, and the log. An alert that is repeated within a second is left out: a flood
         of orders that are refused would hide every other, and wear out the link and the record. One
-        after another line is no repetition: "on" after "off" tells how it stands.
+        after another alert is no repetition: "on" after "off" tells how it stands.
         """
-        if self._was_said(severity, text, self._clock() if now_ns is None else now_ns):
+        if self._is_repeated(alert, self._clock() if now_ns is None else now_ns):
             return
-        self._texts.append((severity, text))
-        grave = severity <= mavlink.MAV_SEVERITY_WARNING
-        _log.log(logging.WARNING if grave else logging.INFO, text)
-        self._on_text(severity, text, alert)
-        with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
-            self._text_id = text_id = self._text_id % 0xFFFF + 1
-        for message in status_texts(severity, text, text_id):
-            self._send(severity, message)
+        self._alerts.append(alert)
+        grave = severity(alert) <= mavlink.MAV_SEVERITY_WARNING
+        _log.log(logging.WARNING if grave else logging.INFO, text(alert))
+        self._on_alert(alert)
+        self._send(severity(alert), status_text(alert))
 
-    def _was_said(self, severity: int, text: str, now_ns: int) -> bool:
-        with self._text_lock:
-            said_ns, *line = self._newest
-            if line == [severity, text] and now_ns - said_ns < _SAME_NS:
+    def _is_repeated(self, alert: Alert, now_ns: int) -> bool:
+        with self._newest_lock:
+            sent_ns, newest = self._newest
+            if alert == newest and now_ns - sent_ns < _SAME_NS:
                 return True
-            self._newest = (now_ns, severity, text)
+            self._newest = (now_ns, alert)
             return False
 
-    def texts(self) -> list[str]:
-        """The last lines, oldest first."""
-        return [text for _, text in list(self._texts)]
+    def alerts(self) -> list[Alert]:
+        """The last ones, oldest first."""
+        return list(self._alerts)
 
 
-def status_texts(severity: int, text: str, text_id: int) -> list[Any]:
-    """STATUSTEXT (253) of a line, in chunks of 50 characters under one id where it is longer."""
-    raw = text.encode("ascii", "replace")[: _MAX_CHUNKS * _TEXT_LENGTH]
-    chunks = [raw[i : i + _TEXT_LENGTH] for i in range(0, max(len(raw), 1), _TEXT_LENGTH)]
-    if len(chunks) == 1:
-        return [mavlink.MAVLink_statustext_message(severity, raw)]
-    if len(chunks[-1]) == _TEXT_LENGTH:
-        # A receiver knows the end by a chunk that is not full.
-        chunks.append(b"")
-    return [
-        mavlink.MAVLink_statustext_message(severity, chunk, text_id, i)
-        for i, chunk in enumerate(chunks)
-    ]
+def status_text(alert: Alert) -> Any:
+    """STATUSTEXT (253) of an alert."""
+    raw = text(alert).encode("ascii", "replace")[:TEXT_LENGTH]
+    return mavlink.MAVLink_statustext_message(severity(alert), raw)
 
 
 def named_values(figures: Mapping[str, float], uptime_ms: int) -> list[Any]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-from mavlink_bridge.messages import without_figures
+from mavlink_bridge.alerts.alert import Alert, AlertKey
 
 _RELAPSE_NS = 8_000_000_000
 
@@ -43,73 +41,55 @@ class Hysteresis:
 
 
 class StatusNotifier:
-    """Remembers by topic what the operator was told, so that nothing is told twice.
-
-    say: tell the operator (severity, text). known: topics that count as told already.
-    """
+    """Remembers by topic what the operator was told, so that nothing is told twice."""
 
     def __init__(
-        self, say: Callable[[int, str], None], known: Mapping[str, str] | None = None
+        self, report: Callable[[Alert], None], known: Mapping[str, Alert | None] | None = None
     ) -> None:
-        self._say = say
-        self._told = dict(known or {})
+        self.report = report
+        """Tell the operator, whatever was told before."""
+        self._reported: dict[str, Alert | None] = dict(known or {})
         self._settling: dict[str, Hysteresis] = {}
-        self._since_relief: dict[str, set[str]] = {}
+        self._since_relief: dict[str, set[AlertKey]] = {}
 
-    def told(self, topic: str) -> str:
-        """What was told last of a topic, without its figures; empty when all is well."""
-        return self._told.get(topic, "")
+    def reported(self, topic: str) -> Alert | None:
+        """What was told last of a topic; None before."""
+        return self._reported.get(topic)
 
     def forget(self, topic: str) -> None:
-        """The next text of a topic is told whatever it says."""
-        self._told.pop(topic, None)
+        """The next alert of a topic is told whatever it is."""
+        self._reported.pop(topic, None)
 
-    def tell(self, topic: str, problem: str, relief: str = "", *, prefix: str = "") -> None:
-        """A problem when it begins or changes (digits aside, or it would never stop), and its end.
-
-        prefix: part of what is compared, not of what is said.
+    def tell(self, topic: str, problem: Alert | None, relief: Alert | None = None) -> None:
+        """A problem when it begins or changes in more than numbers, and its end, the relief. A
+        topic that begins without a problem is not told.
         """
-        plain = f"{prefix if not problem else ''}{without_figures(problem)}"
-        if plain == self.told(topic):
+        news, last = problem or relief, self.reported(topic)
+        if (news and news.key) == (last and last.key):
             return
-        known = topic in self._told
-        self._told[topic] = plain
-        if problem:
-            self.warn(problem)
-        elif relief and known and prefix in ("", "inject"):
-            self.inform(relief)
+        is_known = topic in self._reported
+        self._reported[topic] = news
+        if news is not None and (problem is not None or is_known):
+            self.report(news)
 
     def tell_settled(
         self,
         topic: str,
-        problem: str,
-        relief: str,
+        problem: Alert | None,
+        relief: Alert | None,
         now_ns: int,
         *,
-        prefix: str = "",
         wait_s: float = 1.5,
     ) -> None:
         """As `tell`, for what comes and goes: each problem once until the relief, and that only
         once it has lasted, `wait_s` the first time.
         """
         settling = self._settling.setdefault(topic, Hysteresis(wait_s))
-        over = settling.is_over(now_ns, bad=bool(problem))
+        over = settling.is_over(now_ns, bad=problem is not None)
         told = self._since_relief.setdefault(topic, set())
-        if problem and without_figures(problem) not in told:
-            told.add(without_figures(problem))
-            self.tell(topic, problem, relief, prefix=prefix)
+        if problem is not None and problem.key not in told:
+            told.add(problem.key)
+            self.tell(topic, problem, relief)
         elif over:
             told.clear()
-            self.tell(topic, "", relief, prefix=prefix)
-
-    def warn(self, text: str) -> None:
-        """A warning, whatever was told before."""
-        self._say(mavlink.MAV_SEVERITY_WARNING, f"PiLoT: {text}")
-
-    def notice(self, text: str) -> None:
-        """A notice, whatever was told before."""
-        self._say(mavlink.MAV_SEVERITY_NOTICE, f"PiLoT: {text}")
-
-    def inform(self, text: str) -> None:
-        """An information, whatever was told before."""
-        self._say(mavlink.MAV_SEVERITY_INFO, f"PiLoT: {text}")
+            self.tell(topic, None, relief)

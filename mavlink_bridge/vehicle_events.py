@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -32,21 +35,20 @@ class VehicleEvents:
         healthy = gnss_healthy(state, now_ns)
         self._follow_gnss(healthy and not (refused and not self._gnss), now_ns, injecting=injecting)
         if state.armed and not self._armed and not healthy:
-            what = "injecting" if injecting else "nothing is injected"
-            self._teller.warn(f"armed without GNSS, {what}")
+            self._teller.report(alert(AlertId.ARMED_WITHOUT_GNSS, output=_output(injecting)))
         self._armed = state.armed
 
-    def held(self, reason: str, now_ns: int) -> None:
-        """Why fixes that come are not sent, from the interlock; empty when they are or none come.
+    def held(self, reason: Alert | None, now_ns: int) -> None:
+        """Why fixes that come are not sent, from the interlock; None when they are or none come.
 
         A score needs some seconds: what goes by itself is no news.
         """
-        if not reason:
+        if reason is None:
             self._held_ns = None
             return
         self._held_ns = self._held_ns or now_ns
         if now_ns - self._held_ns >= _HELD_NS:
-            self._teller.tell("held", f"not sent: {reason}")
+            self._teller.tell("held", reason)
 
     def _follow_gnss(self, healthy: bool, now_ns: int, *, injecting: bool) -> None:
         passed_ns, self._looked_ns = min(now_ns - self._looked_ns, _LOST_NS), now_ns
@@ -55,11 +57,15 @@ class VehicleEvents:
             well = self._back_ns is not None and now_ns - self._back_ns >= _BACK_NS
             if healthy and (well or self._gnss is None):
                 if self._gnss is not None:
-                    self._teller.inform("GNSS is back")
+                    self._teller.report(alert(AlertId.GNSS_BACK))
                 self._gnss, self._bad_ns = True, 0
             return
         change_ns = round(-_PAID_BACK * passed_ns) if healthy else passed_ns
         self._bad_ns = max(self._bad_ns + change_ns, 0)
         if self._bad_ns > _LOST_NS:
             self._gnss, self._back_ns = False, None
-            self._teller.warn(f"GNSS lost, {'injecting' if injecting else 'nothing is injected'}")
+            self._teller.report(alert(AlertId.GNSS_LOST, output=_output(injecting)))
+
+
+def _output(injecting: bool) -> str:
+    return "injecting" if injecting else "nothing is injected"

@@ -46,15 +46,13 @@ def page() -> str:
 
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
-    ended = body(cleared(spec.id))
+    ended = f"{spec.cleared} (`{body(cleared(spec.id))}`)" if spec.cleared else "not told"
     inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
     action = ", ".join(
         [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]
     )
     text = shown.removeprefix(PREFIX)
-    return (
-        f"| `{spec.id.value}` | {text} | {spec.raised} | {spec.cleared} (`{ended}`) | {action} |\n"
-    )
+    return f"| `{spec.id.value}` | {text} | {spec.raised} | {ended} | {action} |\n"
 
 
 def _value(field: str, spec: AlertSpec) -> str:

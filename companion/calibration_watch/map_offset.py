@@ -18,6 +18,9 @@ import numpy as np
 from localizer.geometry.pose import Array
 from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, TrackingState
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
 
@@ -33,7 +36,6 @@ _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's m
 _AGAIN_M = 2.0  # by which another estimate is told anew
 _OUTLIER = 3.0  # robust sigmas of a block's median
 _SLEW_M_S = 0.2  # of what is applied: far below what the EKF or the monitor take for a motion
-_NOTICE = 5  # MAV_SEVERITY_NOTICE
 _WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 Policy = Literal["tell", "apply"]
@@ -50,8 +52,8 @@ class MapOffsetTelemetry(Protocol):
         """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
         ...
 
-    def say(self, severity: int, text: str) -> None:
-        """A line for the operator."""
+    def report_alert(self, alert: Alert) -> None:
+        """An alert for the operator."""
         ...
 
 
@@ -66,11 +68,11 @@ class MapOffset:
     blocks: int
     significant: bool
 
-    def line(self) -> str:
-        """For the operator, e.g. "map 2.3 m east of GNSS"."""
+    @property
+    def direction(self) -> str:
+        """Of the map from GNSS, e.g. "east"."""
         north, east = self.ne_m
-        wind = _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]
-        return f"map {math.hypot(north, east):.1f} m {wind} of GNSS"
+        return _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]
 
 
 def estimate(blocks: Array, bias_m: float) -> MapOffset:
@@ -177,7 +179,10 @@ class MapOffsetEstimator:
             return
         self._told = shift.ne_m
         applied = ", applied" if self._policy == "apply" else ""
-        self._vehicle.say(_NOTICE, f"PiLoT: {shift.line()}{applied}")
+        self._vehicle.report_alert(
+            alert(AlertId.MAP_OFFSET, metres=math.hypot(*shift.ne_m), direction=shift.direction,
+                  applied=applied)
+        )  # fmt: skip
         north, east = shift.ne_m
         self._event(
             "info",

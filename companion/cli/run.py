@@ -18,6 +18,7 @@ from companion.terminal.console_log import console_log
 from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
+from mavlink_bridge.alerts.alert import Alert
 
 # Records (positions, pictures, the deployment's settings) are for their owner and group: files
 # 0640, folders 0750.
@@ -88,13 +89,13 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     from companion.supervision.processes import FlightProcess
     from companion.supervision.service_manager import ServiceManager
     from companion.supervision.supervisor import Supervisor, mark_dead
-    from mavlink_bridge.vehicle.crash_notifier import say_without_bridge
+    from mavlink_bridge.vehicle.crash_notifier import report_without_bridge
 
     command = [sys.executable, "-m", "companion", "run", *arguments]
     record = settings.record
 
-    def tell(severity: int, text: str) -> None:
-        say_without_bridge(settings.bridge, severity, text)
+    def tell(alert: Alert) -> None:
+        report_without_bridge(settings.bridge, alert)
 
     begun, kept = count(), keep(settings)
 

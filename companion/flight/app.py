@@ -25,13 +25,14 @@ from companion.supervision.pulse import Pulse
 from companion.supervision.restart import without_lost_disks
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 
 _log = logging.getLogger(__name__)
 # How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
 # between an estimate and the autopilot, would be 7 ms in the median (benchmarks.bridge).
 _SWITCH_S = 0.0002
-_WARNING = 4  # MAV_SEVERITY
 
 
 class Companion:
@@ -172,7 +173,7 @@ class Companion:
             keeper.failed("disk gone")
         bridge = self._parts.get(Bridge)
         if bridge is not None and self._lost_settings:
-            bridge.say(_WARNING, "PiLoT: deployment file lost, flown as before")
+            bridge.report_alert(alert(AlertId.DEPLOYMENT_LOST))
             events.send("warning", f"flown as before the restart, since {self._lost_settings}")
 
 

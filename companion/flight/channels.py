@@ -55,8 +55,8 @@ class Channels:
     """The name of every target that ended, on the targets' thread."""
     clicks: Channel[[TrackRequest]] = field(default_factory=Channel)
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
-    texts: Channel[[int, str, Alert | None]] = field(default_factory=Channel)
-    """Every line (MAV_SEVERITY, text, its alert) that the operator was told, on any thread."""
+    alerts: Channel[[Alert]] = field(default_factory=Channel)
+    """Every alert that the operator was told, on any thread."""
     vehicle_texts: Channel[[int, str, str]] = field(default_factory=Channel)
     """Every line (MAV_SEVERITY, text, sender) of the autopilot, on a MAVLink link's thread."""
     events: Channel[[str, str]] = field(default_factory=Channel)

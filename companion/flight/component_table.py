@@ -63,6 +63,8 @@ from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, severity, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.injection.restart_memory import RestartMemory
@@ -100,7 +102,7 @@ def _bridge(making: BuildContext) -> Bridge:
         making[MapStack].cache.manifest.geoid_separation_m,
         on_track=making.channels.clicks.send,
         on_hint=lambda hint: search().hint_at(hint),
-        on_text=making.channels.texts.send,
+        on_alert=making.channels.alerts.send,
         on_vehicle_text=making.channels.vehicle_texts.send,
         clock=making.clock,
     )
@@ -110,10 +112,12 @@ def _bridge(making: BuildContext) -> Bridge:
 
 def _record(making: BuildContext) -> RecordKeeper:
     bridge, channels, config = making[Bridge], making.channels, making.config
-    keeper = RecordKeeper(
-        making[MapStack].cache.frame,
-        lambda why: bridge.say(_WARNING, f"PiLoT: record is incomplete: {why}"),
-    )
+
+    def incomplete(why: str) -> None:
+        _log.warning("the record is incomplete: %s", why)
+        bridge.report_alert(alert(AlertId.RECORD_INCOMPLETE))
+
+    keeper = RecordKeeper(making[MapStack].cache.frame, incomplete)
     if config.record is None:
         return keeper
 
@@ -134,11 +138,11 @@ def _record(making: BuildContext) -> RecordKeeper:
         channels.events.subscribe(recorder.event)
 
         # What the operator was told belongs in the record; the bridge has logged it.
-        def told(severity: int, text: str, alert: Alert | None) -> None:
-            recorder.event(_level(severity), text, "" if alert is None else alert.id.value)
-            recorder.text(severity, text, "companion")
+        def told(of: Alert) -> None:
+            recorder.event(_level(severity(of)), text(of), of.id.value)
+            recorder.text(severity(of), text(of), "companion")
 
-        channels.texts.subscribe(told)
+        channels.alerts.subscribe(told)
         channels.vehicle_texts.subscribe(recorder.text)
     return keeper
 
@@ -149,8 +153,8 @@ def _source(making: BuildContext) -> FrameSource:
     def on_state(state: StreamState, text: str) -> None:
         events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
 
-    def on_stranger(text: str) -> None:
-        bridge.say(_WARNING, f"PiLoT: {text}")
+    def on_stranger(host: str) -> None:
+        bridge.report_alert(alert(AlertId.VIDEO_SENDER_IGNORED, host=host))
 
     model = camera.model.camera()
     wanted: tuple[PacketTap | None, ...] = (making.get(KlvRelay), making.get(FrameTimes))
@@ -218,7 +222,7 @@ def _targets(making: BuildContext) -> TargetReporter:
         MapSurface(cache).cast,
         channels.targets.send,
         channels.gone.send,
-        bridge.say,
+        bridge.report_alert,
     )
 
     def report(target: TargetEstimate) -> None:
@@ -233,7 +237,7 @@ def _targets(making: BuildContext) -> TargetReporter:
 
 
 def _clicks(making: BuildContext) -> ClickPolicy:
-    clicks = ClickPolicy(making[TargetReporter], making[Bridge].say, making.config.targets)
+    clicks = ClickPolicy(making[TargetReporter], making[Bridge].report_alert, making.config.targets)
     making.channels.estimates.subscribe(clicks.add_estimate)
     making.channels.clicks.subscribe(clicks.on_request)
     making.channels.gone.subscribe(clicks.on_gone)
@@ -251,7 +255,7 @@ def _detector(making: BuildContext) -> BoxDetector:
     config = making.config.targets.detector
     assert config is not None  # or the part is not wanted
     cast = MapSurface(making[MapStack].cache).cast
-    detector = BoxDetector(config, cast, reporter.add_detection, making[Bridge].say)
+    detector = BoxDetector(config, cast, reporter.add_detection, making[Bridge].report_alert)
     channels.frames.subscribe(detector.add_frame)
     channels.estimates.subscribe(lambda estimate, _: detector.add_estimate(estimate))
     return detector
@@ -414,7 +418,7 @@ def _console(making: BuildContext) -> Publisher:
     def track(request: TrackRequest) -> None:
         bridge.track(replace(request, time_ns=request.time_ns + late_ns))
 
-    helm = Helm(bridge.say, track, hint)
+    helm = Helm(bridge.report_alert, track, hint)
     orders = Orders(config.console.control, helm)
     record = None if config.record is None else config.record.folder
     path = socket_path(config.map, record, config.console.listen)
@@ -434,7 +438,7 @@ def _console(making: BuildContext) -> Publisher:
     channels.targets.subscribe(shown.add_target)
     channels.gone.subscribe(shown.forget_target)
     channels.events.subscribe(shown.add_event)
-    channels.texts.subscribe(lambda severity, text, _: shown.add_event(_level(severity), text))
+    channels.alerts.subscribe(lambda of: shown.add_event(_level(severity(of)), text(of)))
     return publisher
 
 
@@ -463,9 +467,7 @@ def _engine(making: BuildContext) -> DualThreadEngine:
     if table is None:
         channels.frames.subscribe(engine.submit)
         return engine
-    zoomed = ZoomedFrames(
-        table, bridge.zoom_at, lambda text: bridge.say(_WARNING, f"PiLoT: {text}")
-    )
+    zoomed = ZoomedFrames(table, bridge.zoom_at, bridge.report_alert)
     channels.frames.subscribe(zoomed.before(engine.submit))
     channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))
     return engine

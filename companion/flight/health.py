@@ -10,20 +10,21 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from companion.ending import joined
-from companion.flight.search import NOT_READY
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.sources import StreamState
 from companion.writing import NewestFile
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
-from mavlink_bridge.alerts.catalogue import body
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, body, named
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel
 
@@ -34,25 +35,30 @@ _STALE_S = 2.0
 _RATE_S = 5.0
 _LEAST_HZ = 3.0  # below 4 an EKF does without; a frame or two more or less is no news
 _SHORT_BRIDGE_NS = 2_000_000_000
-_NOTICE = 5  # MAV_SEVERITY_NOTICE
-_NOT_USED = "vision not used: "
-_TOLD = (_NOT_USED, "output held: ")
-_SILENT_VEHICLE = "no heartbeat from the flight controller"
-
-_NO_FRAME = "no frame is being localized"
-_SEARCH_HANGS = "the search hangs"
 _OF_FEED = {
-    StreamState.FAILED: (HealthLevel.FAILED, "video feed failed"),
-    StreamState.MISFIT: (HealthLevel.FAILED, "video size does not fit the calibration"),
-    StreamState.STALLED: (HealthLevel.DEGRADED, "video feed stalled"),
+    StreamState.FAILED: (HealthLevel.FAILED, AlertId.VIDEO_FAILED),
+    StreamState.MISFIT: (HealthLevel.FAILED, AlertId.VIDEO_SIZE),
+    StreamState.STALLED: (HealthLevel.DEGRADED, AlertId.VIDEO_STALLED),
 }
 _OF_STATE = {
-    TrackingState.INITIALIZING: (HealthLevel.STARTING, "localization initializing"),
-    TrackingState.TRACKING: (HealthLevel.OK, "localization tracking"),
-    TrackingState.DEGRADED: (HealthLevel.DEGRADED, "localization degraded"),
-    TrackingState.BRIDGING: (HealthLevel.DEGRADED, "bridging"),
-    TrackingState.LOST: (HealthLevel.FAILED, "localization lost"),
+    TrackingState.INITIALIZING: (HealthLevel.STARTING, AlertId.INITIALIZING),
+    TrackingState.TRACKING: (HealthLevel.OK, AlertId.TRACKING),
+    TrackingState.DEGRADED: (HealthLevel.DEGRADED, AlertId.DEGRADED),
 }
+
+
+@dataclass(frozen=True)
+class HealthStatus:
+    """alerts: that are true now, worst first. is_reported: somebody else told the worst one."""
+
+    level: HealthLevel
+    alerts: tuple[Alert, ...]
+    is_reported: bool = False
+
+    @property
+    def line(self) -> str:
+        """For health.json."""
+        return ", ".join(body(alert) for alert in self.alerts)
 
 
 @dataclass(frozen=True)
@@ -68,11 +74,14 @@ class HealthInputs:
     unreadable_nodes: Callable[[], int] = lambda: 0
     map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None
     targets: Callable[[], dict[str, int]] = dict
-    search_lacks: Callable[[], str] = lambda: ""
+    search_lacks: Callable[[], AlertId | None] = lambda: None
 
 
 class HealthMonitor:
-    """Watches the parts and reports transitions, and keeps ``health.json``."""
+    """Watches the parts and reports transitions, and keeps ``health.json``.
+
+    Above 200 lines: every condition that can be true is ranked here, in one place.
+    """
 
     def __init__(
         self,
@@ -109,9 +118,8 @@ class HealthMonitor:
         """Start watching."""
         if self._file is not None:
             self._file.start()
-        self.last_tick_ns = (
-            time.monotonic_ns()
-        )  # since it was made, kernels were compiled for a minute
+        # Since it was made, kernels were compiled for a minute.
+        self.last_tick_ns = time.monotonic_ns()
         self._thread.start()
 
     def stop(self) -> None:
@@ -143,109 +151,124 @@ class HealthMonitor:
                 return
 
     def _report(self) -> None:
-        level, text = self.assess()
-        # The bridge logs and records what it tells; a silent vehicle it tells by itself, and what
-        # keeps positions from the EKF; the monitor tells what it withholds.
+        status = self.assess()
         if self._ended:
             if self._stop.is_set():
-                self._bridge.say(_NOTICE, "PiLoT: ending, nothing is injected any more")
-                self._write("ended", f"{self._ended}; {self._last_state(text)}")
+                self._bridge.report_alert(alert(AlertId.ENDING))
+                self._write("ended", f"{self._ended}; {self._last_state(status)}", ())
             return
-        known = text == _SILENT_VEHICLE or text.startswith(_TOLD)
-        self._bridge.set_health(level, text, tell=not known)
-        self._write(level.value, text)
+        self._bridge.set_health(status.level, status.alerts, tell=not status.is_reported)
+        self._write(status.level.value, status.line, status.alerts)
 
-    def _last_state(self, text: str) -> str:
+    def _last_state(self, status: HealthStatus) -> str:
         """What was true until the end. A camera that ended before says nothing of the flight."""
-        if text.startswith(_NO_FRAME):
+        if status.alerts[0].id is AlertId.NO_FRAME:
             arrived, estimate = self._estimates[-1]
             age_s = time.monotonic() - arrived
-            return f"{_OF_STATE[estimate.state][1]} until {age_s:.0f} s before, then {text}"
-        return f"{text} until then"
+            before = body(_of_state(estimate)[1])
+            return f"{before} until {age_s:.0f} s before, then {status.line}"
+        return f"{status.line} until then"
 
-    def assess(self) -> tuple[HealthLevel, str]:
-        """The worst thing that is true now, in one line."""
+    def assess(self) -> HealthStatus:
+        """What is true now."""
         feed = self._feed_state()
         if feed in _OF_FEED:
-            return _OF_FEED[feed]
+            level, of = _OF_FEED[feed]
+            return HealthStatus(level, (alert(of),))
         if not self._bridge.state().connected:
-            return HealthLevel.DEGRADED, _SILENT_VEHICLE
+            return HealthStatus(HealthLevel.DEGRADED, (alert(AlertId.FC_SILENT),), is_reported=True)
         engine = self._engine_health()
         if not self._estimates:
-            return HealthLevel.STARTING, _waiting_for(engine, self._lacks(engine))
+            waiting = _waiting_for(engine, self._lacks(engine))
+            return HealthStatus(HealthLevel.STARTING, (alert(waiting),))
         arrived, estimate = self._estimates[-1]
-        if time.monotonic() - arrived > _STALE_S:
-            if _is_lost(estimate):  # the error stands in health.json; this is what to act on
-                return HealthLevel.FAILED, "localization lost" + self._since(estimate, engine)
-            nothing = self._overload(engine) or _NO_FRAME
-            return HealthLevel.DEGRADED, engine.last_error or nothing
-        level, text = _OF_STATE[estimate.state]
-        if estimate.state is TrackingState.BRIDGING:
-            level, text = _bridging(estimate)
-        injection_fault = self._bridge.injection_fault
-        if level is HealthLevel.OK and injection_fault:
-            level, text = HealthLevel.DEGRADED, _NOT_USED + injection_fault
-        if level is HealthLevel.OK and (lacks := self._lacks(engine)) not in ("", NOT_READY):
-            level, text = HealthLevel.DEGRADED, f"tracking, but {lacks}"
-        overload = self._overload(engine)
-        if overload and level is HealthLevel.OK:
-            level, text = HealthLevel.DEGRADED, overload
-        held = self._integrity_monitor.reason if self._integrity_monitor is not None else None
-        withheld = body(held) if held is not None else ""
-        if withheld and not _is_lost(estimate):
-            level, text = HealthLevel.FAILED, withheld
-        if _is_lost(estimate):
-            text += self._since(estimate, engine)
-        # The map stands in by coarser levels, as far as they are in memory.
-        text += ", map unreadable" if self._unreadable_nodes() else ""
-        text += ", video scaled" if feed is StreamState.SCALED else ""
-        return level, text + ("" if self._is_recorded() else ", record incomplete")
+        is_old = time.monotonic() - arrived > _STALE_S
+        if _is_lost(estimate):  # the error stands in health.json; this is what to act on
+            status = HealthStatus(HealthLevel.FAILED, self._lost(estimate, engine))
+        elif is_old:
+            failed = alert(AlertId.LOCALIZATION_FAILED) if engine.last_error else None
+            news = failed or self._overload(engine) or alert(AlertId.NO_FRAME)
+            status = HealthStatus(HealthLevel.DEGRADED, (news,))
+        else:
+            status = self._tracking(estimate, engine)
+        return status if is_old else replace(status, alerts=(*status.alerts, *self._notes(feed)))
 
-    def _overload(self, engine: EngineHealth) -> str:
-        """Too few frames are localized of those that come; empty where they are enough."""
+    def _tracking(self, estimate: PoseEstimate, engine: EngineHealth) -> HealthStatus:
+        """While frames come and the position is not lost."""
+        level, news = _of_state(estimate)
+        overload = self._overload(engine)
+        held = self._integrity_monitor.reason if self._integrity_monitor is not None else None
+        if held is not None:  # the monitor told it
+            return HealthStatus(HealthLevel.FAILED, (held,), is_reported=True)
+        if level is not HealthLevel.OK:
+            return HealthStatus(level, (news,))
+        fault, lacks = self._bridge.injection_fault, self._lacks(engine)
+        if fault is not None:  # the bridge told it
+            return HealthStatus(HealthLevel.DEGRADED, (fault,), is_reported=True)
+        if lacks not in (None, AlertId.SEARCH_NOT_READY):
+            overload = alert(lacks)
+        if overload is not None:
+            return HealthStatus(HealthLevel.DEGRADED, (overload,))
+        return HealthStatus(level, (news,))
+
+    def _notes(self, feed: StreamState) -> tuple[Alert, ...]:
+        """What else is true. Coarser levels replace unreadable parts of the map."""
+        notes = (
+            (self._unreadable_nodes() > 0, AlertId.MAP_UNREADABLE),
+            (feed is StreamState.SCALED, AlertId.VIDEO_SCALED),
+            (not self._is_recorded(), AlertId.RECORD_INCOMPLETE),
+        )
+        return tuple(alert(of) for holds, of in notes if holds)
+
+    def _overload(self, engine: EngineHealth) -> Alert | None:
+        """Too few frames are localized of those that come."""
         now_s, came = time.monotonic(), engine.frames_in
         self._came.append((now_s, came))
         while now_s - self._came[0][0] > _RATE_S:
             self._came.popleft()
         begun_s, before = self._came[0]
         if now_s - begun_s < 0.7 * _RATE_S:
-            return ""
+            return None
         offered, done = (came - before) / (now_s - begun_s), self._rate()
         if done >= _LEAST_HZ or offered < 2.0 * _LEAST_HZ:
-            return ""
-        return f"overloaded, {done:.0f} of {offered:.0f} frames/s"
+            return None
+        return alert(AlertId.OVERLOADED, done=done, offered=offered)
 
-    def _since(self, estimate: PoseEstimate, engine: EngineHealth) -> str:
+    def _lost(self, estimate: PoseEstimate, engine: EngineHealth) -> tuple[Alert, ...]:
         """Since when there is no fix, how far off the autopilot may be, and that no search will
         answer.
 
         Not whether the map is being searched: that begins and ends every few seconds, and each time
         the loss would be told again (`engine.searching` in health.json has it).
         """
-        text = ""
-        if estimate.last_fix_ns is not None:
-            text = f" {(time.monotonic_ns() - estimate.last_fix_ns) * 1e-9:.0f} s"
-        sigma_m = self._position_sigma_m()
-        text += f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else ""
-        lacks = self._lacks(engine)
-        return text + (f", {lacks}" if lacks else "")
+        fix_ns = estimate.last_fix_ns
+        since_s = 0.0 if fix_ns is None else (time.monotonic_ns() - fix_ns) * 1e-9
+        alerts = [alert(AlertId.LOST, seconds=since_s)]
+        sigma_m, lacks = self._position_sigma_m(), self._lacks(engine)
+        if sigma_m is not None:
+            alerts.append(alert(AlertId.EKF_UNCERTAIN, metres=2.0 * sigma_m))
+        if lacks is not None:
+            alerts.append(alert(lacks))
+        return tuple(alerts)
 
-    def _lacks(self, engine: EngineHealth) -> str:
-        """Why a lost place cannot be searched now; empty where it can."""
-        return _SEARCH_HANGS if engine.search_hangs else self._search_lacks()
+    def _lacks(self, engine: EngineHealth) -> AlertId | None:
+        """Why a lost place cannot be searched now; None where it can."""
+        return AlertId.SEARCH_HANGS if engine.search_hangs else self._search_lacks()
 
-    def _write(self, level: str, text: str) -> None:
+    def _write(self, level: str, text: str, alerts: tuple[Alert, ...]) -> None:
+        score = self._bridge.shadow_score()
         report: dict[str, Any] = {
             "level": level,
             "text": text,
+            "alerts": {a.id.value: named(a) for a in alerts},
             "time_ns": time.monotonic_ns(),
             "pid": os.getpid(),
             "engine": asdict(self._engine_health()),
             "rate_hz": self._rate(),
             "stages_ms": _stages([e for _, e in list(self._estimates)]),
             "bridge": self._bridge.counters(),
-            "shadow": self._bridge.shadow_score().line(),
-            "guardian": self._guardian_report(),
+            "shadow": {"ready": score.go, "text": score.line()},
+            "guardian": _monitor_report(self._integrity_monitor),
             "map_shift": self._map_shift(),
             "targets": self._targets(),
         }
@@ -253,21 +276,22 @@ class HealthMonitor:
         if self._file is not None:
             self._file.put(json.dumps(_finite(report), indent=1, default=str))
 
-    def _guardian_report(self) -> dict[str, Any] | None:
-        """Standing findings with their figures, and the newest protection level."""
-        if self._integrity_monitor is None:
-            return None
-        level = self._integrity_monitor.level
-        return {
-            "findings": self._integrity_monitor.standing(),
-            "hpl_m": None if level is None else level.horizontal_m,
-            "vpl_m": None if level is None else level.vertical_m,
-        }
-
     def _rate(self) -> float:
         """Localized frames per second over the last few seconds."""
         now = time.monotonic()
         return sum(1 for t, _ in list(self._estimates) if now - t < _RATE_S) / _RATE_S
+
+
+def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
+    """Active findings with their figures, and the newest protection level."""
+    if monitor is None:
+        return None
+    level = monitor.level
+    return {
+        "findings": monitor.standing(),
+        "hpl_m": None if level is None else level.horizontal_m,
+        "vpl_m": None if level is None else level.vertical_m,
+    }
 
 
 def _file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:
@@ -289,25 +313,31 @@ def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
     }
 
 
-def _waiting_for(engine: EngineHealth, lacks: str) -> str:
+def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
     """What is missing before the first estimate. lacks: for a search of the map."""
-    if engine.searching or (lacks and engine.searches):
-        return lacks or "searching the map"
-    seen = engine.frames_in > 0
-    return engine.last_error or f"waiting for {'a pose prior' if seen else 'video'}"
+    if engine.searching or (lacks is not None and engine.searches):
+        return lacks or AlertId.SEARCHING
+    if engine.last_error:
+        return AlertId.LOCALIZATION_FAILED
+    return AlertId.WAITING_FOR_PRIOR if engine.frames_in > 0 else AlertId.WAITING_FOR_VIDEO
 
 
-def _bridging(estimate: PoseEstimate) -> tuple[HealthLevel, str]:
-    """How long the odometry has carried the pose on, and how far off it may be (95 %).
+def _of_state(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
+    """BRIDGING: how long the odometry has carried the pose on, and how far off it may be (95 %).
 
-    A second or two is no news: a shadow of a cloud, a car that fills the picture.
+    A second or two of it is no news: a shadow of a cloud, a car that fills the frame.
     """
+    if estimate.state is TrackingState.LOST:
+        return HealthLevel.FAILED, alert(AlertId.LOST, seconds=0.0)
+    if estimate.state is not TrackingState.BRIDGING:
+        level, of = _OF_STATE[estimate.state]
+        return level, alert(of)
     since_ns = estimate.exposure_time_ns - (estimate.last_fix_ns or estimate.exposure_time_ns)
     if since_ns < _SHORT_BRIDGE_NS:
-        return _OF_STATE[TrackingState.TRACKING]
+        return HealthLevel.OK, alert(AlertId.TRACKING)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
-    text = f"bridging {since_ns * 1e-9:.0f} s, {2.0 * sigma_m:.0f} m"
-    return HealthLevel.DEGRADED, text
+    bridging = alert(AlertId.BRIDGING, seconds=since_ns * 1e-9, metres=2.0 * sigma_m)
+    return HealthLevel.DEGRADED, bridging
 
 
 def _is_lost(estimate: PoseEstimate) -> bool:

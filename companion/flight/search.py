@@ -24,10 +24,10 @@ from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocaliz
 from localizer.relocalization.types import PlaceQuery, Relocalization, SearchRegion
 from localizer.sensors.error_model import SENSORS
 from localizer.types import Frame, PosePrior
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import PlaceHint
 
 _log = logging.getLogger(__name__)
-NOT_READY, NO_SEARCH = "search not ready", "no search"
 _HINT_SIGMAS = 2.0
 _HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
@@ -173,8 +173,8 @@ class PlaceSearch:
         self._in_reach = 0  # searches since the whole map was searched
         self._hint: Hint | None = None
         self._open: OpenRelocalizer | None = None
-        self.lacks = NOT_READY
-        """Why no place can be searched now; "" where one can."""
+        self.lacks: AlertId | None = AlertId.SEARCH_NOT_READY
+        """Why no place can be searched now; None where one can."""
         self._stop = threading.Event()
         # A daemon: one that hangs must not keep the process from ending.
         self._thread = threading.Thread(target=self.prepare, name="overview", daemon=True)
@@ -278,7 +278,7 @@ class PlaceSearch:
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)
-            self.lacks = ""
+            self.lacks = None
         except (LocalizerError, OSError) as error:
             self._without(str(error))
         except Exception as error:  # the flight goes on without it, and says so
@@ -286,5 +286,5 @@ class PlaceSearch:
             self._without(f"{type(error).__name__}: {error}")
 
     def _without(self, why: str) -> None:
-        self.lacks = NO_SEARCH
+        self.lacks = AlertId.NO_SEARCH
         self._event("warning", f"no search for a lost place: {why}")

@@ -10,9 +10,11 @@ from typing import Any
 
 from companion.errors import CompanionError
 from companion.targets.detections import CONSOLE
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, reason
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import TrackRequest
 
-_NOTICE = 5  # MAV_SEVERITY_NOTICE
 _MOST = 10  # orders in as many seconds
 _SPAN_S = 5.0
 _LARGEST_RADIUS_M = 10_000.0
@@ -25,12 +27,12 @@ class OrderError(CompanionError):
 
 @dataclass(frozen=True)
 class Helm:
-    """What orders act on. say: tells the operator and the log; track: a click, its time that of
+    """What orders act on. report: tells the operator and the log; track: a click, its time that of
     the frame that it points into; hint: (latitude_deg, longitude_deg, radius_m), raises
     `OrderError` for a place off the map.
     """
 
-    say: Callable[[int, str], None]
+    report: Callable[[Alert], None]
     track: Callable[[TrackRequest], None]
     hint: Callable[[float, float, float], None]
 
@@ -54,31 +56,34 @@ class Orders:
         self._taken.append(now)
         do = order.get("do")
         if do == "stop":
-            return self._track("stop", order, (), "targets ended")
+            return self._track("stop", order, (), alert(AlertId.CONSOLE_STOP))
         if do == "target":
             x, y = (_share(order, key) for key in ("x", "y"))
-            return self._track("point", order, (x, y), f"target at {x:.2f} {y:.2f}")
+            return self._track("point", order, (x, y), alert(AlertId.CONSOLE_TARGET, x=x, y=y))
         if do == "box":
             box = tuple(_share(order, key) for key in ("left", "top", "right", "bottom"))
             if box[0] >= box[2] or box[1] >= box[3]:
                 raise OrderError("a box has its left top before its right bottom")
-            return self._track("rectangle", order, box, f"target box at {box[0]:.2f} {box[1]:.2f}")
+            news = alert(AlertId.CONSOLE_BOX, x=box[0], y=box[1])
+            return self._track("rectangle", order, box, news)
         if do == "hint":
             latitude = _number(order, "latitude_deg", -90.0, 90.0)
             longitude = _number(order, "longitude_deg", -180.0, 180.0)
             radius = _number(order, "radius_m", 5.0, _LARGEST_RADIUS_M)
             self._helm.hint(latitude, longitude, radius)
-            return self._told(f"hint {latitude:.5f} {longitude:.5f} +-{radius:.0f} m")
+            return self._told(
+                alert(AlertId.CONSOLE_HINT, latitude=latitude, longitude=longitude, metres=radius)
+            )
         raise OrderError("no such order")
 
-    def _track(self, kind: str, order: dict[str, Any], at: tuple[float, ...], text: str) -> str:
+    def _track(self, kind: str, order: dict[str, Any], at: tuple[float, ...], news: Alert) -> str:
         time_ns = time.monotonic_ns() if kind == "stop" else _pointed_into(order)
         self._helm.track(TrackRequest(kind, time_ns, at, asked_by=CONSOLE))
-        return self._told(text)
+        return self._told(news)
 
-    def _told(self, text: str) -> str:
-        self._helm.say(_NOTICE, f"PiLoT: console: {text}")
-        return text
+    def _told(self, news: Alert) -> str:
+        self._helm.report(news)
+        return reason(news)
 
 
 def _pointed_into(order: dict[str, Any]) -> int:

@@ -21,6 +21,7 @@ from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
+from mavlink_bridge.alerts.catalogue import body
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
@@ -133,7 +134,7 @@ class Shown:
             "health": self._instruments.health(),
             "vehicle": asdict(vehicle),
             "shadow": asdict(shadow) | {"line": shadow.line()},
-            "follows": None if verdict is None else asdict(verdict),
+            "follows": None if verdict is None else _follows(verdict),
             "injecting": self._instruments.injecting(),
             "estimate": self._estimate and self._position(self._estimate),
             "gnss_residual_m": self._residual(vehicle),
@@ -275,3 +276,8 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | str):
         return value
     return str(value)
+
+
+def _follows(verdict: LoopVerdict) -> dict[str, Any]:
+    reason = "" if verdict.reason is None else body(verdict.reason)
+    return asdict(verdict) | {"reason": reason}

@@ -37,6 +37,8 @@ from localizer.tracking.opening import MapStack
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, severity, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore
 from mavlink_bridge.vehicle.origin import offset
@@ -240,8 +242,11 @@ class _Player:
         self._parts = Assembly(
             _shadow(config), [p for p in COMPONENTS if p.kind in _KINDS], lambda: self.now_ns
         )
-        self._counts, self._scores = _Counts(), [ShadowScore(False, 0, ("no fix",))]
-        self._parts.channels.texts.subscribe(self._told)
+        self._counts, self._scores = (
+            _Counts(),
+            [ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),))],
+        )
+        self._parts.channels.alerts.subscribe(self._told)
         self._parts.make(up)
         self.bridge, self._monitor = self._parts[Bridge], self._parts.get(IntegrityMonitor)
         injection = self._parts[FixInjection]
@@ -336,9 +341,9 @@ class _Player:
         self._counts.passed += 1
         return fix
 
-    def _told(self, severity: int, text: str, alert: Alert | None) -> None:
-        name = "" if alert is None else alert.id.value
-        self._counts.lines.append(ToldLine(self._since_s(), severity, text, name))
+    def _told(self, of: Alert) -> None:
+        line = ToldLine(self._since_s(), severity(of), text(of), of.id.value)
+        self._counts.lines.append(line)
 
     def _since_s(self) -> float:
         return (self.now_ns - _BEGIN_NS) * 1e-9

@@ -124,14 +124,16 @@ def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:
     )
     for path in reversed(kept):
         shadow = _read(path).get("shadow")
-        if isinstance(shadow, str) and shadow:
+        if isinstance(shadow, dict):  # 0.1 wrote a line; a score that old does not count
             when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
-            text = f"{shadow} ({path.parent.name}, {_age(when.date(), now.date())})"
+            text = f"{shadow.get('text')} ({path.parent.name}, {_age(when.date(), now.date())})"
             recent = (now - when).days <= _OLD_SHADOW_DAYS
             flown = _read(path.with_name("record.json")).get("config")
             other = isinstance(flown, dict) and flown.get("map") != str(config.map)
             text += ", over another map" if other else ""
-            return SheetRow("shadow score", text, shadow.startswith("go") and recent and not other)
+            return SheetRow(
+                "shadow score", text, shadow.get("ready") is True and recent and not other
+            )
     return SheetRow("shadow score", "none: fly in shadow mode first", False)
 
 

@@ -109,11 +109,12 @@ class Span:
 
 @dataclass(frozen=True)
 class ReportEvent:
-    """Something that happened."""
+    """Something that happened. alert: the identifier of its alert, if any."""
 
     time_s: float
     level: str
     text: str
+    alert: str = ""
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ from companion.reporting.content import (
     ReportTable,
     Span,
 )
+from mavlink_bridge.alerts.ids import AlertId
 
 STAGES = ("reference", "extract", "register", "latency")
 _GAP_S = 1.0  # without an estimate: the state before is not carried on over it
-_HARMLESS = ("PiLoT: injection forced", "PiLoT: GNSS lost", "PiLoT: ending")
+_HARMLESS = (AlertId.INJECTION_FORCED.value, AlertId.GNSS_LOST.value, AlertId.ENDING.value)
 _WELL = f"{NOTHING}: tracking from the first fix to the end, and no warning"
 _NEAR_NS = 2_000_000
 LATENCY = "exposure to estimate"
@@ -71,8 +72,9 @@ def events(columns: Columns, start_ns: int) -> tuple[ReportEvent, ...]:
     if not columns:
         return ()
     times = seconds(columns["time_ns"], start_ns)
-    rows = zip(times, columns["level"], columns["text"], strict=True)
-    return tuple(ReportEvent(float(t), str(level), str(text)) for t, level, text in rows)
+    alerts = columns.get("alert", [""] * len(times))  # a record of 0.1 has none
+    rows = zip(times, columns["level"], columns["text"], alerts, strict=True)
+    return tuple(ReportEvent(float(t), *(str(c) for c in cells)) for t, *cells in rows)
 
 
 def stage_table(estimates: Columns) -> ReportTable:
@@ -130,7 +132,7 @@ def _first_since(
         found.append((t, f"tracking ended in state {states[left[0]]}"))
     for event in happened:
         if event.level == "warning" and event.time_s >= begin_s:
-            if event.text.startswith(_HARMLESS):
+            if event.alert in _HARMLESS:
                 continue
             found.append((event.time_s, event.text))
             break

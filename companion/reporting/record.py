@@ -348,16 +348,23 @@ def _verdicts(tables: RecordTables) -> tuple[CriterionResult, ...]:
             )
         )  # fmt: skip
     verdicts += _untold_targets(health.get("targets"))
-    shadow = str(health.get("shadow", ""))
+    shadow = _shadow(health.get("shadow"))
     if shadow:
         verdicts.append(
             CriterionResult(
-                "shadow score at the end", shadow, "go", shadow.startswith("go"),
+                "shadow check at the end", str(shadow["text"]), "ready", bool(shadow["ready"]),
                 "vision was not shown to agree with GNSS for long enough",
                 "the reasons after the colon, and vision against GNSS",
             )
         )  # fmt: skip
     return tuple(verdicts)
+
+
+def _shadow(told: Any) -> dict[str, Any]:
+    """Of health.json; 0.1 wrote a line that begins with "go" or "no-go"."""
+    if isinstance(told, str) and told:
+        return {"ready": told.startswith("go"), "text": told}
+    return _mapping(told)
 
 
 def _untold_targets(counts: Any) -> list[CriterionResult]:

@@ -483,10 +483,10 @@ class LiveVideoSource:
             c = self._counters
             self._counters = replace(c, **{k: getattr(c, k) + n for k, n in more.items()})
 
-    def _stranger(self, text: str) -> None:
-        _log.warning("%s: %s", self._location, text)
+    def _stranger(self, host: str) -> None:
+        _log.warning("%s: video of another sender ignored: %s", self._location, host)
         if self._on_stranger is not None:
-            self._on_stranger(text)
+            self._on_stranger(host)
 
     def _report_stall(self, reason: str) -> None:
         self._report_change(StreamState.STALLED, f"{self._location}: {reason}")

@@ -166,7 +166,7 @@ class VideoDatagrams:
     FFmpeg reads it as a file (`read`) in the decoding thread; `close` may be called from any. What
     comes is MPEG-TS, RTP (its pictures are put together here) or H.264, H.265 by itself.
 
-    on_stranger: told (a text of at most 43 characters, the address) of each address that is
+    on_stranger: told the address of each that is
     refused, once, in the reading thread. sets: of RTP, the parameter sets that a session
     description gives, where the stream itself may lack them.
     """
@@ -315,7 +315,7 @@ class VideoDatagrams:
         if host in self._told or len(self._told) >= 16 or not self._lock.has_chosen:
             return
         self._told.add(host)
-        self._on_stranger(f"stranger's video ignored: {host}")
+        self._on_stranger(host)
 
 
 def parse_sender(text: str) -> tuple[str, int | None]:

@@ -21,6 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, PoseEstimate
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 
 Level = Annotated[float, Field(ge=0.0, le=100.0)]
 Factor = Annotated[float, Field(ge=0.2, le=50.0)]
@@ -104,17 +107,17 @@ class FocalCorrection:
 class ZoomedFrames:
     """Gives every frame the camera of its zoom; the feed's thread, `factor` from any.
 
-    level_at: the reported level at a time, None where it is not known. tell: a text for the
-    operator, told when the trouble begins and every ten seconds of it.
+    level_at: the reported level at a time, None where it is not known. report: takes an alert for
+    the operator when the trouble begins and every ten seconds of it.
     """
 
     def __init__(
         self,
         table: ZoomTable,
         level_at: Callable[[int, float], float | None],
-        tell: Callable[[str], None],
+        report: Callable[[Alert], None],
     ) -> None:
-        self._table, self._level_at, self._tell = table, level_at, tell
+        self._table, self._level_at, self._report = table, level_at, report
         self._lock = threading.Lock()
         self._factor: float | None = None
         self._correction = FocalCorrection(table.refine)
@@ -177,6 +180,6 @@ class ZoomedFrames:
             return
         self._told_ns = time_ns
         if level is None:
-            self._tell("zoom unknown, no fixes: no CAMERA_SETTINGS")
+            self._report(alert(AlertId.ZOOM_UNKNOWN))
         else:
-            self._tell(f"zoom {level:.0f} not in table, no fixes")
+            self._report(alert(AlertId.ZOOM_NOT_IN_TABLE, level=level))

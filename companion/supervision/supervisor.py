@@ -22,6 +22,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from companion.supervision.processes import ENDING, Beat
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, body
+from mavlink_bridge.alerts.ids import AlertId
 
 _log = logging.getLogger(__name__)
 _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
@@ -101,7 +104,7 @@ class Manager(Protocol):
 class Supervisor:
     """`run` until the flight is over.
 
-    spawn: makes a process, flying at once or as a standby. tell: a line (severity, text) to the
+    spawn: makes a process, flying at once or as a standby. tell: an alert to the
     operator; mark: what the ``health.json`` of the process (id) is to say. manager: told on the
     way. clock: monotonic seconds; pause: sleeps so many.
     """
@@ -109,7 +112,7 @@ class Supervisor:
     def __init__(
         self,
         spawn: Callable[[bool], Process],
-        tell: Callable[[int, str], None],
+        tell: Callable[[Alert], None],
         mark: Callable[[int, str], None],
         policy: RestartPolicy | None = None,
         manager: Manager | None = None,
@@ -238,17 +241,18 @@ class Supervisor:
         assert self._flying is not None
         dead, wait_s = self._flying.pid, self._wait_s()
         process, self._standby = self._standby, None
-        what = f"again in {wait_s:.0f} s" if process is None and wait_s else "restarting"
-        _log.error("the flight process %s, %s", how, what)
+        news = alert(AlertId.COMPANION_RESTARTS, how=how)
+        if process is None and wait_s:
+            news = alert(AlertId.COMPANION_WAITS, how=how, seconds=wait_s)
+        _log.error("the flight process: %s", body(news))
         if process is not None:
             # First of all. It opens the links later than this process, which then tells at once.
             process.release()
             self._fly(process, self._policy.released_s)
-        text = f"companion {how}, {what}"
-        _do_in_time("tell", lambda: self._tell(2, f"PiLoT: {text}"))
-        _do_in_time("mark", lambda: self._mark(dead, text))
+        _do_in_time("tell", lambda: self._tell(news))
+        _do_in_time("mark", lambda: self._mark(dead, body(news)))
         if self._manager is not None:
-            self._manager.status(text)
+            self._manager.status(body(news))
         if process is None:
             self._begin_anew(wait_s)
 

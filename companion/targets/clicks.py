@@ -15,27 +15,29 @@ from companion.targets.history import PoseHistory
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import TrackRequest
 
 _OLDEST_NS = 2_000_000_000  # how long the pose of a click's frame is waited for
 _FRAME_NS = 60_000_000  # a frame so near to the wanted time is the one that was seen
 _MOST = 8  # clicked targets at a time
-_WARNING, _INFO = 4, 6  # MAV_SEVERITY
-_UNKNOWN = "the camera's position is not known"
-_UNCONFIRMED = "the camera's position is not confirmed yet"
+_UNKNOWN = "position not known"
+_UNCONFIRMED = "position not confirmed yet"
 
 
 class ClickPolicy:
     """Finds each click's frame in the poses that were flown, and begins or ends its target.
 
-    say: tells the operator (MAV_SEVERITY, text).
+    report: tells the operator.
     """
 
     def __init__(
-        self, targets: TargetReporter, say: Callable[[int, str], None], config: TargetConfig
+        self, targets: TargetReporter, report: Callable[[Alert], None], config: TargetConfig
     ) -> None:
         self._targets = targets
-        self._say = say
+        self._report = report
         self._delay_ns = round(config.operator_delay_ms * 1e6)
         self._sigma_ns = round(config.operator_delay_sigma_ms * 1e6)
         self._history = PoseHistory()
@@ -116,7 +118,7 @@ class ClickPolicy:
         if len(self._alive) > _MOST:
             oldest = self._alive.pop(0)
             self._targets.forget((oldest.name,))
-            self._say(_INFO, f"PiLoT: target {oldest.number} ended: more than {_MOST}")
+            self._report(alert(AlertId.TARGET_REPLACED, number=oldest.number))
         self._targets.begin(click)
 
     def _refuse(self, request: TrackRequest, why: str) -> None:
@@ -125,4 +127,4 @@ class ClickPolicy:
             request.time_ns - self._refused[0] > _OLDEST_NS or self._refused[1] != why
         ):
             self._refused = (request.time_ns, why)
-            self._say(_WARNING, f"PiLoT: no target: {why}")
+            self._report(alert(AlertId.NO_TARGET, why=why))

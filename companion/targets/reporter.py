@@ -17,24 +17,22 @@ from companion.targets.pictures import RecentPictures
 from companion.targets.target_manager import Click, TargetEstimate, TargetManager
 from localizer.targets.locate import RayCaster
 from localizer.types import Frame, PoseEstimate
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 
 _log = logging.getLogger(__name__)
 _KEPT = 64  # detections that wait
 _ESTIMATES = 256  # as many as `FrameTimes` knows frames: a slow detector is seconds behind
 _PICTURES = 16
-_WARNING = 4  # MAV_SEVERITY
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
-
-
-def _say_nothing(_severity: int, _text: str) -> None:
-    pass
 
 
 class TargetReporter:
     """Pairs detections with accepted estimates, and lets the population of targets live on them.
 
     on_gone: called on the targets' thread with each name that ended, after the last on_target of
-    that name. say: tells the operator (MAV_SEVERITY, text). failed counts what raised an error, of
+    that name. report_alert: tells the operator. failed counts what raised an error, of
     which the first is logged; unmatched detections whose frame has no accepted estimate.
     """
 
@@ -44,10 +42,10 @@ class TargetReporter:
         cast: RayCaster,
         on_target: Callable[[TargetEstimate], None],
         on_gone: Callable[[str], None] = lambda _name: None,
-        say: Callable[[int, str], None] = _say_nothing,
+        report_alert: Callable[[Alert], None] = lambda _alert: None,
     ) -> None:
-        self._population = TargetManager(config, cast, on_target, on_gone, say)
-        self._on_gone, self._say = on_gone, say
+        self._population = TargetManager(config, cast, on_target, on_gone, report_alert)
+        self._on_gone, self._report_alert = on_gone, report_alert
         self._forgotten: tuple[str, ...] = ()
         self._clicks: list[Click] = []
         self._estimates: deque[PoseEstimate] = deque(maxlen=_ESTIMATES)
@@ -134,7 +132,7 @@ class TargetReporter:
                 self._guarded(self._population.look, estimate, _gray(frame))
             for click in clicks:
                 if not self._guarded(self._population.begin, click):
-                    self._say(_WARNING, f"PiLoT: target {click.number} refused: map unreadable?")
+                    self._report_alert(alert(AlertId.TARGET_UNREADABLE, number=click.number))
                     self._guarded(self._population.end, (click.name,))
                     self._on_gone(click.name)
             for name in forgotten:

@@ -21,12 +21,14 @@ from localizer.targets.limits import UNCONFIRMED
 from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.targets.track import NO_MAP, TargetSettings, TargetTrack, projected
 from localizer.types import PoseEstimate, TargetFix, Visibility
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 
 _log = logging.getLogger(__name__)
 _MAX_DETECTED = 32  # at a time: what a telemetry link bears
 # A detected target unseen for so long makes room for another.
 _GONE_NS = 10_000_000_000
-_WARNING, _INFO = 4, 6  # MAV_SEVERITY
 _CONFIRMS_NS = 0.18e9
 _PICTURES = 24  # kept, of accepted frames: longer than an operator's delay
 _PICTURE_NS = 60_000_000  # between a click's frame and the picture that stands for it
@@ -131,11 +133,16 @@ class _Back:
     position: Array
 
 
+def _number(name: str) -> int:
+    """Of a clicked target."""
+    return clicked_number(name) or 0
+
+
 class TargetManager:
     """The living targets, by name. Not thread-safe.
 
-    tell: takes each fix. gone: takes the name of each target that ended. say: tells the operator
-    (MAV_SEVERITY, text). missed counts detections that show no map: beside the picture, or in the
+    tell: takes each fix. gone: takes the name of each target that ended. report_alert: tells the
+    operator. missed counts detections that show no map: beside the picture, or in the
     sky; doubted those whose place may not be told; refused those of targets beyond the 32nd.
 
     Above 200 lines: what is done to one target touches the others, so all live under one owner.
@@ -147,11 +154,11 @@ class TargetManager:
         cast: RayCaster,
         tell: Callable[[TargetEstimate], None],
         gone: Callable[[str], None],
-        say: Callable[[int, str], None],
+        report_alert: Callable[[Alert], None],
     ) -> None:
         self._config = config
         self._cast = cast
-        self._tell, self._gone, self._say = tell, gone, say
+        self._tell, self._gone, self._report_alert = tell, gone, report_alert
         self._settings = TargetSettings(
             config.pixel_sigma,
             config.map_sigma_m,
@@ -176,7 +183,9 @@ class TargetManager:
         fix = track.see(click.estimate, click.pixel, drift=self._drift(click))
         if fix is None:
             self.missed += 1
-            self._say(_WARNING, f"PiLoT: target {click.number} refused: {track.refusal}")
+            self._report_alert(
+                alert(AlertId.TARGET_REFUSED, number=click.number, why=track.refusal)
+            )
             self._gone(name)
             return
         life = _TargetState(track, time_ns, True, time_ns, found_ns=time_ns, begun_ns=time_ns)
@@ -186,7 +195,7 @@ class TargetManager:
             life.extent_m = (click.extent[0] * cell, click.extent[1] * cell)
         self._lives[name] = life
         sigma = float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1]))
-        self._say(_INFO, f"PiLoT: target {click.number}: +-{sigma:.1f} m")
+        self._report_alert(alert(AlertId.TARGET_FOUND, number=click.number, metres=sigma))
         self._report(life, fix, click.estimate)
         self._follow(name, life, click, fix)
 
@@ -236,7 +245,7 @@ class TargetManager:
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
-                self._say(_INFO, f"PiLoT: target {clicked_number(name)} ended: out of the picture")
+                self._report_alert(alert(AlertId.TARGET_OUT_OF_VIEW, number=_number(name)))
                 self.end((name,))
                 continue
             self._report(life, fix, estimate)
@@ -289,7 +298,7 @@ class TargetManager:
             life.found_ns = life.seen_ns = time_ns
             life.refused_ns = 0 if fix is not None else life.refused_ns or time_ns
         elif track.moves and since_s > _LOST_S and not self._may_be_back(life, time_ns):
-            self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost")
+            self._report_alert(alert(AlertId.TARGET_LOST, number=_number(name)))
             self.end((name,))
             return
         elif track.moves:
@@ -300,7 +309,9 @@ class TargetManager:
             life.told_ns = time_ns
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
-            self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost: {track.refusal}")
+            self._report_alert(
+                alert(AlertId.TARGET_NOT_LOCATED, number=_number(name), why=track.refusal)
+            )
             self.end((name,))
 
     def _found_leaving(
@@ -347,9 +358,9 @@ class TargetManager:
         it was. Of another that does not look as it did, the operator is told: if that came at once,
         it may have left.
         """
-        number = clicked_number(name)
+        number = _number(name)
         if life.moved_at_once and follower.shows_ground(gray, estimate):
-            self._say(_WARNING, f"PiLoT: target {number} lost: it left its place")
+            self._report_alert(alert(AlertId.TARGET_LEFT, number=number))
             self.end((name,))
             return True
         held = life.track.hold(estimate)
@@ -360,11 +371,11 @@ class TargetManager:
             return False
         if follower.is_changed and not life.changed_ns:
             life.changed_ns = life.found_ns
-            self._say(_WARNING, f"PiLoT: target {number} may have left: look changed")
+            self._report_alert(alert(AlertId.TARGET_MAY_HAVE_LEFT, number=number))
         elif not life.is_slide_said and not life.changed_ns:
             # The view of what is not flat changes by and by: its place is as good as before.
             life.is_slide_said = True
-            self._say(_INFO, f"PiLoT: target {number}: place held, its look has changed")
+            self._report_alert(alert(AlertId.TARGET_HELD, number=number))
         return False
 
     @staticmethod
@@ -392,7 +403,7 @@ class TargetManager:
         life.found_ns, life.unseen_ns = time_ns, 0
         if life.changed_ns:
             life.changed_ns = 0
-            self._say(_INFO, f"PiLoT: target {clicked_number(name)} is at its place again")
+            self._report_alert(alert(AlertId.TARGET_BACK, number=_number(name)))
 
     @staticmethod
     def _doubted(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
@@ -531,7 +542,7 @@ class TargetManager:
         is_silent = life.told_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
         if is_silent and time_ns - self._silence_said_ns >= _SAID_NS:
             self._silence_said_ns = time_ns
-            self._say(_WARNING, f"PiLoT: {name} not told: {life.track.refusal}")
+            self._report_alert(alert(AlertId.TARGET_SILENT, name=name, why=life.track.refusal))
 
     def _drift(self, click: Click) -> tuple[float, float]:
         """One sigma, in pixels, of the picture's motion within the delay's error."""

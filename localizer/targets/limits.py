@@ -73,7 +73,7 @@ class LastPlace:
             self.fix, self._leap, self._begun_ns = fix, None, leap.since_ns
             return ""
         moved = float(np.linalg.norm(fix.position_world - last.position_world))
-        return f"{moved:.0f} m from where it was, which its error does not cover"
+        return f"moved {moved:.0f} m"
 
     def _first(self, fix: TargetFix) -> str:
         """Nothing was told yet: the first place is believed once sightings have agreed on it."""
@@ -83,7 +83,7 @@ class LastPlace:
         elif not _reachable(
             begun.newest, fix, moves=time_ns - begun.newest.exposure_time_ns <= _LEAP_NS
         ):
-            return "elsewhere than a moment ago"
+            return "elsewhere than before"
         self._leap = _Leap(begun.since_ns, fix)
         if time_ns - begun.since_ns < self._confirm_ns:
             return UNCONFIRMED

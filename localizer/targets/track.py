@@ -129,7 +129,7 @@ class TargetTrack:
             self._moves = velocity is None or float(np.hypot(*velocity[:2])) > _STANDS_MPS
         fix = moving if self._moves else self._standing(estimate, pixel) if fits else None
         if fix is None:
-            return self._refuse("elsewhere than before: one such sighting is not believed")
+            return self._refuse("elsewhere than before")
         if self._moves:
             bias = settings.bias.covariance(fix.position_world - eye)
             fix = replace(fix, covariance=fix.covariance + bias + self._aim)

@@ -10,6 +10,7 @@ from mavlink_bridge.alerts.ids import AlertId
 
 PREFIX = "PiLoT: "
 Value = float | int | str
+AlertKey = tuple[AlertId, bool, tuple[str, ...]]
 
 
 class Severity(enum.IntEnum):
@@ -50,6 +51,7 @@ class AlertSpec:
     prefix, with the values by name. cleared_text: when it ends; None: "cleared: TITLE". units: of
     each value, in the order of `Alert.values`. raised, cleared: under which condition. raise_s,
     clear_s: how long the condition must last. repeat_s: period while it is active, 0 for once.
+    lead: what the text begins with.
     """
 
     id: AlertId
@@ -67,6 +69,7 @@ class AlertSpec:
     raise_s: float = 0.0
     clear_s: float = 0.0
     repeat_s: float = 0.0
+    lead: str = ""
 
     @property
     def values(self) -> tuple[str, ...]:
@@ -76,13 +79,27 @@ class AlertSpec:
     @property
     def template(self) -> str:
         """The text with what the action adds."""
-        held = "output held: " if self.action is not OutputAction.NONE else ""
+        held = "output held: " if self.action is not OutputAction.NONE else self.lead
         return f"{PREFIX}{held}{self.text}"
 
     def __post_init__(self) -> None:
         used = {name for _, name, _, _ in string.Formatter().parse(self.text) if name}
         if not used <= set(self.units):
             raise ValueError(f"{self.id}: the text uses {used}, the values are {set(self.units)}")
+
+
+def event(
+    of: AlertId, severity: Severity, text: str, units: dict[str, str], *told: str, lead: str = ""
+) -> AlertSpec:
+    """The row of what is told when it begins. told: raised, meaning, operator; and, where its end
+    is told, cleared and its text.
+    """
+    raised, meaning, operator, *end = told
+    cleared, cleared_text = end or ("", None)
+    return AlertSpec(
+        of, severity, of.words, text, units, raised, cleared, meaning, operator, cleared_text,
+        lead=lead,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -94,6 +111,6 @@ class Alert:
     active: bool = True
 
     @property
-    def key(self) -> tuple[AlertId, bool, tuple[str, ...]]:
+    def key(self) -> AlertKey:
         """Equal for alerts that differ in numbers only."""
         return self.id, self.active, tuple(v for v in self.values if isinstance(v, str))

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from mavlink_bridge.alerts.alert import PREFIX, Alert, AlertSpec, Severity, Value
+from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.injection import INJECTION
 from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
+from mavlink_bridge.alerts.vehicle import VEHICLE
 
-CATALOGUE: dict[AlertId, AlertSpec] = {spec.id: spec for spec in (*INTEGRITY, *MONITOR, *SOURCES)}
+_GROUPS = (INTEGRITY, MONITOR, SOURCES, INJECTION, VEHICLE, HEALTH, TARGETS, CONSOLE)
+
+CATALOGUE: dict[AlertId, AlertSpec] = {spec.id: spec for group in _GROUPS for spec in group}
 TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
@@ -38,9 +43,19 @@ def body(of: Alert) -> str:
     return text(of).removeprefix(PREFIX)
 
 
+def reason(of: Alert) -> str:
+    """The text without prefix and lead ("not ready: "), for a list of reasons."""
+    return body(of).removeprefix(spec_of(of).lead)
+
+
+def named(of: Alert) -> dict[str, Value]:
+    """Its values by name."""
+    return dict(zip(spec_of(of).values, of.values, strict=True)) if of.active else {}
+
+
 def text(of: Alert) -> str:
     """The STATUSTEXT."""
     spec = spec_of(of)
     if of.active:
-        return spec.template.format(**dict(zip(spec.values, of.values, strict=True)))
+        return spec.template.format(**named(of))
     return PREFIX + (f"cleared: {spec.title}" if spec.cleared_text is None else spec.cleared_text)

@@ -12,21 +12,36 @@ from functools import cache
 from mavlink_bridge.alerts.catalogue import CATALOGUE, cleared, text
 from mavlink_bridge.alerts.ids import AlertId
 
+_FIELD = re.compile(r"\{(\w+)[^}]*\}")
+
 
 @cache
 def _patterns() -> tuple[tuple[AlertId, re.Pattern[str]], ...]:
-    found = []
-    for spec in CATALOGUE.values():
-        fixed = re.split(r"\{[^}]*\}", spec.template)
-        found.append((spec.id, re.compile(".+".join(re.escape(part) for part in fixed))))
-    return tuple(found)
+    """Most fixed characters first: "lost" is no reason of "lost: {why}"."""
+    found = [(spec.id, _pattern(spec.template)) for spec in CATALOGUE.values()]
+    return tuple(sorted(found, key=lambda one: -len(_FIELD.sub("", CATALOGUE[one[0]].template))))
+
+
+def _pattern(template: str) -> re.Pattern[str]:
+    parts = _FIELD.split(template)  # text, name, text, name, ..., text
+    made = (f"(?P<{p}>.*)" if i % 2 else re.escape(p) for i, p in enumerate(parts))
+    return re.compile("".join(made))
+
+
+def values_of(statustext: str) -> tuple[AlertId, dict[str, str]] | None:
+    """The active alert of a text and its values as they are shown; None for other texts."""
+    for of, pattern in _patterns():
+        match = pattern.fullmatch(statustext)
+        if match is not None:
+            return of, match.groupdict()
+    return None
 
 
 def alert_of(statustext: str) -> tuple[AlertId, bool] | None:
     """The alert of a text and whether it is active; None for other texts."""
-    for of, pattern in _patterns():
-        if pattern.fullmatch(statustext) is not None:
-            return of, True
-        if statustext == text(cleared(of)):
-            return of, False
-    return None
+    read = values_of(statustext)
+    if read is not None:
+        return read[0], True
+    ended = (spec.id for spec in CATALOGUE.values() if text(cleared(spec.id)) == statustext)
+    of = next(ended, None)
+    return None if of is None else (of, False)

@@ -15,6 +15,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
 from mavlink_bridge.vehicle.origin import north_east
@@ -32,7 +35,6 @@ _FRAMES = (
 _AGAIN_NS = 1_000_000_000  # a target that moves is followed so often
 _MOVED_M = 1.0
 _PATIENCE_NS = 3_000_000_000  # for the autopilot's answer
-_WARNING, _INFO = 4, 6  # MAV_SEVERITY
 
 
 @dataclass(frozen=True)
@@ -49,16 +51,16 @@ class LookAt:
     """What the gimbal is to look at. Safe to use from any thread; `due` and `answered` are called
     in the flight controller's.
 
-    say: tells the operator (MAV_SEVERITY, text).
+    report: tells the operator.
     """
 
     def __init__(
-        self, config: BridgeConfig, geoid_separation_m: float, say: Callable[[int, str], None]
+        self, config: BridgeConfig, geoid_separation_m: float, report: Callable[[Alert], None]
     ) -> None:
         self._allowed = config.look_at
         self._has_gimbal = config.camera.mount == "gimbal"
         self._geoid_m = geoid_separation_m
-        self._say = say
+        self._report = report
         self._targets: dict[int, TargetReport] = {}
         self._number = 0
         self._wanted: _Place | None = None
@@ -82,14 +84,14 @@ class LookAt:
             if self._number != number:
                 return
             self._number, self._wanted = 0, None
-        self._say(_INFO, f"PiLoT: target {number} ended, the gimbal stays")
+        self._report(alert(AlertId.LOOK_AT_ENDED, number=number))
 
     def command(self, message: Any) -> int:
         """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is told, too."""
         why = self._obey(message)
         if not why:
             return int(mavlink.MAV_RESULT_ACCEPTED)
-        self._say(_WARNING, f"PiLoT: look-at refused: {why}")
+        self._report(alert(AlertId.LOOK_AT_REFUSED, why=why))
         return int(mavlink.MAV_RESULT_DENIED)
 
     def due(self, now_ns: int) -> tuple[int, int, int, int, float] | None:
@@ -97,7 +99,7 @@ class LookAt:
         with self._lock:
             if self._asked_ns is not None and now_ns - self._asked_ns > _PATIENCE_NS:
                 self._asked_ns = None
-                self._say(_WARNING, "PiLoT: the autopilot does not answer look-at")
+                self._report(alert(AlertId.LOOK_AT_UNANSWERED))
             if self._ahead:
                 self._ahead, self._sent = False, None
                 self._asked_ns = now_ns
@@ -122,8 +124,8 @@ class LookAt:
                 return
             self._wanted, self._number = None, 0
         name = mavlink.enums["MAV_RESULT"].get(result)
-        reason = "unknown" if name is None else name.name.removeprefix("MAV_RESULT_").lower()
-        self._say(_WARNING, f"PiLoT: the autopilot refused look-at: {reason}")
+        result_name = "unknown" if name is None else name.name.removeprefix("MAV_RESULT_").lower()
+        self._report(alert(AlertId.LOOK_AT_DENIED, result=result_name))
 
     def _obey(self, message: Any) -> str:
         """Why not; empty if it is done."""

@@ -1,4 +1,4 @@
-"""Was it used? What was sent, held against what the EKF reports, and the reason in one line."""
+"""Was it used? What was sent, held against what the EKF reports, and the reason why not."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionMessage
 from mavlink_bridge.messages import VehicleState
 
@@ -26,23 +29,16 @@ _JUMP_SAMPLES = 3
 _JUMP_SIGMAS, _JUMP_SLACK_M = 3.0, 1.0  # to announce it once too often costs nothing
 _MOST_REPEATS = 5
 
-_SOURCE = {
-    "vision_position_estimate": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
-    "odometry": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
-    "gps_input": "GPS1_TYPE=14 and EK3_SRCn_POSXY=3",
-    "global_position_sensor": "EKF2_AGPn_ID=1 and bit 0 of EKF2_AGPn_CTRL, n = 0 to 3",
-}
-
 
 @dataclass(frozen=True)
 class LoopVerdict:
-    """Whether the EKF follows what is sent. reason: one line; empty while all is well.
+    """Whether the EKF follows what is sent. reason: None while all is well.
 
     difference_m: median horizontal distance between sent and estimated position.
     """
 
     used: bool
-    reason: str
+    reason: Alert | None
     difference_m: float | None
 
 
@@ -101,7 +97,7 @@ class ClosedLoopCheck:
         after_jump = now_ns - self._announced_ns > _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
         if after_jump and difference is not None and _is_there(difference, sigma):
             self._repeats = 0  # another jump may be missed as often
-        return LoopVerdict(not reason, reason, difference)
+        return LoopVerdict(reason is None, reason, difference)
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that is remembered."""
@@ -142,34 +138,23 @@ class ClosedLoopCheck:
 
     def _reason(
         self, rate: float, state: VehicleState, difference: float | None, sigma: float
-    ) -> str:
-        wanted = _GPS_MINIMUM_HZ if self._message == "gps_input" else _MINIMUM_HZ
+    ) -> Alert | None:
+        needed = _GPS_MINIMUM_HZ if self._message == "gps_input" else _MINIMUM_HZ
         flags = state.ekf_flags
-        reasons = (
-            (rate < wanted, f"rate {rate:.1f} Hz is below {wanted:.1f} Hz"),
-            (
-                bool(flags & mavlink.EKF_UNINITIALIZED) and state.autopilot == "ardupilot",
-                "the EKF is not initialised yet",
-            ),
-            (
-                bool(flags & mavlink.EKF_CONST_POS_MODE),
-                f"the EKF has no position source; check {_SOURCE[self._message]}",
-            ),
-            (
-                difference is None,
-                f"the EKF reports no local position; check {_SOURCE[self._message]}",
-            ),
-            (
-                (difference or 0.0) > _SIGMAS * sigma + _SLACK_M,
-                f"the EKF is {difference or 0.0:.1f} m from what is sent; "
-                "check frame, origin and source",
-            ),
+        no_init = bool(flags & mavlink.EKF_UNINITIALIZED) and state.autopilot == "ardupilot"
+        off_m = difference or 0.0
+        found = (
+            (rate < needed, alert(AlertId.FIX_RATE_LOW, hertz=rate, needed=needed)),
+            (no_init, alert(AlertId.EKF_NOT_INITIALISED)),
+            (bool(flags & mavlink.EKF_CONST_POS_MODE), alert(AlertId.EKF_NO_SOURCE)),
+            (difference is None, alert(AlertId.EKF_NO_POSITION)),
+            (off_m > _SIGMAS * sigma + _SLACK_M, alert(AlertId.EKF_OFF_FIXES, metres=off_m)),
             (
                 (state.ekf_horizontal_variance or 0.0) > _VARIANCE_LIMIT,
-                "the EKF rejects positions (innovation gate); check VISO_POS_M_NSE and delay",
+                alert(AlertId.EKF_REJECTS_FIXES),
             ),
         )
-        return next((reason for holds, reason in reasons if holds), "")
+        return next((reason for holds, reason in found if holds), None)
 
 
 def _is_there(distance_m: float, sigma_m: float) -> bool:

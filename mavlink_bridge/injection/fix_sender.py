@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.fix_queue import FixQueue
-from mavlink_bridge.injection.injector import NO_FIX_YET, NO_FRESH_FIX, Injector
+from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
@@ -18,8 +21,7 @@ from mavlink_bridge.vehicle.profile import FirmwareProfile
 
 _QUEUE = 64
 _NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
-_NOT_SENT = "not sent: "
-_FULL = "the link takes no more"
+_BRIEF = (AlertId.NO_FRESH_FIX, AlertId.LINK_FULL)
 _GOOD_NS = 1_000_000_000
 _FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
 
@@ -47,7 +49,7 @@ class FixSender:
         self._outcome = outcome
         self._teller = teller
         self._counters = counters
-        self._reason = ""
+        self._reason: Alert | None = None
         self._taken = True  # by the link, of the last position
         self._delivered_ns = 0
         self._sent_ns: int | None = None  # to the flight controller
@@ -64,13 +66,16 @@ class FixSender:
         if injection is not None:
             self.vision = injection.estimate.position
             self._deliver(link, mode, injection, now_ns)
-        reason = self._reason = self.injector.reason or ("" if self._taken else _FULL)
+        reason = self.injector.reason
+        if reason is None and not self._taken:
+            reason = alert(AlertId.LINK_FULL)
+        self._reason = reason
         # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
         recent = now_ns - self._delivered_ns < _NEWS_AFTER_NS
-        brief = recent and reason in (NO_FRESH_FIX, _FULL)
-        if reason != NO_FIX_YET and not brief:
-            problem = f"{_NOT_SENT}{reason}" if reason else ""
-            self._teller.tell_settled("inject", problem, "injecting", now_ns, prefix=mode)
+        of = None if reason is None else reason.id
+        if of is not AlertId.NO_FIX_YET and not (recent and of in _BRIEF):
+            relief = alert(AlertId.INJECTING) if mode == "inject" else None
+            self._teller.tell_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
         """Whether positions came of late (and went, where they are to), and the yaw guard is
@@ -89,10 +94,11 @@ class FixSender:
         return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
 
     @property
-    def refusal(self) -> str:
-        """Why positions that are due are not made, once it has lasted and was told; else empty."""
-        told = self._teller.told("inject").startswith(_NOT_SENT)
-        return f"{_NOT_SENT}{self._reason}" if told and self._reason else ""
+    def refusal(self) -> Alert | None:
+        """Why positions that are due are not made, once it has lasted and was told; else None."""
+        reported = self._teller.reported("inject")
+        is_told = reported is not None and reported.id is not AlertId.INJECTING
+        return self._reason if is_told else None
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""

@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionEnableConfig
 from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
 
@@ -29,14 +32,14 @@ class InjectionEnable:
     A receiver that falls silent changes nothing: to take the position from the EKF at that moment
     would turn the vehicle's way home into a landing. Any thread may call.
 
-    changed: called with a line for the operator when it opens or closes. memory: of the gate that
+    changed: called with an alert when it opens or closes. memory: of the gate that
     a process before this one left open.
     """
 
     def __init__(
         self,
         config: InjectionEnableConfig,
-        changed: Callable[[str], None],
+        changed: Callable[[Alert], None],
         memory: InjectionEnableMemory | None = None,
     ) -> None:
         self._config = config
@@ -45,7 +48,7 @@ class InjectionEnable:
         self._open = False
         self._high: bool | None = None
         self._memory = memory
-        self._at_start = "injection off, shadow (at the start)"
+        self._at_start = alert(AlertId.INJECTION_OFF, by="at the start")
 
     def recall(self) -> None:
         """Open it if it was left open by a process that did not end in order; `announce` tells."""
@@ -57,7 +60,7 @@ class InjectionEnable:
             if by_channel:
                 self._high = True  # a switch turned off meanwhile closes it at its first look
             self._open = True
-            self._at_start = f"injection on (restored, {age_s:.0f} s old)"
+            self._at_start = alert(AlertId.INJECTION_RESTORED, seconds=age_s)
         if self._memory is not None:
             self._memory.opened(by_channel=by_channel)
 
@@ -112,4 +115,4 @@ class InjectionEnable:
                     self._memory.opened(by_channel=by_channel)
                 else:
                     self._memory.closed()
-        self._changed(f"injection {'on' if wanted else 'off, shadow'} ({by})")
+        self._changed(alert(AlertId.INJECTION_ON if wanted else AlertId.INJECTION_OFF, by=by))

@@ -15,6 +15,9 @@ import math
 import statistics
 from collections import Counter, deque
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.injection.encode import EncodedEstimate
 from mavlink_bridge.injection.fix_queue import Latency, PendingJump
@@ -30,8 +33,6 @@ from mavlink_bridge.injection.yaw_guard import YawGuard
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import VisionFix
 
-NO_FIX_YET = "no fix yet"
-NO_FRESH_FIX = "no fresh fix"
 _QUEUE = 32
 _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
@@ -93,7 +94,8 @@ class Injector:
         self._sent_fix_ns = 0
         self.yaw_difference_rad: float | None = None
         """The last fix's yaw minus the autopilot's; None while none could be compared."""
-        self.reason = NO_FIX_YET
+        self.reason: Alert | None = alert(AlertId.NO_FIX_YET)
+        """Why nothing was sent last; None when it was."""
         self.counters: Counter[str] = Counter()
 
     @property
@@ -155,7 +157,7 @@ class Injector:
             self.reason = outcome.reason
             self.counters[outcome.counter] += 1
             return None
-        self.reason = ""
+        self.reason = None
         self._last_stamp_ns = outcome.estimate.position.time_ns
         self._last_was_fill = not outcome.estimate.fresh
         self.counters["sent_fresh" if outcome.estimate.fresh else "sent_propagated"] += 1
@@ -216,7 +218,7 @@ class Injector:
         if (refused := self.refused_yaw_rad) is not None:
             self._fresh = None
             degrees = math.degrees(refused)
-            reason = f"vision yaw differs from the autopilot's by {degrees:+.1f} deg"
+            reason = alert(AlertId.YAW_MISMATCH, degrees=degrees)
             return HeldOutput(reason, "withheld_yaw") if fill_due else None
         if self._fresh is not None and now_ns >= self._earliest_ns():
             fix, self._fresh = self._fresh, None
@@ -237,10 +239,11 @@ class Injector:
             return None
         too_far = (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s
         if too_far or (not fresh and self._pace.overdue(now_ns)):
-            return HeldOutput(NO_FRESH_FIX, "withheld_stale")
+            return HeldOutput(alert(AlertId.NO_FRESH_FIX), "withheld_stale")
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:
-            return HeldOutput(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")
+            over = alert(AlertId.SIGMA_OVER_LIMIT, metres=sigma)
+            return HeldOutput(over, "withheld_covariance")
         attitude = attitude_of(fix, time_ns, context)
         counter = (self._reset_counter + self._jump.pending) % 256
         estimate = EncodedEstimate(

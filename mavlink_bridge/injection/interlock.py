@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import CATALOGUE, alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
@@ -46,16 +47,15 @@ class ShadowInterlock:
         self._next_ns = 0
         self._without_since_ns: int | None = None
         self._go_ns: int | None = None
-        self._against = ""
-        self._reason = "not compared with GNSS yet"
+        self._against: Alert | None = None
+        self._reason: Alert | None = alert(AlertId.SHADOW_NOT_COMPARED)
         self._open = False
 
     def recall(self) -> None:
         """What spoke against the map in a process that was killed speaks against it still."""
-        against = "" if self._memory is None else self._memory.recall()
-        if against:
-            self._against = self._reason = against
-            self._teller.warn("no go, as before the restart")
+        if self._memory is not None and self._memory.recall():
+            self._against = self._reason = alert(AlertId.SHADOW_RESTORED)
+            self._teller.report(self._against)
 
     def end(self, *, clean_shutdown: bool = True) -> None:
         """The end; of an orderly one nothing is remembered."""
@@ -82,16 +82,17 @@ class ShadowInterlock:
         receiver that is led astray meanwhile.
         """
         if self._memory is not None:
-            self._memory.note("" if self._open else self._against)
+            self._memory.note(not self._open and self._against is not None)
 
     @property
-    def reason(self) -> str:
-        """Why nothing is injected in mode ``inject``; empty when that is not the reason."""
+    def reason(self) -> Alert | None:
+        """Why nothing is injected in mode ``inject``; None when that is not the reason."""
         if self._open:
-            return ""
+            return None
         if self.inhibited_by:
-            return ", ".join(sorted(CATALOGUE[of].title for of in self.inhibited_by))
-        return f"no go: {self._reason}" if self._reason else ""
+            title = min(CATALOGUE[of].title for of in self.inhibited_by)
+            return alert(AlertId.INHIBITED, alert=title)
+        return self._reason
 
     def may_switch(self, now_ns: int) -> bool:
         """Whether vision may be switched to: proven lately, or there is nothing to prove it by."""
@@ -115,11 +116,11 @@ class ShadowInterlock:
         if self._recent_go(now_ns) and not self.inhibited_by:
             return True
         if self._force:
-            self._teller.warn("injection forced, no shadow check")
+            self._teller.report(alert(AlertId.INJECTION_FORCED))
         elif by_pilot:
-            self._teller.warn("injecting without a go from shadow")
+            self._teller.report(alert(AlertId.INJECTION_NOT_READY))
         elif without and not self._against and not self.inhibited_by:
-            self._teller.warn("injecting without shadow check")
+            self._teller.report(alert(AlertId.INJECTION_UNCHECKED))
         else:
             return False
         return True
@@ -135,9 +136,9 @@ class ShadowInterlock:
         self._next_ns = now_ns + _PERIOD_NS
         score = self._score(now_ns)
         if score.go:
-            self._go_ns, self._against = self._compared_ns(), ""
+            self._go_ns, self._against = self._compared_ns(), None
         elif score.samples >= MINIMUM_SAMPLES:
             # It stays when its samples have aged: what was wrong with GNSS is wrong without. A rate
             # that was too low says nothing of the map: the injection looks at it itself.
-            self._against = score.against[0] if score.against else ""
-        self._reason = self._against or (score.reasons[0] if score.reasons else "")
+            self._against = score.against[0] if score.against else None
+        self._reason = self._against or (score.reasons[0] if score.reasons else None)

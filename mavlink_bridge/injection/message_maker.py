@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.encode import (
     Angles,
@@ -29,7 +32,7 @@ _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 class HeldOutput:
     """Why nothing is sent although it is time. counter: the name it is counted under."""
 
-    reason: str
+    reason: Alert
     counter: str
 
 
@@ -88,7 +91,7 @@ class MessageMaker:
         if kind == "global_position_sensor":
             return EncodedMessage(global_position_sensor(e, altitude, now_ns), e)
         if context.origin is None:
-            return HeldOutput("the EKF has no origin", "withheld_no_origin")
+            return HeldOutput(alert(AlertId.EKF_NO_ORIGIN), "withheld_no_origin")
         ned = ned_from_origin(
             context.origin,
             e.position.latitude_deg,
@@ -97,7 +100,7 @@ class MessageMaker:
             context.profile.projection,
         )
         if math.hypot(*ned) > _FARTHEST_M:
-            reason = f"the EKF origin is {math.hypot(*ned) * 1e-3:.0f} km away"
+            reason = alert(AlertId.EKF_ORIGIN_FAR, kilometres=math.hypot(*ned) * 1e-3)
             return HeldOutput(reason, "withheld_far_origin")
         formula = context.profile.covariance
         if self._config.covariance != "profile":
@@ -120,7 +123,7 @@ class MessageMaker:
         if attitude is None:
             now = context.attitude_at(e.position.time_ns)
             if now is None:
-                return HeldOutput("no attitude for ODOMETRY", "withheld_no_attitude")
+                return HeldOutput(alert(AlertId.NO_ATTITUDE), "withheld_no_attitude")
             attitude = (now.roll_rad, now.pitch_rad, now.yaw_rad)
             e = replace(e, attitude=attitude)
         frame = context.profile.odometry_frame

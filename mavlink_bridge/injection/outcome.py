@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
+from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.injection.encode import EncodedEstimate
@@ -84,11 +85,12 @@ class InjectionOutcome:
         """Whether the EKF follows, told; True when a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
         if self.verdict is not None and (self.verdict.reason or not self.ekf_ok_inhibited_by):
-            self._teller.tell_settled("loop", self.verdict.reason, "the EKF follows", now_ns)
+            follows = alert(AlertId.EKF_FOLLOWS)
+            self._teller.tell_settled("loop", self.verdict.reason, follows, now_ns)
         if not self._loop.jump_missed():
             return False
         self._counters["jumps_repeated"] += 1
-        self._teller.notice("the EKF missed a jump: announced again")
+        self._teller.report(alert(AlertId.JUMP_REPEATED))
         return True
 
     def waiting(self) -> dict[str, int]:

@@ -24,7 +24,6 @@ _log = logging.getLogger(__name__)
 _OLDEST_S = 600.0
 _RENEW_S = 30.0
 _STOP_S = 2.0
-_LONGEST = 80  # characters of a reason
 
 
 class RestartMemory:
@@ -169,23 +168,24 @@ class ShadowFailureMemory:
 
     def __init__(self, memory: RestartMemory) -> None:
         self._memory = memory
-        self._kept = ""
+        self._kept = False
 
-    def recall(self) -> str:
-        """What spoke against it in the process before; empty for nothing."""
+    def recall(self) -> bool:
+        """Whether it spoke against the map in the process before."""
         found = self._memory.recall()
-        against = None if found is None else found[0].get("against")
-        told = against[:_LONGEST] if isinstance(against, str) and against.isprintable() else ""
-        self.note(told)
-        return told
+        told = None if found is None else found[0].get("against")
+        of_0_1 = isinstance(told, str) and bool(told) and told.isprintable()  # the reason
+        against = told is True or of_0_1
+        self.note(against)
+        return against
 
-    def note(self, against: str) -> None:
-        """What speaks against it now; empty for nothing."""
+    def note(self, against: bool) -> None:
+        """Whether it speaks against the map now."""
         if against == self._kept:
             return
         self._kept = against
         if against:
-            self._memory.keep({"against": against})
+            self._memory.keep({"against": True})
         else:
             self._memory.drop()
 

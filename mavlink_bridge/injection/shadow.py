@@ -13,6 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, reason
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.origin import north_east
@@ -43,21 +46,24 @@ class ShadowScore:
 
     go: bool
     samples: int
-    reasons: tuple[str, ...]
+    reasons: tuple[Alert, ...]
     median_m: float | None = None
     p95_m: float | None = None
     bias_ne_m: tuple[float, float] | None = None
     height_m: float | None = None
     consistency: float | None = None
     rate_hz: float | None = None
-    against: tuple[str, ...] = ()
+    against: tuple[Alert, ...] = ()
 
     def line(self) -> str:
         """One line for the operator."""
-        if self.median_m is None or self.p95_m is None:
-            return f"{'go' if self.go else 'no-go'}: {'; '.join(self.reasons)}"
-        figures = f"median {self.median_m:.1f} m, p95 {self.p95_m:.1f} m, n {self.samples}"
-        return f"go: {figures}" if self.go else f"no-go: {'; '.join(self.reasons)} ({figures})"
+        figures = ""
+        if self.median_m is not None and self.p95_m is not None:
+            figures = f"median {self.median_m:.1f} m, p95 {self.p95_m:.1f} m, n {self.samples}"
+        if self.go:
+            return f"ready: {figures}"
+        why = "; ".join(reason(of) for of in self.reasons)
+        return f"not ready: {why}" + (f" ({figures})" if figures else "")
 
 
 def gnss_healthy(state: VehicleState, now_ns: int) -> bool:
@@ -91,28 +97,30 @@ class ShadowScorer:
         with self._lock:
             samples = np.array([s for s in self._samples if now_ns - s[0] < _WINDOW_NS])
         if not len(samples):
-            return ShadowScore(False, 0, ("no fix could be compared with GNSS",))
+            return ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),))
         errors = np.hypot(samples[:, 1], samples[:, 2])
         median, p95 = float(np.median(errors)), float(np.percentile(errors, 95))
         consistency = float(np.median(samples[:, 3]))
         span_s = float(samples[-1, 0] - samples[0, 0]) * 1e-9
         rate = (len(samples) - 1) / span_s if span_s > 0 else 0.0
-        reasons, against = [], []
+        reasons: list[Alert] = []
+        against: list[Alert] = []
         if len(samples) < MINIMUM_SAMPLES:
-            reasons.append(f"only {len(samples)} fixes of {MINIMUM_SAMPLES}")
+            few = alert(AlertId.SHADOW_FEW_FIXES, fixes=len(samples), needed=MINIMUM_SAMPLES)
+            reasons.append(few)
         elif rate < _RATE_LIMIT_HZ:
-            reasons.append(f"{rate:.1f} Hz, needs {_RATE_LIMIT_HZ:.0f}")
+            reasons.append(alert(AlertId.SHADOW_RATE, hertz=rate, needed=_RATE_LIMIT_HZ))
         if median > _MEDIAN_LIMIT_M:
-            against.append(f"median error {median:.1f} m")
+            against.append(alert(AlertId.SHADOW_MEDIAN, metres=median))
         if p95 > _P95_LIMIT_M:
-            against.append(f"p95 error {p95:.1f} m")
+            against.append(alert(AlertId.SHADOW_P95, metres=p95))
         if consistency > _CONSISTENCY_LIMIT:
-            against.append("errors exceed the claimed covariance")
+            against.append(alert(AlertId.SHADOW_COVARIANCE))
         height = float(np.median(samples[:, 4]))
         if abs(height) > _HEIGHT_LIMIT_M:
-            against.append(f"height differs by {height:+.0f} m; check geoid, datum, barometer")
+            against.append(alert(AlertId.SHADOW_HEIGHT, metres=height))
         if refused_yaw_rad is not None:
-            against.append(f"yaw differs by {math.degrees(refused_yaw_rad):+.1f} deg")
+            against.append(alert(AlertId.SHADOW_YAW, degrees=math.degrees(refused_yaw_rad)))
         reasons += against
         bias = (float(samples[:, 1].mean()), float(samples[:, 2].mean()))
         return ShadowScore(

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -45,10 +44,16 @@ _CHOSEN = re.compile(r"Using EKF Source Set ([1-3])\b")
 
 @dataclass(frozen=True)
 class SwitchOrder:
-    """Select a source set (MAV_CMD_SET_EKF_SOURCE_SET), and why."""
+    """Select a source set (MAV_CMD_SET_EKF_SOURCE_SET), and why. metres: GNSS from vision, or 0."""
 
     source_set: int
-    reason: str
+    cause: str
+    metres: float = 0.0
+
+    @property
+    def alert(self) -> Alert:
+        """For the operator."""
+        return Alert(AlertId.SOURCE_SET_SELECTED, (self.source_set, self.cause, self.metres))
 
 
 _Place = tuple[float, float]  # latitude and longitude, degrees
@@ -94,10 +99,18 @@ def _ekf_is_with_vision(state: VehicleState, vision: PropagatedFix) -> bool:
 
 @dataclass(frozen=True)
 class GnssFault:
-    """What is wrong with GNSS. proven: more than vision speaks against it."""
+    """What is wrong with GNSS. proven: more than vision speaks against it. metres: how far it is
+    from vision where that is the cause.
+    """
 
-    reason: str
+    cause: str
     proven: bool
+    metres: float = 0.0
+
+    @property
+    def is_of_receiver(self) -> bool:
+        """Whether GNSS alone shows it, without vision."""
+        return not self.metres
 
 
 def gnss_fault(
@@ -112,20 +125,20 @@ def gnss_fault(
     apart = _inconsistent_m(state, vision, sigmas)
     if vision is None or not apart:
         return None
-    return GnssFault(f"GNSS {apart:.0f} m from vision", _ekf_is_with_vision(state, vision))
+    return GnssFault("GNSS off vision", _ekf_is_with_vision(state, vision), apart)
 
 
 class SourceSwitch:
     """Decides; the caller sends and reports the acknowledgement. One thread.
 
-    refusal: why GNSS that is bad is not left for vision; empty when that is not so. current: the
+    refusal: why GNSS that is bad is not left for vision; None when that is not so. current: the
     set in use; None where it is not known. returning: what is found of GNSS while it is not used.
     """
 
     def __init__(self, config: SourceSwitchConfig) -> None:
         self._config = config
         self.current: int | None = config.gnss_set
-        self.refusal = ""
+        self.refusal: Alert | None = None
         self.returning = GnssReturnCheck()
         self._bad_since_ns: int | None = None
         self._sound_since_ns: int | None = None
@@ -175,7 +188,7 @@ class SourceSwitch:
         """What to order now. good: fixes are being sent, and the yaw guard is content. may_switch:
         the shadow score of this flight was a go.
         """
-        self.refusal = ""
+        self.refusal = None
         fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
         if self.current == self._config.gnss_set:
             self.returning.reset()
@@ -189,7 +202,7 @@ class SourceSwitch:
         self._bad_since_ns = None if fault is None else self._bad_since_ns or now_ns
         self._overruled = self._overruled and fault is not None
         # As far as GNSS alone is asked: vision's word against it does not count once that is gone.
-        sound = fault is None or not fault.reason.startswith(("GNSS lost", "GNSS glitch"))
+        sound = fault is None or not fault.is_of_receiver
         self._sound_since_ns = (self._sound_since_ns or now_ns) if sound else None
         if self._vision_ns is None or (fresh and good):
             self._vision_ns = now_ns
@@ -211,14 +224,17 @@ class SourceSwitch:
         since = self._bad_since_ns
         if since is None or now_ns - since < self._config.bad_after_s * 1e9:
             return None
+        why = ""
         if self._overruled:
-            self.refusal = f"{fault.reason}, set {self.current} was chosen"
+            why = f"set {self.current} chosen"
         elif not fault.proven:
-            self.refusal = f"{fault.reason}, EKF with GNSS"
+            why = "EKF with GNSS"
         elif not may_switch:
-            self.refusal = f"{fault.reason}, no go from shadow"
+            why = "not ready"
         elif vision_good:
-            return SwitchOrder(self._config.vision_set, fault.reason)
+            return SwitchOrder(self._config.vision_set, fault.cause, fault.metres)
+        if why:
+            self.refusal = Alert(AlertId.SOURCE_SET_HELD, (fault.cause, fault.metres, why))
         return None
 
     def _to_gnss(
@@ -240,7 +256,7 @@ class SourceSwitch:
         refused = self.returning.refusal is not None
         if refused or receiver is None or ekf is None or _apart_m(receiver, ekf) > _RETURN_M:
             return None
-        return SwitchOrder(self._config.gnss_set, "vision gone, GNSS is there")
+        return SwitchOrder(self._config.gnss_set, "vision lost, GNSS good")
 
 
 class SourceOrders:
@@ -252,10 +268,8 @@ class SourceOrders:
         commander: Commander,
         teller: StatusNotifier,
         counters: Counter[str],
-        report: Callable[[Alert], None],
     ) -> None:
         self._switch = SourceSwitch(config)
-        self._report = report
         self._alerted_ns: int | None = None
         self._gnss_set = config.gnss_set
         self._commander = commander
@@ -290,7 +304,7 @@ class SourceOrders:
         self._has_met = True
         if state.armed and state.autopilot == "ardupilot":
             self._switch.met_in_flight()
-            self._teller.warn("EKF source set is not known: met in flight")
+            self._teller.report(alert(AlertId.SOURCE_SET_UNKNOWN))
 
     def on_text(self, text: str) -> None:
         """A STATUSTEXT of the autopilot."""
@@ -306,7 +320,7 @@ class SourceOrders:
     def acknowledged(self, accepted: bool) -> None:
         """COMMAND_ACK of an order."""
         if self._switch.acknowledged(accepted) and not accepted:
-            self._teller.warn("source switch refused")
+            self._teller.report(alert(AlertId.SOURCE_SET_REFUSED))
 
     def tick(
         self,
@@ -322,15 +336,14 @@ class SourceOrders:
         order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
         self._tell_refused(now_ns)
         refusal = self._switch.refusal
-        if refusal and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
+        if refusal is not None and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
             self._refused_ns = now_ns  # again as long as it lasts: the operator decides
-            self._teller.warn(f"no switch: {refusal}")
+            self._teller.report(refusal)
         if order is None:
             return
         self._counters["source_switches"] += 1
         self._commander.send(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
-        # Set 2 for a reason and set 1 for another differ by more than digits.
-        self._teller.tell("switch", f"EKF source set {order.source_set}: {order.reason}")
+        self._teller.tell("switch", order.alert)
 
     def _tell_refused(self, now_ns: int) -> None:
         returning, alerted_ns = self._switch.returning, self._alerted_ns
@@ -338,8 +351,8 @@ class SourceOrders:
         if returning.refusal is not None:
             if alerted_ns is None or now_ns - alerted_ns >= again_ns:
                 self._alerted_ns, why = now_ns, returning.refusal
-                self._report(alert(AlertId.GNSS_REFUSED, size=why.size, why=why.why))
+                self._teller.report(alert(AlertId.GNSS_REFUSED, size=why.size, why=why.why))
         elif alerted_ns is not None:
             self._alerted_ns = None
             if returning.accepted:
-                self._report(cleared(AlertId.GNSS_REFUSED))
+                self._teller.report(cleared(AlertId.GNSS_REFUSED))

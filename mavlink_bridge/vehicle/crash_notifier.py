@@ -12,11 +12,13 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link, LinkOptions
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.transport import Endpoint
+from mavlink_bridge.status import status_text
 
 _PATIENCE_NS = 400_000_000  # for the autopilot to be heard; a guess is better than silence
 _TICK_NS = 50_000_000
@@ -66,11 +68,9 @@ class _Speaker:
             self.told.set()
 
 
-def say_without_bridge(
-    config: BridgeConfig, severity: int, text: str, timeout_s: float = 0.8
-) -> bool:
-    """Say a line on every link of the bridge; whether it went out on one of them in time."""
-    message = mavlink.MAVLink_statustext_message(severity, text.encode()[:50])
+def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float = 0.8) -> bool:
+    """Send an alert on every link of the bridge; whether it went out on one of them in time."""
+    message = status_text(alert)
     spoken = []
     ends = [(config.connection, config.signing, True)]
     if config.ground_connection is not None:

@@ -13,6 +13,9 @@ from typing import Any, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import Origin
 
@@ -125,8 +128,8 @@ class OriginKeeper:
         self.origin, self._asked, self._told, self._next_ns = None, 0, False, 0
         self.moved_m = None
 
-    def on_origin(self, message: Any, *, armed: bool) -> str | None:
-        """GPS_GLOBAL_ORIGIN; returns a line for the operator when it is news.
+    def on_origin(self, message: Any, *, armed: bool) -> Alert | None:
+        """GPS_GLOBAL_ORIGIN; returns an alert when it is news.
 
         armed: an origin that is known is kept then. No EKF moves its origin in flight, and who
         forged one would drag every position by its distance.
@@ -141,7 +144,7 @@ class OriginKeeper:
             return None
         self.origin = read
         if moved:
-            return "EKF origin moved; positions follow it"
+            return alert(AlertId.ORIGIN_MOVED)
         if self._configured is not None:
             north, east = north_east(
                 self._configured.latitude_deg,
@@ -151,8 +154,8 @@ class OriginKeeper:
             )
             apart = math.hypot(north, east)
             if apart > 1.0:
-                return f"EKF origin is {apart:.0f} m from the configured one; using the EKF's"
-        return "EKF origin known"
+                return alert(AlertId.ORIGIN_DIFFERS, metres=apart)
+        return alert(AlertId.ORIGIN_KNOWN)
 
     def tick(self, now_ns: int, system_id: int, ask: Callable[[int], None]) -> Any | None:
         """Ask for the origin (`ask(49)`), seldom once it is known; SET_GPS_GLOBAL_ORIGIN if due."""

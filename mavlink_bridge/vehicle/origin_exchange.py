@@ -7,9 +7,11 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.messages import Origin, without_figures
+from mavlink_bridge.messages import Origin
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import OriginKeeper
@@ -35,7 +37,7 @@ class OriginExchange:
         self._commander = commander
         self._teller = teller
         self._counters = counters
-        self._told: dict[str, int] = {}
+        self._told: dict[AlertId, int] = {}
 
     @property
     def origin(self) -> Origin | None:
@@ -49,12 +51,11 @@ class OriginExchange:
         moved_m = self._keeper.moved_m
         if moved_m is not None:
             self._counters["origins_refused"] += 1
-            self._teller.tell("origin", f"EKF origin off by {moved_m:.0f} m in flight: refused")
+            self._teller.tell("origin", alert(AlertId.ORIGIN_REFUSED, metres=moved_m))
         self._tracker.set_origin(self._keeper.origin)
-        key = without_figures(news or "")
-        if news is not None and time_ns - self._told.get(key, -_AGAIN_NS) >= _AGAIN_NS:
-            self._told[key] = time_ns
-            self._teller.inform(news)
+        if news is not None and time_ns - self._told.get(news.id, -_AGAIN_NS) >= _AGAIN_NS:
+            self._told[news.id] = time_ns
+            self._teller.report(news)
 
     def forget(self) -> None:
         """Nothing is sent relative to an origin that may be another one by now."""

@@ -5,35 +5,35 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import VehicleState
 
 _PATIENCE_NS = 5_000_000_000
 _TWIN_WINDOW_NS = 5_000_000_000
 _TWIN_SWITCHES = 40  # in a window: even a line that damages every third frame is far below
-_TEXTS = {
-    "there": (mavlink.MAV_SEVERITY_INFO, "flight controller found"),
-    "lost": (mavlink.MAV_SEVERITY_WARNING, "flight controller lost: no heartbeat for 3 s"),
-    "silent": (mavlink.MAV_SEVERITY_WARNING, "no heartbeat from the flight controller"),
+_NEWS = {
+    "there": AlertId.FC_FOUND,
+    "lost": AlertId.FC_LOST,
+    "silent": AlertId.FC_SILENT,
 }
 
 
 class VehicleWatch:
     """Every link asks with each tick: the flight controller's own may be waiting to reconnect.
 
-    say: tell the operator (severity, text). first: called after the first of these texts.
+    report: tell the operator. first: called after the first of these alerts.
     clock: CLOCK_MONOTONIC, ns.
     """
 
     def __init__(
         self,
-        say: Callable[[int, str], None],
+        report: Callable[[Alert], None],
         first: Callable[[], None] = lambda: None,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
-        self._say, self._first, self._clock = say, first, clock
+        self._report, self._first, self._clock = report, first, clock
         self._lock = threading.Lock()
         # Of the first tick: an application may compile for minutes before it starts the bridge.
         self._begun_ns: int | None = None
@@ -52,10 +52,7 @@ class VehicleWatch:
                 self._known = "silent"
             if self._known == before:
                 return
-        severity, text = _TEXTS[self._known]
-        if before == "lost":
-            text = "flight controller is back"
-        self._say(severity, f"PiLoT: {text}")
+        self._report(Alert(AlertId.FC_BACK if before == "lost" else _NEWS[self._known]))
         if before == "nothing":
             self._first()
 

@@ -7,6 +7,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.catalogue import alert, cleared
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -72,8 +74,8 @@ class TimeSync:
         answered_ns = self._tracker.clock.answered_ns
         if answered_ns is not None:
             is_silent = now_ns - max(answered_ns, self._asking_ns) > _UNANSWERED_NS
-            problem = "TIMESYNC unanswered: stamps may drift" if is_silent else ""
-            self._teller.tell("timesync", problem, "TIMESYNC is answered again")
+            problem = alert(AlertId.TIMESYNC_UNANSWERED) if is_silent else None
+            self._teller.tell("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""

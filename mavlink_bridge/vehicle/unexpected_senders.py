@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -43,38 +45,37 @@ class UnexpectedSenderMonitor:
         config, tell = self._config, self._teller.tell
         ours = (config.localizer_component, config.companion_component, config.camera_component)
         if system == link.system_id and component in ours:
-            tell("twin", f"another companion speaks as component {component}: stop one")
+            tell("twin", alert(AlertId.SECOND_COMPANION, component=component))
         elif system == link.system_id and is_autopilot(message):
             self._counters["other_autopilots"] += 1
-            tell("twins", f"another autopilot is system {system}, too: give it another id")
+            tell("twins", alert(AlertId.DUPLICATE_SYSTEM_ID, system=system))
         elif config.system_id is None and is_autopilot(message):
             self._counters["other_autopilots"] += 1
-            tell(
-                "others",
-                f"autopilot {system} is heard, {link.system_id} is followed: set bridge.system_id",
-            )
+            used = link.system_id
+            tell("others", alert(AlertId.AUTOPILOT_IGNORED, system=system, used=used))
 
     def check(self, link: Link, now_ns: int) -> None:
         """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
         if link.stranger:
-            self._teller.tell("foreign", f"MAVLink of {link.stranger} ignored")
+            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=link.stranger))
         others = self._tracker.other_gimbals
         if others and not self._config.camera.gimbal_component:
             component, device = others[0]
-            self._teller.tell("gimbals", f"another gimbal ignored: {component}, device {device}")
+            ignored = alert(AlertId.GIMBAL_IGNORED, component=component, device=device)
+            self._teller.tell("gimbals", ignored)
         self._check_arming(link, now_ns)
         clock = self._tracker.clock
         self._check_answers(clock.contradictions, now_ns)
         ran_back = self._twins.two(now_ns, clock.strays + clock.reboots)
         if ran_back or self._tracker.impostors:
-            system = link.system_id
-            self._teller.tell("twins", f"two autopilots speak as system {system}: change one's id")
+            twins = alert(AlertId.DUPLICATE_SYSTEM_ID, system=link.system_id)
+            self._teller.tell("twins", twins)
 
     def _check_answers(self, now: int, now_ns: int) -> None:
         """Answers to TIMESYNC of quite another time than the vehicle's stamps are another's."""
         lies, since_ns = self._lies
         if now - lies >= _LIES:
-            self._teller.tell("answers", "TIMESYNC contradicts the stamps: do two answer?")
+            self._teller.tell("answers", alert(AlertId.TIMESYNC_CONTRADICTS))
         if now - lies >= _LIES or now_ns - since_ns > _TURNS_IN_NS:
             self._lies = (now, now_ns)
 
@@ -83,8 +84,7 @@ class UnexpectedSenderMonitor:
         turns, since_ns = self._turns
         now = self._tracker.arming.turns
         if now - turns >= _TURNS:
-            self._teller.tell(
-                "arming", f"system {link.system_id} says armed and disarmed in turn: sign the link"
-            )
+            forged = alert(AlertId.ARMING_ALTERNATES, system=link.system_id)
+            self._teller.tell("arming", forged)
         if now - turns >= _TURNS or now_ns - since_ns > _TURNS_IN_NS:
             self._turns = (now, now_ns)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mavlink_bridge.alerts.ids import AlertId
 from sitl.demo.scenario import Scenario
 from sitl.errors import SimulationError
 from sitl.geodesy import Location
@@ -129,7 +130,7 @@ class FlightScript:
     def _tracking(self) -> bool:
         self._require_companion()
         health = self._health()
-        return health is not None and health["text"] == "localization tracking"
+        return health is not None and list(health["alerts"]) == [AlertId.TRACKING.value]
 
     def _health(self) -> dict[str, Any] | None:
         """What the companion says of itself; None while it is not up."""

@@ -11,6 +11,8 @@ import numpy as np
 from companion.offline.tables import Columns, read_columns
 from companion.targets.detections import clicked_name
 from localizer.geometry.pose import Array
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import values_of
 from sitl.operator.operator import Asked
 from sitl.operator.station import GeoReport, Heard
 from sitl.operator.truth import GroundTruth, Pointed, all_pointed
@@ -105,7 +107,11 @@ def judge(
 
 
 def _is_about(text: str, number: int) -> bool:
-    return f"target {number} " in text or f"target {number}:" in text or "no target" in text
+    """Texts of the operator's link: the catalogue's alerts of this target."""
+    read = values_of(text)
+    return read is not None and (
+        read[0] is AlertId.NO_TARGET or read[1].get("number") == str(number)
+    )
 
 
 def _line(

@@ -10,6 +10,8 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.ids import AlertId
 from sitl.suite.record import CaseRecord
 
 FOREVER = math.inf
@@ -146,11 +148,10 @@ class Lags(_Expectation):
 
 
 class Says(_Span):
-    """A status text came (or, with absent, did not) within the span."""
+    """A status text of the vehicle came (or, with absent, did not) within the span."""
 
     check: Literal["text"]
     contains: str
-    sender: Literal["vehicle", "bridge"] = "vehicle"
     absent: bool = False
 
     def judge(self, record: CaseRecord) -> CheckResult:
@@ -158,22 +159,42 @@ class Says(_Span):
         times = [
             t.at_s
             for t in record.texts
-            if t.sender == self.sender
+            if t.sender == "vehicle"
             and self.contains in t.text
             and self.from_s <= t.at_s <= self.to_s
         ]
         said = f"{times[0]:.1f} s" if times else "never"
-        what = f"{self.sender}: '{self.contains}' {said}"
-        return CheckResult(bool(times) != self.absent, what)
+        return CheckResult(bool(times) != self.absent, f"vehicle: '{self.contains}' {said}")
+
+
+class Reports(_Span):
+    """An alert of our bridge came (or, with absent, did not) within the span. values: it must show
+    these.
+    """
+
+    check: Literal["alert"]
+    alert: AlertId
+    values: dict[str, str] = {}
+    absent: bool = False
+
+    def judge(self, record: CaseRecord) -> CheckResult:
+        """See `_Expectation.judge`."""
+        times = [
+            t.at_s for t in record.texts
+            if t.alert is self.alert
+            and self.values.items() <= t.values.items()
+            and self.from_s <= t.at_s <= self.to_s
+        ]  # fmt: skip
+        said = f"{times[0]:.1f} s" if times else "never"
+        return CheckResult(bool(times) != self.absent, f"bridge: {self.alert.words} {said}")
 
 
 class Alerted(_Span):
-    """An EKF error beyond a limit is told by our bridge at latest within_s after it began."""
+    """Our bridge holds output at latest within_s after an EKF error beyond a limit began."""
 
     check: Literal["alerted"]
     limit_m: float = Field(gt=0)
     within_s: float = Field(ge=0)
-    contains: str
 
     def judge(self, record: CaseRecord) -> CheckResult:
         """See `_Expectation.judge`."""
@@ -185,7 +206,7 @@ class Alerted(_Span):
         told = [
             t.at_s
             for t in record.texts
-            if t.sender == "bridge" and self.contains in t.text and t.at_s >= self.from_s
+            if t.alert is not None and CATALOGUE[t.alert].action and t.at_s >= self.from_s
         ]
         said = f"told at {told[0]:.1f} s" if told else "never told"
         if not beyond:
@@ -329,6 +350,8 @@ Check = (
     | Jumps
     | Lags
     | Says
+    | Reports
+    | Reports
     | Alerted
     | Silent
     | InMode

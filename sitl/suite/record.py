@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import values_of
 from mavlink_bridge.messages import Figures
 
 Array = NDArray[np.float64]
@@ -23,6 +25,18 @@ class Text:
     at_s: float
     sender: str
     text: str
+
+    @property
+    def alert(self) -> AlertId | None:
+        """The active alert of our bridge that it tells; None for others."""
+        read = values_of(self.text) if self.sender == "bridge" else None
+        return None if read is None else read[0]
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Of its alert, as shown."""
+        read = values_of(self.text)
+        return {} if read is None else read[1]
 
 
 @dataclass(frozen=True)

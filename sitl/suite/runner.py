@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mavlink_bridge.alerts.integrity import INTEGRITY
-from mavlink_bridge.alerts.reading import alert_of
 from sitl.errors import SimulationError
 from sitl.suite.case import Case
 from sitl.suite.checks import AsAccurateAs, CheckResult
@@ -27,6 +26,8 @@ PACE_LIMIT = 0.98
 STALL_LIMIT_S = 0.05  # on a machine with room it is below 0.01 s
 _LANDING_S = 15.0  # in which an interrupted flight ends its vehicle
 Figures = tuple[float, float, float]
+
+_MONITORED = {spec.id for spec in INTEGRITY}
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class ReportRow:
     def guardian_lines(self) -> tuple[str, ...]:
         """What the monitor told, with seconds; the bridge's own lines are others."""
         texts = self.record.texts if self.record is not None else []
-        its = [t for t in texts if _is_of_monitor(t.text)]
+        its = [t for t in texts if t.alert in _MONITORED]
         return tuple(f"{t.at_s:.1f} s: {t.text}" for t in its)
 
     @property
@@ -175,8 +176,3 @@ def _row(future: Future[ReportRow], case: Case, kind: VehicleKind) -> ReportRow:
 def _expected_s(case: Case) -> float:
     flight = case.flight
     return flight.seconds or 4 * (flight.side_m / 10.0 + 5.0) / (2.0 if case.raw else 1.0)
-
-
-def _is_of_monitor(text: str) -> bool:
-    read = alert_of(text)
-    return read is not None and read[1] and read[0] in {spec.id for spec in INTEGRITY}

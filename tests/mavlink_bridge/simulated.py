@@ -13,7 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.alerts.catalogue import text as alert_text
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd
@@ -78,14 +79,11 @@ class Flight:
         config = BridgeConfig(**options)
         self.now_ns = 1_000 * SECOND
         monkeypatch.setattr("mavlink_bridge.link.clock.monotonic_ns", lambda: self.now_ns)
-        self.texts: list[str] = []
+        self.alerts: list[Alert] = []
         self.tracked: list[TrackRequest] = []
         self.hinted: list[PlaceHint] = []
 
         self.vehicle_texts: list[tuple[int, str, str]] = []
-
-        def say(_: int, text: str) -> None:
-            self.texts.append(text)
 
         shared = Shared(
             config,
@@ -94,15 +92,14 @@ class Flight:
             VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), True),
             self.now_ns,
             lambda: HealthLevel.OK,
-            say,
+            self.alerts.append,
             self.track,
             self.hint,
-            VehicleWatch(say, clock=lambda: self.now_ns),
+            VehicleWatch(self.alerts.append, clock=lambda: self.now_ns),
             enable,
-            LookAt(config, GEOID, say),
+            LookAt(config, GEOID, self.alerts.append),
             lambda *told: self.vehicle_texts.append(told),
             lambda: self.now_ns,
-            lambda alert: self.texts.append(alert_text(alert)),
         )
         self.shared = shared
         self.end = FlightControllerEnd(shared)
@@ -124,6 +121,10 @@ class Flight:
         self.yaw_error_rad = 0.0
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
+
+    def told(self, *wanted: AlertId) -> list[Alert]:
+        """The alerts of these kinds that the operator was told, in order."""
+        return [alert for alert in self.alerts if alert.id in wanted]
 
     def track(self, request: TrackRequest) -> None:
         """A wish to track came."""

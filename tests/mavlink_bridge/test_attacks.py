@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig, SigningConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
@@ -45,8 +47,8 @@ def test_a_forged_origin_does_not_drag_the_positions(monkeypatch: pytest.MonkeyP
     for _ in range(5):
         flight.say(origin_message(60.0))
     assert flight.end.origin.origin == before
-    told = [text for text in flight.texts if "origin" in text and "refused" in text]
-    assert told == ["PiLoT: EKF origin off by 60 m in flight: refused"]
+    (told,) = flight.told(AlertId.ORIGIN_REFUSED)
+    assert told.values[0] == pytest.approx(60.0, abs=0.5)
     assert flight.end.counters["origins_refused"] == 5
     start_ns = flight.now_ns
     flight.run(2.0)
@@ -60,16 +62,14 @@ def test_a_forged_disarming_opens_nothing_in_flight(monkeypatch: pytest.MonkeyPa
     flight = Flight(monkeypatch)
     flight.armed = True
     flight.run(12.0)
-    before, told = flight.end.origin.origin, len(flight.texts)
+    before, told = flight.end.origin.origin, len(flight.alerts)
     for _ in range(40):
         flight.say(heartbeat(armed=False))
         flight.say(origin_message(60.0))
         flight.run(0.1)
     assert flight.end.origin.origin == before
-    assert flight.texts[told:] == [
-        "PiLoT: EKF origin off by 60 m in flight: refused",
-        "PiLoT: system 1 says armed and disarmed in turn: sign the link",
-    ]
+    forged = [AlertId.ORIGIN_REFUSED, AlertId.ARMING_ALTERNATES]
+    assert [a.id for a in flight.alerts[told:]] == forged
     assert flight.shared.tracker.snapshot(flight.now_ns).armed
 
 
@@ -103,8 +103,8 @@ def test_armed_and_disarmed_in_turn_is_told_and_arming_twice_is_not(
         else:
             flight.armed = turn % 2 == 0
         flight.run(1.1)
-    told = [text for text in flight.texts if "in turn" in text]
-    assert told == (["PiLoT: system 1 says armed and disarmed in turn: sign the link"] * forged)
+    told = flight.told(AlertId.ARMING_ALTERNATES)
+    assert told == [alert(AlertId.ARMING_ALTERNATES, system=1)] * forged
 
 
 def test_a_disarming_that_lasts_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,8 +170,8 @@ def test_orders_of_other_systems_are_denied_and_told_once(
     for _ in range(3):
         assert orders.command(66, command, component) == [mavlink.MAV_RESULT_DENIED]
     assert not orders.enable.open
-    told = [text for text in orders.flight.texts if "refused" in text]
-    assert told == ["PiLoT: system 66 refused: not in ground_systems"]
+    told = orders.flight.told(AlertId.SENDER_REFUSED)
+    assert told == [alert(AlertId.SENDER_REFUSED, system=66, why="not allowed")]
     assert orders.command(66, mavlink.MAV_CMD_REQUEST_MESSAGE, 100) != []  # a question
 
 
@@ -192,7 +192,8 @@ def test_with_signing_an_unsigned_ground_link_gives_no_orders(
     orders = Orders(monkeypatch, signing=signing, ground_connection="udpout:127.0.0.1:1")
     orders.flight.end.components = Components(orders.flight.shared, ground=True)
     assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_DENIED]
-    assert "PiLoT: system 255 refused: link not signed" in orders.flight.texts
+    refused = alert(AlertId.SENDER_REFUSED, system=255, why="not signed")
+    assert refused in orders.flight.alerts
     assert not orders.enable.open
 
 

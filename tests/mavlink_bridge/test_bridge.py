@@ -16,12 +16,13 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, TargetReport, TrackRequest, VisionFix
+from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, FixError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.messages import PlaceHint
-from mavlink_bridge.status import status_texts
 
 HOME = (47.397742, 8.545594)
 GEOID = 47.0
@@ -129,6 +130,11 @@ def shadowed(bridge: Bridge, count: int) -> Callable[[], bool]:
     return lambda: now() >= wanted
 
 
+def switched(bridge: Bridge, by: str) -> list[AlertId]:
+    """How this switched injection, in order."""
+    return [a.id for a in bridge.alerts() if a.values == (by,)]
+
+
 def make_fix(**options: Any) -> VisionFix:
     options.setdefault("time_ns", time.monotonic_ns() - 20_000_000)
     options.setdefault("position_covariance_ned", np.eye(3) * 0.25)
@@ -173,7 +179,7 @@ def test_second_origin_is_never_sent(autopilot: Any, run: Callable[..., Bridge])
     assert vision[-1].x == pytest.approx(-111.3, abs=0.1)
     assert vision[-1].z == pytest.approx(-68.0, abs=0.1)
     assert autopilot.of("SET_GPS_GLOBAL_ORIGIN") == []
-    assert any("from the configured one" in text for text in bridge.texts())
+    assert any(a.id is AlertId.ORIGIN_DIFFERS for a in bridge.alerts())
 
 
 def test_shadow_and_off_send_nothing(autopilot: Any, run: Callable[..., Bridge]) -> None:
@@ -200,8 +206,7 @@ def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) 
     assert bridge.injecting
     autopilot.rc = {9: 1100}
     assert sleep_until(lambda: not bridge.injecting, 30.0)
-    told = [text for text in bridge.texts() if "injection o" in text][1:]
-    assert told == ["PiLoT: injection on (channel 9)", "PiLoT: injection off, shadow (channel 9)"]
+    assert switched(bridge, "channel 9") == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
 
 
 @pytest.mark.parametrize("over_ground", [False, True])
@@ -242,8 +247,7 @@ def test_command_gates_injection(
     feed(bridge, more(autopilot, 4))
     assert ask(mavlink.MAV_CMD_USER_1, 0.0) == mavlink.MAV_RESULT_ACCEPTED
     assert not bridge.injecting
-    told = [text for text in bridge.texts() if "injection o" in text][1:]
-    assert told == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
+    assert switched(bridge, "command") == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
 
 
 def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
@@ -251,29 +255,17 @@ def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
 ) -> None:
     bridge = run(config(autopilot.port), autopilot)
     for _ in range(5):
-        bridge.set_health(HealthLevel.DEGRADED, "lost, searching")
+        bridge.set_health(HealthLevel.FAILED, [alert(AlertId.LOST, seconds=3.0)])
     assert sleep_until(
         lambda: any(
-            m.system_status == mavlink.MAV_STATE_CRITICAL
+            m.system_status == mavlink.MAV_STATE_EMERGENCY
             for m in autopilot.of("HEARTBEAT")
             if m.get_srcComponent() == 197
         ),
         30.0,
     )
-    assert [m.text for m in autopilot.of("STATUSTEXT") if "lost" in m.text] == [
-        "PiLoT: lost, searching"
-    ]
-
-
-@pytest.mark.parametrize(("length", "chunks"), [(1, 1), (50, 1), (51, 2), (100, 3), (500, 5)])
-def test_long_texts_are_sent_in_chunks(length: int, chunks: int) -> None:
-    text = "".join(chr(65 + i % 26) for i in range(length))
-    messages = status_texts(4, text, 7)
-    assert len(messages) == chunks
-    assert "".join(m.text for m in messages) == text[:200]
-    if chunks > 1:
-        assert [(m.id, m.chunk_seq) for m in messages] == [(7, i) for i in range(chunks)]
-        assert len(messages[-1].text) < 50
+    lost = text(alert(AlertId.LOST, seconds=3.0))
+    assert [m.text for m in autopilot.of("STATUSTEXT")].count(lost) == 1
 
 
 def test_streams_are_asked_for_until_they_come(autopilot: Any, run: Callable[..., Bridge]) -> None:

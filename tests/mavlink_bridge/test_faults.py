@@ -14,12 +14,17 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import TargetReport, VisionFix
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, cleared
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
+
+LATE = (AlertId.FIXES_LATE, AlertId.FIXES_OVER_LIMIT)
 
 
 @pytest.fixture
@@ -53,10 +58,8 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     assert after[0][1].reset_counter == 1
     assert after[0][1].x == pytest.approx(25.0, abs=0.3)
     assert {m.reset_counter for _, m in after} == {1}
-    assert [t for t in flight.texts if "lost" in t or "back" in t] == [
-        "PiLoT: flight controller lost: no heartbeat for 3 s",
-        "PiLoT: flight controller is back",
-    ]
+    lost, back = AlertId.FC_LOST, AlertId.FC_BACK
+    assert flight.told(lost, back) == [alert(lost), alert(back)]
     assert flight.end.counters["reboots"] == 0
     # Only what is fresh: nothing that waited during the loss.
     assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
@@ -89,25 +92,26 @@ def test_reboot_in_flight(flight: Flight) -> None:
     assert len(after) > 40
     assert {m.reset_counter for _, m in after} == {0}
     assert flight.end.counters["reboots"] == 1
-    assert sum("rebooted" in t for t in flight.texts) == 1
+    assert len(flight.told(AlertId.FC_REBOOTED)) == 1
     assert flight.attitude_error() < 0.005
 
 
 def test_only_a_gap_of_a_second_is_told(flight: Flight) -> None:
     """A busy computer drops a few fixes now and then: nobody wants two texts for each."""
 
-    def blind(seconds: float) -> list[str]:
-        before = len(flight.texts)
+    def blind(seconds: float) -> list[AlertId]:
+        before = len(flight.alerts)
         withheld = flight.end.sender.injector.counters["withheld_stale"]
         flight.sees = False
         flight.run(seconds)
         flight.sees = True
         flight.run(2.0)
         assert flight.end.sender.injector.counters["withheld_stale"] > withheld
-        return [t for t in flight.texts[before:] if "sent" in t or "injecting" in t]
+        news = [a.id for a in flight.alerts[before:]]
+        return [of for of in news if of in (AlertId.NO_FRESH_FIX, AlertId.INJECTING)]
 
     assert blind(0.8) == []
-    assert blind(3.0) == ["PiLoT: not sent: no fresh fix", "PiLoT: injecting"]
+    assert blind(3.0) == [AlertId.NO_FRESH_FIX, AlertId.INJECTING]
 
 
 def test_a_clock_that_is_not_compared_any_more_is_told(flight: Flight) -> None:
@@ -115,14 +119,12 @@ def test_a_clock_that_is_not_compared_any_more_is_told(flight: Flight) -> None:
     flight.run(20.0)
     flight.answers_timesync = False
     flight.run(14.0)
-    assert not [t for t in flight.texts if "TIMESYNC" in t]
+    assert not flight.told(AlertId.TIMESYNC_UNANSWERED)
     flight.run(20.0)
-    assert [t for t in flight.texts if "TIMESYNC" in t] == [
-        "PiLoT: TIMESYNC unanswered: stamps may drift"
-    ]
+    assert flight.told(AlertId.TIMESYNC_UNANSWERED) == [alert(AlertId.TIMESYNC_UNANSWERED)]
     flight.answers_timesync = True
     flight.run(3.0)
-    assert flight.texts[-1] == "PiLoT: TIMESYNC is answered again"
+    assert flight.alerts[-1] == cleared(AlertId.TIMESYNC_UNANSWERED)
 
 
 def test_a_link_that_was_gone_owes_no_answers(flight: Flight) -> None:
@@ -133,7 +135,7 @@ def test_a_link_that_was_gone_owes_no_answers(flight: Flight) -> None:
     flight.run(10.0)
     flight.reboot()
     flight.run(10.0)
-    assert not [t for t in flight.texts if "TIMESYNC" in t]
+    assert not flight.told(AlertId.TIMESYNC_UNANSWERED)
 
 
 @pytest.mark.parametrize("step_s", [-0.4, 0.4, 7.0, -40.0])
@@ -196,18 +198,17 @@ def test_no_position_from_an_origin_on_another_continent(monkeypatch: pytest.Mon
     flight.origin = (HOME[0], -HOME[1] - 60.0, 480.0)
     flight.run(15.0)
     assert flight.vision() == []
-    assert any("the EKF origin is" in t and "km away" in t for t in flight.texts)
+    assert flight.told(AlertId.EKF_ORIGIN_FAR)
 
 
 def test_late_fixes_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fixes come 50 ms after exposure here; the parameter says 20."""
     late = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=20))
     late.run(30.0)
-    told = [t for t in late.texts if "ms old" in t]
-    assert told == ["PiLoT: fixes are 50 ms old: raise delay_ms (20) and VISO_DELAY_MS"]
+    assert late.told(*LATE) == [alert(AlertId.FIXES_LATE, age_ms=50.0, limit_ms=20.0)]
     fine = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=60))
     fine.run(30.0)
-    assert not [t for t in fine.texts if "ms old" in t]
+    assert not fine.told(*LATE)
 
 
 def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(
@@ -218,11 +219,11 @@ def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(
     flight.run(30.0)
     flight.latency_ms = 240  # below the limit, and not enough below it to say so
     flight.run(20.0)
-    told = [t for t in flight.texts if "ms old" in t or "in time" in t]
-    assert told == ["PiLoT: fixes are 320 ms old, over the 250 ms of VISO_DELAY_MS"]
+    told = flight.told(*LATE, AlertId.FIXES_IN_TIME)
+    assert told == [alert(AlertId.FIXES_OVER_LIMIT, age_ms=320.0, limit_ms=250.0)]
     flight.latency_ms = 150
     flight.run(20.0)
-    assert flight.texts[-1] == "PiLoT: fixes are in time again"
+    assert flight.alerts[-1].id is AlertId.FIXES_IN_TIME
 
 
 def test_a_latency_text_never_names_a_figure_within_its_limit(
@@ -233,14 +234,14 @@ def test_a_latency_text_never_names_a_figure_within_its_limit(
     for latency_ms in (240, 215, 245, 215):  # above delay_ms + 10, then a little below it
         flight.latency_ms = latency_ms
         flight.run(10.0)
-    told = [t for t in flight.texts if "ms old" in t or "in time" in t]
-    assert told == ["PiLoT: fixes are 240 ms old: raise delay_ms (220) and VISO_DELAY_MS"]
+    told = flight.told(*LATE, AlertId.FIXES_IN_TIME)
+    assert told == [alert(AlertId.FIXES_LATE, age_ms=240.0, limit_ms=220.0)]
     flight.latency_ms = 260
     flight.run(10.0)
     flight.latency_ms = 215
     flight.run(10.0)
-    told = [t for t in flight.texts if "ms old" in t or "in time" in t]
-    assert told[1:] == ["PiLoT: fixes are 260 ms old, over the 250 ms of VISO_DELAY_MS"]
+    told = flight.told(*LATE, AlertId.FIXES_IN_TIME)
+    assert told[1:] == [alert(AlertId.FIXES_OVER_LIMIT, age_ms=260.0, limit_ms=250.0)]
 
 
 def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,10 +250,10 @@ def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPa
     for latency_ms in (120, 80, 120, 80, 120, 80, 120):
         flight.latency_ms = latency_ms
         flight.run(8.0)
-    assert len([t for t in flight.texts if "ms old" in t]) == 1
+    assert len(flight.told(*LATE)) == 1
     flight.latency_ms = 80
     flight.run(90.0)
-    assert flight.texts[-1] == "PiLoT: fixes are in time again"
+    assert flight.alerts[-1].id is AlertId.FIXES_IN_TIME
 
 
 @pytest.mark.parametrize(("delay_ms", "texts"), [(100, 0), (45, 1)])
@@ -265,7 +266,7 @@ def test_what_counts_is_the_least_lag(
     for latency_ms in itertools.islice(itertools.cycle((70, 125, 140, 150)), 100):
         flight.latency_ms = latency_ms
         flight.run(0.1)
-    assert len([t for t in flight.texts if "ms old" in t]) == texts
+    assert len(flight.told(*LATE)) == texts
 
 
 @pytest.mark.parametrize("gps_id", [0, 1])
@@ -276,8 +277,7 @@ def test_a_latency_text_names_the_receivers_own_delay(
     injection = InjectionConfig(message="gps_input", gps_id=gps_id, rate_hz=10, delay_ms=20)
     flight = Flight(monkeypatch, injection=injection)
     flight.run(10.0)
-    told = [t for t in flight.texts if "ms old" in t]
-    assert told == [f"PiLoT: fixes are 50 ms old: raise delay_ms (20) and GPS{gps_id + 1}_DELAY_MS"]
+    assert flight.told(*LATE) == [alert(AlertId.FIXES_LATE, age_ms=50.0, limit_ms=20.0)]
 
 
 # --- damaged input --------------------------------------------------------------------------------
@@ -318,7 +318,7 @@ def test_damaged_frames_on_the_flight_controllers_link(
     assert counters.bad_checksums > 50
     assert flight.end.counters["reboots"] == 0
     assert flight.attitude_error() < 0.01
-    assert not [t for t in flight.texts if "two autopilots" in t]
+    assert not flight.told(AlertId.DUPLICATE_SYSTEM_ID)
     assert {m.reset_counter for _, m in flight.vision()} == {0}
     assert len(flight.vision(flight.now_ns - 60 * SECOND)) > 550
     assert max(flight.waiting().values()) < 1024
@@ -431,7 +431,7 @@ def test_a_jump_that_the_ekf_missed_is_announced_again(
         if taken_at in counters:
             flight.ekf_north_m = 10.0
     assert counters == set(range((taken_at or 6) + 1))  # six: announced, and five times again
-    again = [t for t in flight.texts if "missed a jump" in t]
+    again = flight.told(AlertId.JUMP_REPEATED)
     assert len(again) == flight.end.counters["jumps_repeated"] == (taken_at or 6) - 1
 
 
@@ -471,19 +471,19 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
 @pytest.mark.parametrize(
     ("system", "component", "autopilot", "said"),
     [
-        (2, 1, 3, "autopilot 2 is heard, 1 is followed: set bridge.system_id"),
-        (1, 197, 8, "another companion speaks as component 197: stop one"),
-        (1, 2, 3, "another autopilot is system 1, too: give it another id"),
+        (2, 1, 3, alert(AlertId.AUTOPILOT_IGNORED, system=2, used=1)),
+        (1, 197, 8, alert(AlertId.SECOND_COMPANION, component=197)),
+        (1, 2, 3, alert(AlertId.DUPLICATE_SYSTEM_ID, system=1)),
         (255, 190, 8, None),  # a ground station
         (1, 154, 8, None),  # a gimbal
     ],
 )
 def test_a_second_vehicle_and_a_second_companion_are_told_once(
-    flight: Flight, system: int, component: int, autopilot: int, said: str | None
+    flight: Flight, system: int, component: int, autopilot: int, said: Alert | None
 ) -> None:
     stranger = mavlink.MAVLink(None, system, component)
     beat = mavlink.MAVLink_heartbeat_message(2, autopilot, 81, 4, 4, 3).pack(stranger)
-    flight.texts.clear()
+    flight.alerts.clear()
     for _ in range(3):
         kept = flight.link.kept
         for message in flight.reader.feed(beat):
@@ -491,7 +491,7 @@ def test_a_second_vehicle_and_a_second_companion_are_told_once(
         assert flight.link.kept == kept
         flight.run(1.0)
         assert flight.link.kept == kept + 1  # by the vehicle's own heartbeat
-    assert flight.texts == ([f"PiLoT: {said}"] if said else [])
+    assert flight.alerts == ([said] if said else [])
     assert flight.shared.tracker.snapshot(flight.now_ns).system_id == 1
 
 
@@ -499,7 +499,7 @@ def test_a_second_vehicle_and_a_second_companion_are_told_once(
 def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int) -> None:
     """Only their boot times tell them apart. Nothing of the other's attitude may be injected."""
     other = mavlink.MAVLink(None, 1, 1)
-    flight.texts.clear()
+    flight.alerts.clear()
     for step in range(1000):
         flight.run(0.01)
         if step % 4 == 1:
@@ -507,8 +507,8 @@ def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int
             attitude = mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
             for message in flight.reader.feed(attitude.pack(other)):
                 flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
-    told = [t for t in flight.texts if "two autopilots" in t]
-    assert told == ["PiLoT: two autopilots speak as system 1: change one's id"]
+    told = flight.told(AlertId.DUPLICATE_SYSTEM_ID)
+    assert told == [alert(AlertId.DUPLICATE_SYSTEM_ID, system=1)]
     assert {m.yaw for _, m in flight.vision()}.isdisjoint({-1.0})
 
 
@@ -520,36 +520,41 @@ def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> No
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
 
 
+def fault(flight: Flight) -> AlertId | None:
+    """What keeps vision from the EKF."""
+    found = flight.end.injection_fault
+    return None if found is None else found.id
+
+
 def test_what_keeps_vision_from_the_ekf_stands_as_its_trouble(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A gimbal 10 degrees off, whose fixes the yaw guard refuses; an EKF that is elsewhere."""
     flight = Flight(monkeypatch)
     flight.run(6.0)
-    assert flight.end.injection_fault == ""
+    assert flight.end.injection_fault is None
     flight.yaw_error_rad = 0.17
     flight.run(6.0)
-    assert "not sent: vision yaw differs" in flight.end.injection_fault
+    assert fault(flight) is AlertId.YAW_MISMATCH
     flight.yaw_error_rad = 0.0
     flight.run(12.0)
-    assert flight.end.injection_fault == ""
+    assert flight.end.injection_fault is None
     flight.ekf_north_m = 20.0
     flight.run(6.0)
-    assert "20.0 m from what is sent" in flight.end.injection_fault
+    assert fault(flight) is AlertId.EKF_OFF_FIXES
 
 
 def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight(monkeypatch)
     monkeypatch.setattr(flight, "yaw", lambda _: 0.0)
     flight.run(10.0)
-    assert not [t for t in flight.texts if "not checked" in t]
+    assert not flight.told(AlertId.YAW_UNCHECKED)
     flight.yaw_is_seen = False
     flight.run(10.0)
-    told = [t for t in flight.texts if "not checked" in t]
-    assert told == ["PiLoT: vision yaw is not checked: no attitude or no gimbal angles"]
+    assert flight.told(AlertId.YAW_UNCHECKED) == [alert(AlertId.YAW_UNCHECKED)]
     flight.yaw_is_seen = True
     flight.run(5.0)
-    assert flight.texts[-1] == "PiLoT: vision yaw is checked"
+    assert flight.alerts[-1] == cleared(AlertId.YAW_UNCHECKED)
 
 
 def test_an_order_that_is_not_acknowledged_is_repeated_and_told_once(
@@ -560,8 +565,8 @@ def test_an_order_that_is_not_acknowledged_is_repeated_and_told_once(
     orders = [m for _, m, _ in flight.link.sent if getattr(m, "command", 0) == 42007]
     assert len(orders) > 10
     assert {m.param1 for m in orders} == {2.0}
-    told = [t for t in flight.texts if "source set" in t]
-    assert told == ["PiLoT: EKF source set 2: GNSS lost"]
+    told = flight.told(AlertId.SOURCE_SET_SELECTED)
+    assert [a.values[:2] for a in told] == [(2, "GNSS lost")]
 
 
 @pytest.mark.parametrize(
@@ -578,11 +583,11 @@ def test_answers_to_others_commands_are_not_ours(
     ack = mavlink.MAVLink_command_ack_message(42007, 4, 0, 0, system, component)
     flight.say(ack)
     assert flight.end.counters["commands_refused"] == (1 if ours else 0)
-    assert bool([t for t in flight.texts if "source switch refused" in t]) is ours
+    assert bool(flight.told(AlertId.SOURCE_SET_REFUSED)) is ours
 
 
 def test_no_origin_is_set_while_the_gate_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[str] = []
+    opened: list[Alert] = []
     enable = InjectionEnable(InjectionEnableConfig(), opened.append)
     flight = Flight(monkeypatch, enable)
     flight.run(15.0)

@@ -14,6 +14,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.component import CameraComponent
 from mavlink_bridge.camera.cursor_on_target import (
     CursorOnTarget,
@@ -210,8 +212,8 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
         autopilot.peer = ("127.0.0.1", bridge.port)
         assert sleep_until(lambda: bridge.state().connected, 30.0)
         assert sleep_until(lambda: bool(station.listen()), 30.0)  # its link knows whose it is
-        bridge.say(4, "PiLoT: the warning")
-        bridge.say(6, "PiLoT: news")
+        bridge.report_alert(alert(AlertId.FC_LOST))
+        bridge.report_alert(alert(AlertId.FC_BACK))
         bridge.tell_figures({"VPS_SIGNAL": 2.0, "VPS_AGE": 0.25})
 
         def figures():
@@ -220,7 +222,7 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
 
         assert sleep_until(lambda: len(figures()) == 2, 30.0)
         assert figures() == {("VPS_SIGNAL", 191): 2.0, ("VPS_AGE", 191): 0.25}
-        assert station.shown() == (["PiLoT: the warning"] if as_autopilot else [])
+        assert station.shown() == ([text(alert(AlertId.FC_LOST))] if as_autopilot else [])
         with pytest.raises(ValueError, match="10 characters"):
             bridge.tell_figures({"VPS_SIGNALS": 1.0})
     station.socket.close()

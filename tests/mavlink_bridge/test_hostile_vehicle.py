@@ -12,6 +12,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.targets.numbers import TargetNumbers
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import CameraConfig, InjectionEnableConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
@@ -20,7 +23,7 @@ from mavlink_bridge.status import OperatorStatus
 from tests.mavlink_bridge.simulated import HOME, METRE, MS, Flight
 
 KEY = bytes(range(1, 33))
-TWINS = "PiLoT: two autopilots speak as system 1: change one's id"
+TWINS = alert(AlertId.DUPLICATE_SYSTEM_ID, system=1)
 PLACE = (round(HOME[0] * 1e7), round(HOME[1] * 1e7))
 Attack = Callable[[Flight, int], None]
 
@@ -35,13 +38,14 @@ def flown(monkeypatch: pytest.MonkeyPatch, *, armed: bool = True, **options: Any
     flight = Flight(monkeypatch, **options)
     flight.armed, flight.origin = armed, (*HOME, 488.0)
     flight.run(4.0)
-    flight.texts.clear()
+    flight.alerts.clear()
     return flight
 
 
-def told(flight: Flight) -> list[str]:
-    """What the operator read beside what every flight says."""
-    return [t for t in flight.texts if "the EKF follows" not in t and "not checked" not in t]
+def told(flight: Flight) -> list[Alert]:
+    """What the operator was told beside what every flight tells."""
+    usual = (AlertId.EKF_FOLLOWS, AlertId.YAW_UNCHECKED)
+    return [a for a in flight.alerts if a.id not in usual]
 
 
 def heartbeat(autopilot: int = 3) -> Any:
@@ -82,7 +86,7 @@ def test_no_burst_of_forged_stamps_is_a_reboot_that_makes_room_for_a_forged_orig
     assert flight.end.counters["reboots"] == 0
     assert {round(m.x) for _, m in flight.vision(begun_ns)} == {0}
     assert flight.attitude_error() < 0.005
-    assert told(flight) == ["PiLoT: EKF origin off by 60 m in flight: refused"]
+    assert told(flight) == [alert(AlertId.ORIGIN_REFUSED, metres=pytest.approx(60.0, abs=0.5))]
 
 
 def test_a_clock_that_jumps_alone_is_followed_half_a_second_later(flight: Flight) -> None:
@@ -92,7 +96,7 @@ def test_a_clock_that_jumps_alone_is_followed_half_a_second_later(flight: Flight
     assert flight.end.counters["reboots"] == 0
     flight.run(0.2)
     assert flight.end.counters["reboots"] == 1
-    assert flight.texts[0] == "PiLoT: flight controller rebooted"
+    assert flight.alerts[0].id is AlertId.FC_REBOOTED
 
 
 @pytest.mark.parametrize("says", [heartbeat(12), version(3)], ids=["make", "firmware"])
@@ -118,7 +122,7 @@ def test_another_firmware_after_a_reboot_is_asked_for_and_taken(flight: Flight) 
     flight.say(version(5))
     flight.run(1.0)
     assert flight.shared.tracker.snapshot(flight.now_ns).version == (5, 5, 0)
-    assert TWINS not in flight.texts
+    assert TWINS not in flight.alerts
 
 
 @pytest.mark.parametrize("lie", [2**63 - 1, -(2**63)])
@@ -139,7 +143,7 @@ def test_timesync_answers_that_the_stamps_contradict_are_told_and_not_taken(
     assert flight.shared.tracker.clock.rate == 1.0
     assert flight.attitude_error() < 0.005
     assert len(flight.vision(begun_ns)) >= 78
-    assert told(flight) == ["PiLoT: TIMESYNC contradicts the stamps: do two answer?"]
+    assert told(flight) == [alert(AlertId.TIMESYNC_CONTRADICTS)]
 
 
 def test_the_distances_of_two_sensors_that_look_down_are_not_mixed(flight: Flight) -> None:
@@ -248,7 +252,7 @@ def test_a_flood_is_told_in_a_few_lines_and_nothing_grows(
     monkeypatch: pytest.MonkeyPatch, attack: Attack, most: int
 ) -> None:
     flight = flown(monkeypatch, armed=attack is not origins, camera=CameraConfig(mount="gimbal"))
-    flight.texts.clear()
+    flight.alerts.clear()
     for turn in range(120):
         attack(flight, turn)
         if turn % 5 == 0:
@@ -268,18 +272,18 @@ def test_a_receiver_that_comes_and_goes_is_told_as_lost_and_a_short_gap_is_not(
         2**64 - 1, 0, *PLACE, 2**31 - 1, *[65535] * 4, 255, -(2**31), *[2**32 - 1] * 2
     )
 
-    def lost(every: int) -> list[str]:
-        flight.texts.clear()
+    def lost(every: int) -> list[Alert]:
+        flight.alerts.clear()
         for step in range(600):
             flight.run(0.01)
             if step % every == 5:
                 flight.say(none)
-        return [text for text in flight.texts if "GNSS" in text]
+        return flight.told(AlertId.GNSS_LOST, AlertId.GNSS_BACK)
 
     assert lost(every=500) == []
     assert len(lost(every=20)) == 1
     flight.run(6.0)
-    assert "PiLoT: GNSS is back" in flight.texts
+    assert flight.told(AlertId.GNSS_BACK)
 
 
 # --- what is answered, and what runs over ---------------------------------------------------------
@@ -387,11 +391,13 @@ def test_no_flood_of_clicks_ends_the_targets_that_are_followed(flight: Flight) -
 
 
 def test_a_line_repeated_at_once_is_told_once_and_on_after_off_is_told() -> None:
-    told: list[str] = []
-    status = OperatorStatus(lambda *_: None, lambda _, text, _alert: told.append(text))
+    told: list[Alert] = []
+    status = OperatorStatus(lambda *_: None, told.append)
+    refused = alert(AlertId.LOOK_AT_REFUSED, why="no target 3")
     for hundredth in range(250):
-        status.say(4, "look-at refused", hundredth * 10 * MS)
-    assert told == ["look-at refused"] * 3
-    for hundredth, text in enumerate(("on", "off", "on", "on")):
-        status.say(4, text, 10**10 + hundredth * 10 * MS)
-    assert told[3:] == ["on", "off", "on"]
+        status.report(refused, hundredth * 10 * MS)
+    assert told == [refused] * 3
+    on, off = (alert(of, by="command") for of in (AlertId.INJECTION_ON, AlertId.INJECTION_OFF))
+    for hundredth, news in enumerate((on, off, on, on)):
+        status.report(news, 10**10 + hundredth * 10 * MS)
+    assert told[3:] == [on, off, on]

@@ -2,12 +2,15 @@
 
 import math
 import time
+from typing import Any
 
 import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, TargetReport
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOK_AHEAD, LOOK_AT_PLACE, LOOK_AT_TARGET, LookAt
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.link.link import sleep_until
@@ -28,9 +31,9 @@ class Station:
     """A `LookAt` with what it said."""
 
     def __init__(self, **options):
-        self.said: list[str] = []
+        self.said: list[Any] = []
         config = BridgeConfig(**({"look_at": True} | options))
-        self.look = LookAt(config, 47.0, lambda _, text: self.said.append(text))
+        self.look = LookAt(config, 47.0, self.said.append)
 
     def command(self, number, *parameters):
         padded = [*parameters, *([0.0] * (7 - len(parameters)))]
@@ -58,7 +61,7 @@ def test_nobody_turns_the_gimbal_where_the_deployment_does_not_allow_it():
         results = [station.place(), station.command(LOOK_AT_TARGET, 3.0)]
         assert results == [DENIED, DENIED]
         assert station.look.due(SECOND) is None
-        assert station.said == [f"PiLoT: look-at refused: {why}"] * 2
+        assert station.said == [alert(AlertId.LOOK_AT_REFUSED, why=why)] * 2
 
 
 def test_a_place_is_sent_once_and_a_wrong_one_is_refused_with_a_word():
@@ -70,7 +73,7 @@ def test_a_place_is_sent_once_and_a_wrong_one_is_refused_with_a_word():
     nan = math.nan
     wrong = [station.command(LOOK_AT_PLACE, 0, 0, 0, 0, nan, 8.0, 1.0), station.place(0.0, 0.0)]
     assert [*wrong, station.place(95.0), station.place(frame=8)] == [DENIED] * 4
-    assert station.said == ["PiLoT: look-at refused: no place on Earth"] * 4
+    assert station.said == [alert(AlertId.LOOK_AT_REFUSED, why="no place on Earth")] * 4
     assert station.command(LOOK_AHEAD) == OK
     ahead = station.look.due(30 * SECOND)
     assert ahead is not None
@@ -98,7 +101,7 @@ def test_a_target_is_followed_by_its_number_until_it_ends():
     station.look.forget(3)
     station.look.report(_target(3, 47.9))  # of the same number again: it is not ours any more
     assert station.look.due(60 * SECOND) is None
-    assert station.said[1:] == ["PiLoT: target 3 ended, the gimbal stays"]
+    assert station.said[1:] == [alert(AlertId.LOOK_AT_ENDED, number=3)]
 
 
 def test_an_autopilot_that_refuses_or_does_not_answer_is_told():
@@ -111,8 +114,8 @@ def test_an_autopilot_that_refuses_or_does_not_answer_is_told():
     assert station.look.due(10 * SECOND) is not None
     assert station.look.due(14 * SECOND) is None
     assert station.said == [
-        "PiLoT: the autopilot refused look-at: unsupported",
-        "PiLoT: the autopilot does not answer look-at",
+        alert(AlertId.LOOK_AT_DENIED, result="unsupported"),
+        alert(AlertId.LOOK_AT_UNANSWERED),
     ]
 
 
@@ -137,8 +140,8 @@ def test_a_stations_command_reaches_the_autopilot_through_the_bridge(autopilot):
             LOOK_AT_PLACE, mavlink.MAV_RESULT_FAILED, 0, 0, 1, 191
         )
         autopilot.send(refused)
-        text = "PiLoT: the autopilot refused look-at: failed"
-        assert sleep_until(lambda: text in bridge.texts(), 30.0)
+        news = alert(AlertId.LOOK_AT_DENIED, result="failed")
+        assert sleep_until(lambda: news in bridge.alerts(), 30.0)
 
 
 @pytest.mark.parametrize(
@@ -174,5 +177,5 @@ def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there(kind
             assert sleep_until(lambda: bridge.state().connected, 30.0)
             assert not looks_west()
             # It refuses until it knows where it is; the operator asks again.
-            assert sleep_until(lambda: asked() and looks_west(), 120.0, step_s=0.5), bridge.texts()
+            assert sleep_until(lambda: asked() and looks_west(), 120.0, step_s=0.5), bridge.alerts()
         station.close()

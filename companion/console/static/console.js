@@ -84,7 +84,7 @@ function showState() {
     ["mode", mode(about.mode, state.injecting), false, true],
     ["EKF", ekf(vehicle, state.follows), state.follows?.used === false, true],
     ["vehicle", aboutVehicle(vehicle), !vehicle.connected && !page.about?.replay, true],
-    ["shadow", state.shadow ? (state.shadow.go ? "go" : "no-go") : "-", false, true],
+    ["shadow", state.shadow ? (state.shadow.go ? "ready" : "not ready") : "-", false, true],
   ]);
   $("figures").title = state.shadow?.line ?? "";
 }

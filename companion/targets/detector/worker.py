@@ -23,11 +23,13 @@ from companion.targets.detector.network import DetectorNetwork
 from companion.targets.pictures import RecentPictures
 from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.types import Frame, PoseEstimate
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 
 _log = logging.getLogger(__name__)
 _KEPT = 16  # pictures and estimates
 _MATCH_NS = 5_000_000
-_WARNING, _INFO = 4, 6  # MAV_SEVERITY
 _FAILURES = 3  # in a row: it is given up
 _MOST_AWAY_M = 5000.0
 
@@ -35,7 +37,7 @@ _MOST_AWAY_M = 5000.0
 class BoxDetector:
     """Looks for things in the camera's pictures and hands them on as detections.
 
-    on_detection: takes each; must not block. say: tells the operator (MAV_SEVERITY, text). A model
+    on_detection: takes each; must not block. report: tells the operator. A model
     that cannot be loaded, or fails three times in a row, ends the detector and not the flight.
     looked, seen, failed count pictures, boxes and errors.
     """
@@ -45,11 +47,11 @@ class BoxDetector:
         config: DetectorConfig,
         cast: RayCaster,
         on_detection: Callable[[Detection], None],
-        say: Callable[[int, str], None],
+        report: Callable[[Alert], None],
         load: Callable[[DetectorConfig], DetectorNetwork] = DetectorNetwork,
     ) -> None:
         self._config, self._cast = config, cast
-        self._on_detection, self._say, self._load = on_detection, say, load
+        self._on_detection, self._report, self._load = on_detection, report, load
         self._names = ThingNames()
         self._frames = RecentPictures[Frame](_KEPT, lambda frame: frame.image.nbytes)
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
@@ -116,7 +118,7 @@ class BoxDetector:
         self.is_working = False
         self.failed += 1
         _log.warning("the detector is off: %s", why)
-        self._say(_WARNING, "PiLoT: the detector is off, see the log")
+        self._report(alert(AlertId.DETECTOR_OFF))
 
     def _newest_pair(self) -> tuple[Frame, PoseEstimate] | None:
         """The newest picture with its pose that was not looked at yet; waits for half a second."""

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.settings_file import SettingsError, read_settings, validated
+from mavlink_bridge.alerts.ids import AlertId
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioError, ScenarioLeg
@@ -116,7 +117,7 @@ class Expectation(_Model):
     be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
     injects: and some are injected. back_within_s: of a kill or a hang, injected again.
     repeats: how often the companion may say the same, figures aside. ends_tracking: the last health
-    is ok. says: parts of texts that must come from the companion.
+    is ok. reports: alerts that must come from the companion.
     silent: no warning text, no finding of the monitor, and a health that is ok throughout.
     """
 
@@ -128,7 +129,7 @@ class Expectation(_Model):
     injects: bool = True
     back_within_s: float | None = Field(None, gt=0)
     ends_tracking: bool = False
-    says: tuple[str, ...] = ()
+    reports: tuple[AlertId, ...] = ()
     silent: bool = False
     repeats: int | None = Field(None, ge=1)
 

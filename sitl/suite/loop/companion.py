@@ -12,6 +12,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from mavlink_bridge.alerts.ids import AlertId
 from sitl.demo.companion_process import running_companion
 from sitl.demo.script import FlightError
 
@@ -22,8 +23,8 @@ _FRESH_S = 2.0  # a health report that is written every second
 @dataclass(frozen=True)
 class Health:
     """The newest ``health.json``: level and text, its age in seconds (infinite without one), names
-    of the monitor's findings that stand, localized frames per second, whose report it is, and its
-    shadow score.
+    of the monitor's findings that stand, localized frames per second, whose report it is, its
+    shadow score and whether that is ready, ids of active alerts.
     """
 
     level: str = "starting"
@@ -33,16 +34,13 @@ class Health:
     rate_hz: float = 0.0
     pid: int = 0
     shadow: str = ""
-
-    @property
-    def has_go(self) -> bool:
-        """Whether the shadow score is a go."""
-        return self.shadow.startswith("go")
+    ready: bool = False
+    alerts: tuple[str, ...] = ()
 
     @property
     def is_tracking(self) -> bool:
         """Whether all is well."""
-        return self.level == "ok" and self.text.startswith("localization tracking")
+        return self.level == "ok" and AlertId.TRACKING.value in self.alerts
 
 
 class LoopCompanion:
@@ -118,5 +116,6 @@ class LoopCompanion:
         findings = tuple(integrity_monitor.get("findings", {}))
         return Health(
             str(report["level"]), str(report["text"]), age_s, findings, float(report["rate_hz"]),
-            int(report["pid"]), str(report["shadow"]),
+            int(report["pid"]), str(report["shadow"]["text"]), bool(report["shadow"]["ready"]),
+            tuple(report["alerts"]),
         )  # fmt: skip

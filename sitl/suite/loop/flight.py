@@ -31,7 +31,7 @@ from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import LoopCase, LoopEvent, OperatorHint, Wrong, Zoom
-from sitl.suite.loop.companion import LoopCompanion
+from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import Back, LoopRecord, LoopSample, LoopText
 from sitl.suite.loop.terrain_file import terrain_file
@@ -115,7 +115,7 @@ class _LoopFlight:
         self._tlog = out.resolve() / "flight.tlog"
         self._start_ns = 0
         self._ended_ns: int | None = None
-        self._shadow: str | None = None
+        self._shadow: Health | None = None
 
     def prepare(self) -> None:
         """From power on to a companion that tracks at the flight's height."""
@@ -149,7 +149,7 @@ class _LoopFlight:
             pilot.link.sleep(8.0)
         if case.earns:
             pilot.link.wait_wall(self._has_go, _GO_S)
-            self._shadow = self._companion.health().shadow
+            self._shadow = self._companion.health()
         if case.gated:
             self._open_gate()
 
@@ -338,7 +338,7 @@ class _LoopFlight:
 
     def _has_go(self) -> bool:
         self._companion.require()
-        return self._companion.health().has_go
+        return self._companion.health().ready
 
     def _is_tracking(self) -> bool:
         self._companion.require()

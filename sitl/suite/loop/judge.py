@@ -10,14 +10,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from mavlink_bridge.messages import without_figures
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import alert_of
 from sitl.suite.loop.case import Expectation
+from sitl.suite.loop.companion import Health
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
 _AUTOPILOT = 1  # component id
 _WARNING = 4  # MAV_SEVERITY; lower is worse
 _FALSE_M = 5.0
-_GNSS_LOST = "GNSS lost"
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,12 @@ class LoopText:
     text: str
 
     @property
+    def alert(self) -> AlertId | None:
+        """Of the companion, whether it began or ended; None for texts of the autopilot."""
+        read = alert_of(self.text) if self.component != _AUTOPILOT else None
+        return None if read is None else read[0]
+
+    @property
     def is_warning(self) -> bool:
         """Whether the companion says that something is wrong."""
         return self.component != _AUTOPILOT and self.severity <= _WARNING
@@ -79,7 +86,7 @@ class LoopRecord:
     """What a flight left. fix_errors_m: horizontal, of every position that was injected.
 
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
-    back: where the companion was killed or hung; None elsewhere. shadow: its score when the
+    back: where the companion was killed or hung; None elsewhere. shadow: the health when the
     recorded part began; None where injection was forced.
     """
 
@@ -89,7 +96,7 @@ class LoopRecord:
     pace: float = 1.0
     stall_s: float = 0.0
     back: Back | None = None
-    shadow: str | None = None
+    shadow: Health | None = None
 
 
 @dataclass(frozen=True)
@@ -158,7 +165,7 @@ def false_alarms(record: LoopRecord, *, denied: bool = False) -> tuple[str, ...]
     told = [
         (t.at_s, t.text)
         for t in record.texts
-        if t.is_warning and not (denied and _GNSS_LOST in t.text)
+        if t.is_warning and not (denied and t.alert is AlertId.GNSS_LOST)
     ]
     before: set[str] = set()
     for sample in record.samples:
@@ -190,7 +197,7 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         ok = flown.false <= expect.false_fixes and (flown.sent > 0 or not expect.injects)
         held.append(Held("false fixes injected", ok, f"{flown.false} of {flown.sent}"))
     if record.shadow is not None:
-        held.append(Held("go earned", record.shadow.startswith("go"), record.shadow))
+        held.append(Held("shadow check passed", record.shadow.ready, record.shadow.shadow))
     if expect.back_within_s is not None:
         back = record.back or Back(math.inf, math.inf, math.inf)
         ok = back.injects_s <= expect.back_within_s
@@ -201,7 +208,7 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         last = samples[-1] if samples else None
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
         held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
-    held += [_said(record.texts, part) for part in expect.says]
+    held += [_reported(record.texts, of) for of in expect.reports]
     if expect.repeats is not None:
         held.append(_repeated(record.texts, expect.repeats))
     if expect.silent:
@@ -212,11 +219,12 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
 
 def _repeated(texts: Sequence[LoopText], most: int) -> Held:
     """Texts that cycle are read by nobody: an overloaded computer is well and ill by turns."""
-    said = Counter(without_figures(t.text) for t in texts if t.component != _AUTOPILOT)
-    text, times = said.most_common(1)[0] if said else ("nothing", 0)
-    return Held(f"says nothing more than {most} times", times <= most, f"{times} times {text!r}")
+    said = Counter(t.alert.words for t in texts if t.alert is not None)
+    words, times = said.most_common(1)[0] if said else ("nothing", 0)
+    return Held(f"reports nothing more than {most} times", times <= most, f"{times} times {words}")
 
 
-def _said(texts: Sequence[LoopText], part: str) -> Held:
-    found = [t for t in texts if t.component != _AUTOPILOT and part in t.text]
-    return Held(f"says {part!r}", bool(found), f"at {found[0].at_s:.1f} s" if found else "never")
+def _reported(texts: Sequence[LoopText], of: AlertId) -> Held:
+    found = [t for t in texts if t.alert is of]
+    at = f"at {found[0].at_s:.1f} s" if found else "never"
+    return Held(f"reports {of.words}", bool(found), at)

@@ -11,6 +11,7 @@ from companion.calibration_watch.map_offset import MapOffsetEstimator, Policy
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.position_checks import GnssCheck
 from localizer.types import PoseEstimate, TrackingState
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
 
@@ -31,7 +32,7 @@ class Flight:
     seed: int = 0
     bias_m: float = 0.3
     lost_s: float = 1e9
-    said: list[str] = field(default_factory=list)
+    said: list[Alert] = field(default_factory=list)
     fixes: list[VisionFix] = field(default_factory=list)
     _now: int = 0
     _clock_ns: int = 0
@@ -58,8 +59,8 @@ class Flight:
         north, east = np.array([north, east]) + self._rng.normal(0, 0.2, 2)
         return (*offset(*HOME, north, east), 500.0)
 
-    def say(self, _: int, text: str) -> None:
-        self.said.append(text)
+    def report_alert(self, alert: Alert) -> None:
+        self.said.append(alert)
 
     def fly(self, judge: MapOffsetEstimator, seconds: float) -> None:
         seen = PoseEstimate.__new__(PoseEstimate)
@@ -87,8 +88,8 @@ def test_a_shifted_map_is_told_once_and_changes_nothing() -> None:
     shift = judge(flight)
     flight.fly(shift, 240)
     assert len(flight.said) == 1
-    assert flight.said[0].startswith("PiLoT: map 3.")
-    assert flight.said[0].endswith(" m east of GNSS")
+    assert flight.said[0].values[0] == pytest.approx(3.4, abs=0.5)
+    assert flight.said[0].values[1:] == ("east", "")
     assert shift.shift is not None
     assert shift.shift.ne_m == pytest.approx((0.1, 3.4), abs=1.0)
     assert flight.error(2000) == pytest.approx(3.4, abs=0.5)
@@ -102,7 +103,7 @@ def test_an_applied_shift_creeps_in_stays_after_gnss_and_is_what_others_compare(
     shift = judge(flight, "apply")
     flight.fly(shift, 400)
     assert len(flight.said) == 1
-    assert flight.said[0].endswith(" m south-west of GNSS, applied")
+    assert flight.said[0].values[1:] == ("south-west", ", applied")
     assert flight.error(500) == pytest.approx(3.96, abs=0.5)  # not known yet
     assert flight.error(3900) < 1.2  # GNSS's own bias remains
     places = np.array([north_east(*HOME, f.latitude_deg, f.longitude_deg) for f in flight.fixes])

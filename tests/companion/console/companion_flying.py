@@ -33,6 +33,9 @@ from localizer.types import (
     RegistrationStatus,
     TrackingState,
 )
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.mission import MissionWaypoint
@@ -50,7 +53,7 @@ class Flight:
     control: bool = True
     armed: bool = False
     hz: float = 5.0
-    said: list[str] = field(default_factory=list)
+    said: list[Alert] = field(default_factory=list)
     hints: list[tuple[float, float, float]] = field(default_factory=list)
     targets: dict[str, np.ndarray] = field(default_factory=dict)
     sent: int = 0
@@ -76,7 +79,8 @@ class Flight:
         }  # fmt: skip
         instruments = Instruments(
             lambda: self.health, lambda: self.vehicle,
-            lambda: ShadowScore(False, 3, ("only 3 fixes of 50",)), lambda: None, lambda: False,
+            lambda: ShadowScore(False, 3, (alert(AlertId.SHADOW_NOT_COMPARED),)),
+            lambda: None, lambda: False,
             lambda: self.mission,
         )  # fmt: skip
         about = {"mode": "inject", "delay_ms": 220.0, "alert_limit_m": 10.0, "record": None}
@@ -86,7 +90,7 @@ class Flight:
             TargetConfig(), MapSurface(self.cache).cast, self._located, self.shown.forget_target
         )
         config = TargetConfig()
-        self.clicks = ClickPolicy(self.reporter, self._say, config)
+        self.clicks = ClickPolicy(self.reporter, self._report, config)
         numbers = itertools.count(1)
 
         def track(request):
@@ -95,7 +99,7 @@ class Flight:
                 replace(request, time_ns=request.time_ns + late_ns, number=next(numbers))
             )
 
-        helm = Helm(self._say, track, lambda *hint: self.hints.append(hint))
+        helm = Helm(self._report, track, lambda *hint: self.hints.append(hint))
         self.publisher = Publisher(self.path, self.shown, Orders(self.control, helm), 10.0)
         self._stop = threading.Event()
         self._streamer = TileStreamer(self.cache)
@@ -106,9 +110,9 @@ class Flight:
         self.targets[target.fix.target_id] = target.fix.position_world
         self.shown.add_target(target)
 
-    def _say(self, severity: int, text: str) -> None:
-        self.said.append(text)
-        self.shown.add_event("info", text)
+    def _report(self, alert: Alert) -> None:
+        self.said.append(alert)
+        self.shown.add_event("info", text(alert))
 
     def _way(self):
         base = float(self.cache.index.box_min[0, 2])

@@ -13,6 +13,7 @@ import yaml
 
 from companion.live.protocol import socket_path
 from localizer.map.cache.cache import TileCache
+from mavlink_bridge.alerts.ids import AlertId
 from tests.companion.console.companion_flying import CAMERA, HEIGHT_M, Flight
 from tests.companion.console.record_of import write_record
 
@@ -190,7 +191,7 @@ def test_a_click_is_a_target_at_the_place_that_was_clicked(page, flight):
     assert -24.0 < place[0] < 24.0
     assert place[2] < flight.flight.cache.index.box_min[0, 2] + HEIGHT_M / 2
     _until(page, lambda: page.locator("#targets tbody tr").count() == 1)
-    assert any(text.startswith("PiLoT: console: target") for text in flight.flight.said)
+    assert any(of.id is AlertId.CONSOLE_TARGET for of in flight.flight.said)
 
 
 def test_a_hint_arrives_where_the_map_was_clicked(page, flight):

@@ -21,9 +21,10 @@ from companion.flight.app import Companion
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Component
 from companion.flight.feed import Feed
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.messages import without_figures
 from sitl.geodesy import Location
 from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_parameters
 
@@ -130,8 +131,9 @@ def test_a_restart_without_its_deployment_file_tells_the_operator(small_assets, 
     config = parse_config(
         {"map": str(small_assets.map_cache), "camera": {"source": "s", "model": MODEL}}, "test"
     )
-    feed, bridge, said = _StubFeed(), object.__new__(Bridge), []
-    bridge.say = lambda severity, text: said.append((severity, text))  # type: ignore[method-assign]
+    said: list[Any] = []
+    feed, bridge = _StubFeed(), object.__new__(Bridge)
+    bridge.report_alert = said.append  # type: ignore[method-assign,assignment]
     parts = [
         *(p for p in COMPONENTS if p.name == "map"),
         Component("feed", Feed, lambda _: feed), Component("bridge", Bridge, lambda _: bridge),
@@ -142,7 +144,7 @@ def test_a_restart_without_its_deployment_file_tells_the_operator(small_assets, 
         companion.run()
     told = [r.getMessage() for r in caplog.records if "companion.yaml" in r.getMessage()]
     assert len(told) == len(said) == bool(lost)
-    assert all(severity == 4 and len(text) <= 50 for severity, text in said)
+    assert {of.id for of in said} <= {AlertId.DEPLOYMENT_LOST}
 
 
 class _Memory:
@@ -203,7 +205,7 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
     small_assets, tmp_path, caplog
 ):
     def stop_with_last_words(bridge):
-        bridge.say(6, "PiLoT: last words")
+        bridge.report_alert(alert(AlertId.ENDING))
         bridge.stop()
 
     parts = [replace(p, stop=stop_with_last_words) if p.kind is Bridge else p for p in COMPONENTS]
@@ -228,13 +230,13 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
             Companion(config, parts).run()
     assert sleep_until(lambda: set(threading.enumerate()) <= threads, 30.0), threading.enumerate()
     with (tmp_path / "record" / "events.csv").open() as file:
-        recorded = [row["text"] for row in csv.DictReader(file)]
-    assert "PiLoT: last words" in recorded  # the record is closed after all that could tell
+        rows = list(csv.DictReader(file))
+    recorded, ids = [row["text"] for row in rows], [row["alert"] for row in rows]
+    assert AlertId.ENDING.value in ids  # the record is closed after all that could tell
     logged = [r.getMessage() for r in caplog.records]
-    assert recorded.count("PiLoT: flight controller found") == 1, recorded
+    assert ids.count(AlertId.FC_FOUND.value) == 1, recorded
     for text in set(recorded):
         assert logged.count(text) == recorded.count(text), text
-    # Nothing is told twice in a row, in other words or with other figures included.
-    plain = [without_figures(text.removeprefix("PiLoT: ")) for text in recorded]
-    assert all(a != b for a, b in itertools.pairwise(plain)), recorded
+    # Nothing is told twice in a row, with other figures included.
+    assert all(a != b or not a for a, b in itertools.pairwise(ids)), recorded
     assert (tmp_path / "flight.tlog").stat().st_size > 10_000

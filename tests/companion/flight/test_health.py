@@ -18,38 +18,40 @@ from localizer.types import TrackingState
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.messages import HealthLevel, without_figures
+from mavlink_bridge.messages import HealthLevel
 
 FROZEN = alert(AlertId.VIDEO_FROZEN, seconds=4.0)
+FAULT = alert(AlertId.YAW_MISMATCH, degrees=8.7)
 
 
 class FakeBridge:
-    def __init__(self, connected, injection_fault=""):
+    def __init__(self, connected, injection_fault=None):
         self._connected = connected
         self.injection_fault = injection_fault
         self.told = []
         self.said = []
 
-    def say(self, severity, text):
-        self.said.append(text)
+    def report_alert(self, alert):
+        self.said.append(alert)
 
     def state(self):
         return SimpleNamespace(connected=self._connected)
 
-    def set_health(self, level, text, *, tell):
-        known = text.startswith(("vision not used", "output held"))  # told by bridge and monitor
+    def set_health(self, level, alerts, *, tell):
+        known = {alert.id for alert in alerts} & {FAULT.id, FROZEN.id}  # told by bridge and monitor
         assert tell is (self._connected and not known)  # as is a silent vehicle
-        self.told.append((level, text))
+        self.told.append((level, *(alert.id for alert in alerts)))
+        self.alerts = alerts
 
     def counters(self):
         return {"fix_latency_ms": float("nan")}
 
     def shadow_score(self):
-        return SimpleNamespace(line=lambda: "no comparison yet")
+        return SimpleNamespace(go=False, line=lambda: "no comparison yet")
 
 
 def _one_report(
-    folder, state, connected, tracking=None, frames_in=0, injection_fault="", **options
+    folder, state, connected, tracking=None, frames_in=0, injection_fault=None, **options
 ):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
     bridge, events = FakeBridge(connected, injection_fault), []
@@ -71,23 +73,23 @@ def no_estimate_is_stale(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("state", "connected", "level", "text"),
+    ("state", "connected", "level", "of"),
     [
-        (StreamState.LIVE, True, HealthLevel.STARTING, "waiting for video"),
-        (StreamState.LIVE, False, HealthLevel.DEGRADED, "no heartbeat"),
-        (StreamState.STALLED, True, HealthLevel.DEGRADED, "stalled"),
-        (StreamState.FAILED, True, HealthLevel.FAILED, "failed"),
-        (StreamState.MISFIT, True, HealthLevel.FAILED, "size does not fit"),
+        (StreamState.LIVE, True, HealthLevel.STARTING, AlertId.WAITING_FOR_VIDEO),
+        (StreamState.LIVE, False, HealthLevel.DEGRADED, AlertId.FC_SILENT),
+        (StreamState.STALLED, True, HealthLevel.DEGRADED, AlertId.VIDEO_STALLED),
+        (StreamState.FAILED, True, HealthLevel.FAILED, AlertId.VIDEO_FAILED),
+        (StreamState.MISFIT, True, HealthLevel.FAILED, AlertId.VIDEO_SIZE),
     ],
 )
-def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
+def test_the_worst_thing_is_told(tmp_path, state, connected, level, of):
     told, events = _one_report(tmp_path, state, connected)
-    assert told[-1][0] is level
-    assert text in told[-1][1]
+    assert told[-1] == (level, of)
     assert events == []  # the bridge logs and records it; once is enough
     written = json.loads((tmp_path / "health.json").read_text())
     assert set(written) == {
-        "level", "text", "time_ns", "pid", "engine", "rate_hz", "stages_ms", "bridge", "shadow",
+        "level", "text", "alerts", "time_ns",
+        "pid", "engine", "rate_hz", "stages_ms", "bridge", "shadow",
         "guardian", "map_shift", "targets",
     }  # fmt: skip
     assert written["bridge"]["fix_latency_ms"] is None  # NaN is no JSON
@@ -98,26 +100,25 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
 def test_what_is_waited_for_is_told(tmp_path):
     """With pictures and no estimate it is the autopilot's position or attitude that is missing."""
     told, _ = _one_report(tmp_path, StreamState.LIVE, True, frames_in=3)
-    assert told[-1] == (HealthLevel.STARTING, "waiting for a pose prior")
+    assert told[-1] == (HealthLevel.STARTING, AlertId.WAITING_FOR_PRIOR)
 
 
 def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
     """Found on ArduPilot: the yaw guard refused every fix, LAND without a position, health ok."""
-    injection_fault = "not sent: vision yaw differs from the autopilot's by +8.7 deg"
     told, _ = _one_report(
         tmp_path,
         StreamState.LIVE,
         True,
         tracking=TrackingState.TRACKING,
-        injection_fault=injection_fault,
+        injection_fault=FAULT,
     )
-    assert told[-1] == (HealthLevel.DEGRADED, f"vision not used: {injection_fault}")
+    assert told[-1] == (HealthLevel.DEGRADED, FAULT.id)
     lost, _ = _one_report(
         tmp_path,
         StreamState.LIVE,
         True,
         tracking=TrackingState.LOST,
-        injection_fault=injection_fault,
+        injection_fault=FAULT,
     )
     assert lost[-1][0] is HealthLevel.FAILED  # the worse news
 
@@ -132,12 +133,12 @@ def test_tracking_that_the_guardian_withholds_is_a_failure(tmp_path):
         tracking=TrackingState.TRACKING,
         integrity_monitor=integrity_monitor,
     )
-    assert told[-1] == (HealthLevel.FAILED, "output held: video frozen 4 s")
+    assert told[-1] == (HealthLevel.FAILED, FROZEN.id)
 
 
 def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):
     told, _ = _one_report(tmp_path, StreamState.SCALED, True, TrackingState.TRACKING)
-    assert told[-1] == (HealthLevel.OK, "localization tracking, video scaled")
+    assert told[-1] == (HealthLevel.OK, AlertId.TRACKING, AlertId.VIDEO_SCALED)
 
 
 def test_a_file_that_cannot_be_written_is_an_event_and_the_bridge_is_still_told(tmp_path):
@@ -175,7 +176,7 @@ def test_a_record_that_fails_is_told_as_long_as_it_does(tmp_path):
     told, _ = _one_report(
         tmp_path, StreamState.LIVE, True, TrackingState.TRACKING, is_recorded=lambda: False
     )
-    assert told[-1] == (HealthLevel.OK, "localization tracking, record incomplete")
+    assert told[-1] == (HealthLevel.OK, AlertId.TRACKING, AlertId.RECORD_INCOMPLETE)
 
 
 def test_a_report_that_fails_is_not_the_last(tmp_path, monkeypatch, caplog):
@@ -200,7 +201,7 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
     lost = SimpleNamespace(
         state=TrackingState.LOST, stage_ms={}, last_fix_ns=time.monotonic_ns() - 23 * 10**9
     )
-    texts = set()
+    seen = set()
     for searching, hangs in ((True, False), (False, False), (True, True)):
         bridge = FakeBridge(True)
         monitor = HealthMonitor(
@@ -211,28 +212,29 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
         monitor.add_estimate(lost)
         monitor.start()
         monitor.stop()
-        level, text = bridge.told[-1]
+        level, *ids = bridge.told[-1]
         assert level is HealthLevel.FAILED
-        assert text.startswith("localization lost 23 s, +-40 m")
-        assert text.endswith("the search hangs") is hangs
-        texts.add(without_figures(text))
-    assert len(texts) == 2  # a search that will not answer is
+        assert bridge.alerts[0] == alert(AlertId.LOST, seconds=pytest.approx(23.0, abs=5.0))
+        assert bridge.alerts[1] == alert(AlertId.EKF_UNCERTAIN, metres=40.0)
+        assert (AlertId.SEARCH_HANGS in ids) is hangs
+        seen.add(tuple(ids))
+    assert len(seen) == 2  # a search that will not answer is
 
 
 @pytest.mark.parametrize(
     ("hangs", "lacks", "tracking", "lost"),
     [
-        (True, "", "tracking, but the search hangs", "localization lost, the search hangs"),
-        (False, "no search", "tracking, but no search", "localization lost, no search"),
+        (True, None, AlertId.SEARCH_HANGS, AlertId.SEARCH_HANGS),
+        (False, AlertId.NO_SEARCH, AlertId.NO_SEARCH, AlertId.NO_SEARCH),
         # At a map's first start, for minutes: no news for who is not lost.
-        (False, "search not ready", "localization tracking", "localization lost, search not ready"),
-        (False, "", "localization tracking", "localization lost"),
+        (False, AlertId.SEARCH_NOT_READY, AlertId.TRACKING, AlertId.SEARCH_NOT_READY),
+        (False, None, AlertId.TRACKING, AlertId.LOST),
     ],
 )
 def test_that_a_loss_cannot_be_searched_is_told_before_it_comes(
     tmp_path, hangs, lacks, tracking, lost
 ):
-    for state, text in ((TrackingState.TRACKING, tracking), (TrackingState.LOST, lost)):
+    for state, of in ((TrackingState.TRACKING, tracking), (TrackingState.LOST, lost)):
         bridge = FakeBridge(True)
         monitor = HealthMonitor(
             partial(EngineHealth, search_hangs=hangs), bridge, lambda: StreamState.LIVE,
@@ -241,7 +243,7 @@ def test_that_a_loss_cannot_be_searched_is_told_before_it_comes(
         monitor.add_estimate(SimpleNamespace(state=state, stage_ms={}, last_fix_ns=None))
         monitor.start()
         monitor.stop()
-        assert bridge.told[-1][1] == text
+        assert bridge.told[-1][-1] is of
 
 
 def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
@@ -258,7 +260,7 @@ def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
     report = json.loads((tmp_path / "health.json").read_text())
     assert report["level"] == "ended"
     assert report["text"] == "stopped; localization tracking, map unreadable until then"
-    assert bridge.said == ["PiLoT: ending, nothing is injected any more"]
+    assert bridge.said == [alert(AlertId.ENDING)]
 
 
 def test_a_camera_that_ended_before_does_not_speak_for_the_flight(tmp_path, monkeypatch):
@@ -280,13 +282,13 @@ def test_a_camera_that_ended_before_does_not_speak_for_the_flight(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("seconds", "level", "text"),
+    ("seconds", "level", "of"),
     [
-        (1, HealthLevel.OK, "localization tracking"),
-        (23, HealthLevel.DEGRADED, "bridging 23 s, 4 m"),
+        (1, HealthLevel.OK, AlertId.TRACKING),
+        (23, HealthLevel.DEGRADED, AlertId.BRIDGING),
     ],
 )
-def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, text):
+def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, of):
     bridged = SimpleNamespace(
         state=TrackingState.BRIDGING, stage_ms={}, exposure_time_ns=100 * 10**9,
         last_fix_ns=(100 - seconds) * 10**9, covariance=np.eye(6) * 4.0,
@@ -302,7 +304,7 @@ def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, text):
     monitor.add_estimate(bridged)
     monitor.start()
     monitor.stop()
-    assert bridge.told[0] == (level, text)
+    assert bridge.told[0] == (level, of)
 
 
 def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
@@ -329,12 +331,12 @@ def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
 
     told: list[Any] = []
     fly(10, 5)
-    assert {text for _, text in told} == {"localization tracking"}
+    assert {status.alerts[0].id for status in told} == {AlertId.TRACKING}
     told.clear()
     fly(8, 1)
-    assert told[-1] == (HealthLevel.DEGRADED, "overloaded, 1 of 10 frames/s")
+    assert told[-1].alerts[0].id is AlertId.OVERLOADED
     fly(8, 5)
-    assert told[-1] == (HealthLevel.OK, "localization tracking")
+    assert told[-1].alerts == (alert(AlertId.TRACKING),)
 
 
 def test_its_first_turn_is_its_start_not_its_making():

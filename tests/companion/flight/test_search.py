@@ -11,6 +11,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.types import Relocalization, SearchRegion
 from localizer.types import Frame
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import PlaceHint
 
 
@@ -192,10 +193,10 @@ def test_a_search_that_is_not_ready_or_cannot_be_says_so(cache, monkeypatch):
     monkeypatch.setattr("companion.flight.search.open_relocalizer", fail)
     events = []
     search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *e: events.append(e))
-    assert search.lacks == "search not ready"
+    assert search.lacks.value == AlertId.SEARCH_NOT_READY.value
     search.start()
     search.stop()
-    assert search.lacks == "no search"
+    assert search.lacks.value == AlertId.NO_SEARCH.value
     assert events == [("warning", "no search for a lost place: too large a map")]
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import json
 import os
 import socket
 import stat
@@ -24,6 +25,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import Frame, PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.alerts.catalogue import alert, body
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
 
@@ -34,7 +38,8 @@ FRAME = LocalFrame(Geodetic(47.0, 8.0, 400.0))
 def _shown():
     instruments = Instruments(
         lambda: {"level": "ok", "text": "", "rate_hz": float("nan")}, VehicleState,
-        lambda: ShadowScore(False, 0, ("none",)), lambda: None, lambda: False,
+        lambda: ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),)),
+        lambda: LoopVerdict(False, alert(AlertId.EKF_NO_SOURCE), None), lambda: False,
     )  # fmt: skip
     return Shown(FRAME, 48.0, instruments, {"mode": "shadow"})
 
@@ -46,7 +51,7 @@ class Ship:
         self.said: list[Any] = []
         self.tracked: list[Any] = []
         self.hints: list[Any] = []
-        self.helm = Helm(lambda _, text: self.said.append(text), self.tracked.append,
+        self.helm = Helm(self.said.append, self.tracked.append,
                          lambda *hint: self.hints.append(hint))  # fmt: skip
 
 
@@ -241,7 +246,7 @@ def test_garbage_ends_that_console_alone(serving, garbage):
     answer = good.next("answer").head
     assert (answer["number"], answer["ok"]) == (7, True)
     assert ship.hints == [(47.0, 8.0, 50.0)]
-    assert ship.said == ["PiLoT: console: hint 47.00000 8.00000 +-50 m"]
+    assert ship.said == [alert(AlertId.CONSOLE_HINT, latitude=47.0, longitude=8.0, metres=50.0)]
 
 
 def test_who_cannot_be_let_in_does_not_make_the_link_spin(serving, monkeypatch):
@@ -351,19 +356,17 @@ def test_a_click_bears_the_time_of_its_picture(away_s):
 @pytest.mark.parametrize(
     ("order", "told"),
     [
-        ({"do": "stop"}, "PiLoT: console: targets ended"),
-        ({"do": "target", "x": 0.5, "y": 0.25}, "PiLoT: console: target at 0.50 0.25"),
+        ({"do": "stop"}, alert(AlertId.CONSOLE_STOP)),
+        ({"do": "target", "x": 0.5, "y": 0.25}, alert(AlertId.CONSOLE_TARGET, x=0.5, y=0.25)),
         ({"do": "hint", "latitude_deg": 47.5, "longitude_deg": 8.25, "radius_m": 50},
-         "PiLoT: console: hint 47.50000 8.25000 +-50 m"),
+         alert(AlertId.CONSOLE_HINT, latitude=47.5, longitude=8.25, metres=50.0)),
     ],
 )  # fmt: skip
 def test_every_order_is_told_to_the_operator(order, told):
-    """Helm.say is STATUSTEXT and the record's event; 50 characters fit one message."""
     ship = Ship()
     Orders(True, ship.helm).take(order)
     assert ship.said == [told]
     assert {t.asked_by for t in ship.tracked} <= {"console"}  # so is the target called
-    assert len(told) <= 50
 
 
 def test_without_control_and_beyond_the_rate_nothing_is_done():
@@ -380,3 +383,9 @@ def test_without_control_and_beyond_the_rate_nothing_is_done():
     orders.take({"do": "stop"})
     assert len(ship.tracked) == 11
     assert issubclass(OrderError, CompanionError)
+
+
+def test_alerts_reach_the_console_as_ids_and_their_text():
+    document = json.loads(json.dumps(_shown().state(0)[0]))
+    assert document["follows"]["reason"] == body(alert(AlertId.EKF_NO_SOURCE))
+    assert document["shadow"]["reasons"][0]["id"] == AlertId.SHADOW_NOT_COMPARED.value

@@ -73,11 +73,11 @@ def test_a_flight_over_its_own_map_is_a_go(small_assets, flight):
     assert figures["accepted"] >= 0.95 * figures["frames"] > 60
     assert figures["passed"] == figures["judged"] >= 60
     assert figures["score"]["median_m"] < 0.5
-    assert "shadow verdict: go" in result.output
+    assert "shadow verdict: ready" in result.output
 
 
 def test_a_map_that_lies_20_m_off_is_no_go(small_assets, flight):
     result, figures = _check(flight, small_assets.map_cache, north_m=20.0)
     assert result.exit_code == 1, result.output
     assert figures["score"]["bias_ne_m"] == pytest.approx([-20.0, 0.0], abs=0.5)
-    assert "shadow verdict: no-go: median error " in result.output
+    assert "shadow verdict: not ready: median error " in result.output

@@ -19,6 +19,7 @@ from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=timezone.utc)
 GOOD = DoctorFinding("EK3_SRC2_POSXY", "6", "6", "", True, True)
+SHADOW = {"ready": True, "text": "ready: 0.4 m for 120 s"}
 WRONG = DoctorFinding("VISO_TYPE", "0 <b>", "1", "no vision", False, True)
 
 
@@ -50,12 +51,12 @@ def test_each_line_is_of_its_source(deployment, tmp_path):
     plan.write_text(json.dumps(told | {"map_sha256": map_hash(config.map)}))
     record = config.record.folder.with_name("day-2")
     record.mkdir(parents=True)
-    (record / "health.json").write_text(json.dumps({"shadow": "go: 0.4 m for 120 s"}))
+    (record / "health.json").write_text(json.dumps({"shadow": SHADOW}))
     now = datetime.now(timezone.utc)
     found = rows(make_sheet(path, config, Diagnosis((GOOD, WRONG)), plan, now))
     assert found["parameters and parts"] == ("1 of 2 checks good; wrong: VISO_TYPE", False)
     assert found["forecast"][0] == "a.plan: vision will not do on 1 of 2 legs (dusk): 2-3"
-    assert found["shadow score"] == ("go: 0.4 m for 120 s (day-2, today)", True)
+    assert found["shadow score"] == ("ready: 0.4 m for 120 s (day-2, today)", True)
     assert found["map"][1] is False
     assert "2026-11-02" in found["calibration"][0]
 
@@ -78,7 +79,7 @@ def test_a_score_over_another_map_is_marked(deployment):
     path, config = deployment
     record = config.record.folder
     record.mkdir(parents=True)
-    (record / "health.json").write_text(json.dumps({"shadow": "go: 0.4 m for 120 s"}))
+    (record / "health.json").write_text(json.dumps({"shadow": SHADOW}))
     for flown, good in ((str(config.map), True), ("/maps/valley", False)):
         (record / "record.json").write_text(json.dumps({"config": {"map": flown}}))
         sheet = make_sheet(path, config, Diagnosis((GOOD,)), None, datetime.now(timezone.utc))

@@ -29,6 +29,7 @@ from companion.reporting.layout import render
 from companion.reporting.record import read_record, record_report, worst_frames
 from companion.reporting.report import report_of, write_page
 from localizer.map.cache.cache import TileCache
+from mavlink_bridge.alerts.ids import AlertId
 
 MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
 START_NS = 1_000_000_000
@@ -68,7 +69,12 @@ def record(small_assets, tmp_path):
     ]
     _rows(folder / "targets.csv", TARGET_COLUMNS, targets)
     events = [
-        {"time_ns": START_NS, "level": "warning", "text": "PiLoT: injection forced, no check"},
+        {
+            "time_ns": START_NS,
+            "level": "warning",
+            "text": "forced",
+            "alert": AlertId.INJECTION_FORCED.value,
+        },
         {"time_ns": START_NS + 2_500_000_000, "level": "warning", "text": "<script>alert(1)"},
     ]
     _rows(folder / "events.csv", EVENT_COLUMNS, events)
@@ -110,14 +116,14 @@ def test_what_came_before_gnss_was_denied_is_no_headline_of_the_denial() -> None
     """It stood in amber above a flight without a fault."""
     time_s = np.arange(-5.0, 5.0)
     estimates = {"state": np.full(10, "tracking"), "time": time_s}
-    early = (ReportEvent(-3.0, "warning", "PiLoT: video feed stalled"),)
+    early = (ReportEvent(-3.0, "warning", "video feed stalled"),)
     told = first_fault(estimates, time_s, early, "", 0.0)
-    assert told == "nothing while GNSS was denied; before, at -3.0 s: PiLoT: video feed stalled"
-    late = (*early, ReportEvent(2.0, "warning", "PiLoT: withheld"))
-    assert first_fault(estimates, time_s, late, "", 0.0) == "at 2.0 s: PiLoT: withheld"
+    assert told == "nothing while GNSS was denied; before, at -3.0 s: video feed stalled"
+    late = (*early, ReportEvent(2.0, "warning", "withheld"))
+    assert first_fault(estimates, time_s, late, "", 0.0) == "at 2.0 s: withheld"
     assert first_fault(estimates, time_s, (), "", 0.0).startswith("nothing: ")
     assert '<p class="first fine">' in render(Report("a flight", "", told))
-    assert '<p class="first">' in render(Report("a flight", "", "at 2.0 s: PiLoT: withheld"))
+    assert '<p class="first">' in render(Report("a flight", "", "at 2.0 s: withheld"))
 
 
 def test_a_latency_has_one_name_and_says_of_when_it_is(record):

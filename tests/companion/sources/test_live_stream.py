@@ -122,7 +122,7 @@ def test_pictures_of_a_second_sender_are_not_mixed_in(url: str) -> None:
         before = len(watch.frames)
         watch.wait_for(before + 3)
     assert max(read_counter(frame.image) for frame, _ in watch.frames) < 500
-    assert watch.strangers == ["stranger's video ignored: 127.0.0.2"]
+    assert watch.strangers == ["127.0.0.2"]
 
 
 def test_a_stream_of_another_shape_is_an_error_that_names_both(url: str) -> None:

@@ -153,7 +153,8 @@ def test_restarts_are_given_it_and_the_first_start_is_not(
             pass
 
     monkeypatch.setattr("companion.supervision.processes.FlightProcess", Dies)
-    monkeypatch.setattr("mavlink_bridge.vehicle.crash_notifier.say_without_bridge", lambda *_: None)
+    notifier = "mavlink_bridge.vehicle.crash_notifier"
+    monkeypatch.setattr(f"{notifier}.report_without_bridge", lambda *_: True)
     before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         done = CliRunner().invoke(app, ["run", str(deployment), "--supervised"])

@@ -19,6 +19,9 @@ import pytest
 from companion.supervision.processes import ENDING, Beat, FlightProcess
 from companion.supervision.service_manager import ServiceManager
 from companion.supervision.supervisor import RestartPolicy, Supervisor, described, mark_dead
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert, body
+from mavlink_bridge.alerts.ids import AlertId
 
 
 @dataclass
@@ -82,7 +85,7 @@ class Stage:
     def __init__(self, flights: Sequence[Scripted], **policy: float) -> None:
         self.waiting = list(flights)
         self.spawned: list[Scripted] = []
-        self.told: list[tuple[int, str]] = []
+        self.told: list[Alert] = []
         self.marked: list[str] = []
         self._now_s = 0.0
         self.refusals = 0
@@ -94,13 +97,13 @@ class Stage:
 
     def made(
         self,
-        tell: Callable[[int, str], None] | None = None,
+        tell: Callable[[Alert], None] | None = None,
         mark: Callable[[int, str], None] | None = None,
     ) -> Supervisor:
         """A supervisor of these processes."""
         return Supervisor(
             self._spawn,
-            tell or (lambda severity, text: self.told.append((severity, text))),
+            tell or self.told.append,
             mark or (lambda _, text: self.marked.append(text)),
             self._policy,
             self.manager,
@@ -140,7 +143,7 @@ def test_a_death_is_told_marked_and_the_standby_flies_on() -> None:
     assert second.released
     assert third.dismissed  # the second's own
     assert not third.released
-    assert stage.told == [(2, "PiLoT: companion died (SIGKILL), restarting")]
+    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")]
     assert stage.marked == ["companion died (SIGKILL), restarting"]
 
 
@@ -181,11 +184,10 @@ def test_quick_deaths_never_end_it_and_cold_starts_wait_longer_and_longer() -> N
     stage = Stage([*(Scripted(2, 1) for _ in range(9)), Scripted(2, 0)], standby_after_s=1e3)
     assert stage.supervisor.run() == 0
     assert len(stage.spawned) == 10
-    waits = ["restarting"] * 4 + [f"again in {s} s" for s in (2, 4, 8, 16, 30)]
-    assert [text.split("), ")[1] for _, text in stage.told] == waits
+    waits = [("died (exit 1)",)] * 4 + [("died (exit 1)", float(s)) for s in (2, 4, 8, 16, 30)]
+    assert [told.values for told in stage.told] == waits
     assert stage.waited_s == 2 + 4 + 8 + 16 + 30
-    assert all(len(text) <= 50 for _, text in stage.told)
-    assert stage.marked == [text.removeprefix("PiLoT: ") for _, text in stage.told]
+    assert stage.marked == [body(told) for told in stage.told]
 
 
 def test_a_standby_takes_over_at_once_however_many_died() -> None:
@@ -193,7 +195,7 @@ def test_a_standby_takes_over_at_once_however_many_died() -> None:
     stage = Stage([*(Scripted(30, -9) for _ in range(8)), Scripted(0, 0)], standby_after_s=2.0)
     stage.waiting += [Scripted(9, 0) for _ in range(3)]
     assert stage.supervisor.run() == 0
-    assert all(text.endswith("restarting") for _, text in stage.told)
+    assert {told.id for told in stage.told} == {AlertId.COMPANION_RESTARTS}
     assert stage.waited_s == 0.0
 
 
@@ -216,7 +218,7 @@ def test_a_computer_without_a_process_to_give_is_asked_again(refusals: int) -> N
     stage = Stage([Scripted(3, -9), Scripted(3, 0)], standby_after_s=60.0)
     stage.refusals = refusals
     assert stage.supervisor.run() == 0
-    assert [text for _, text in stage.told] == ["PiLoT: companion died (SIGKILL), restarting"]
+    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")]
     assert stage.waited_s == sum(min(2**i, 30) for i in range(refusals))
 
 
@@ -274,16 +276,16 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 def test_real_processes_killed_and_released(tmp_path: Path) -> None:
     """kill -9 on the one that flies; the standby takes over and ends in order."""
-    told: list[str] = []
+    told: list[Alert] = []
     command = [sys.executable, "-S", "-c", _CHILD, str(tmp_path)]
     supervisor = Supervisor(
         lambda standby: FlightProcess(command, standby=standby),
-        lambda _, text: told.append(text),
+        told.append,
         lambda *_: None,
         RestartPolicy(standby_after_s=0.0),
     )
     assert supervisor.run() == 0
-    assert told == ["PiLoT: companion died (SIGKILL), restarting"]
+    assert told == [alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")]
 
 
 @pytest.mark.parametrize(
@@ -300,11 +302,12 @@ def test_what_hangs_is_told_ended_and_taken_over(
     flights = [Scripted(20, 0, says=says), Scripted(20, 0), Scripted(9, 0)]
     stage = Stage(flights, standby_after_s=1.0)
     assert stage.supervisor.run() == 0
-    told = [f"companion hangs ({hangs}), restarting"] if hangs else []
+    news = alert(AlertId.COMPANION_RESTARTS, how=f"hangs ({hangs})")
+    told = [news] if hangs else []
     assert stage.spawned[0].killed == bool(hangs)
     assert stage.spawned[1].released == bool(hangs)
-    assert stage.marked == told
-    assert stage.told == [(2, f"PiLoT: {text}") for text in told]
+    assert stage.marked == [body(of) for of in told]
+    assert stage.told == told
 
 
 def test_a_process_that_never_shows_life_is_ended_after_its_patience() -> None:
@@ -315,7 +318,7 @@ def test_a_process_that_never_shows_life_is_ended_after_its_patience() -> None:
     assert stage.told == []
     stage = Stage([Scripted(1000, 0, says=mute), Scripted(9, 0)], cold_s=120.0)
     assert stage.supervisor.run() == 0
-    assert stage.told == [(2, "PiLoT: companion hangs (process), restarting")]
+    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="hangs (process)")]
 
 
 def ends(word: str) -> Callable[[int], Beat | None]:
@@ -340,7 +343,7 @@ def test_an_end_that_is_none_or_comes_to_none_is_not_waited_for(
     stage = Stage([Scripted(40, 0, says=ends(word)), Scripted(3, 0)], standby_after_s=60, **policy)
     assert stage.supervisor.run() == 0
     assert stage.spawned[0].killed
-    assert stage.told == [(2, "PiLoT: companion hangs (process), restarting")]
+    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="hangs (process)")]
 
 
 def test_a_computer_that_slept_hangs_nothing() -> None:
@@ -394,16 +397,16 @@ while True:
 
 @pytest.mark.parametrize(("how", "what"), [("stops", "process"), ("blocks", "localize")])
 def test_real_processes_that_stop_or_block_are_ended(how: str, what: str) -> None:
-    told: list[str] = []
+    told: list[Alert] = []
     command = [sys.executable, "-S", "-c", _HANGING, how]
     supervisor = Supervisor(
         lambda standby: FlightProcess(command, standby=standby),
-        lambda _, text: told.append(text),
+        told.append,
         lambda *_: None,
         RestartPolicy(standby_after_s=0.0, silent_s=0.6),
     )
     assert supervisor.run() == 0
-    assert told == [f"PiLoT: companion hangs ({what}), restarting"]
+    assert told == [alert(AlertId.COMPANION_RESTARTS, how=f"hangs ({what})")]
 
 
 def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:

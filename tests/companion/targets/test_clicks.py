@@ -22,12 +22,12 @@ class Ground:
 
     def __init__(self):
         self.targets: list[Any] = []
-        self.texts: list[Any] = []
+        self.alerts: list[Any] = []
         self.gone: list[Any] = []
         config = TargetConfig(operator_delay_ms=0.0)
         self.numbers = itertools.count(1)
         self.reporter = TargetReporter(config, flat, self.targets.append, on_gone=self.gone.append)
-        self.clicks = ClickPolicy(self.reporter, lambda _, text: self.texts.append(text), config)
+        self.clicks = ClickPolicy(self.reporter, self.alerts.append, config)
         self.reporter.start()
 
     def __enter__(self):

@@ -15,6 +15,9 @@ from companion.targets.detector.names import LocatedBox, ThingNames
 from companion.targets.detector.network import DetectorNetwork
 from companion.targets.detector.worker import BoxDetector
 from localizer.types import Frame
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from tests.companion.targets.scene import CAMERA, MS, cast, estimate, pose_at
 
 SIZE = (128, 96)  # of the network's pictures
@@ -152,7 +155,7 @@ class Flight:
 
     def __init__(self, see):
         self.told: list[Any] = []
-        self.said: list[str] = []
+        self.said: list[Any] = []
         self.looks = 0
         self._taken = threading.Semaphore(0)
 
@@ -163,7 +166,7 @@ class Flight:
 
         config = DetectorConfig(model="x.onnx", rate_hz=30, duty=1.0)
         self.detector = BoxDetector(
-            config, cast, self.told.append, lambda _, text: self.said.append(text),
+            config, cast, self.told.append, self.said.append,
             load=lambda _: Fake(look),
         )  # fmt: skip
         self.detector.start()
@@ -203,17 +206,15 @@ def test_a_network_that_fails_is_counted_and_given_up_and_the_flight_goes_on():
     assert flight.looks == 3
     assert not flight.detector.is_working
     assert flight.detector.failed == 4
-    assert flight.said == ["PiLoT: the detector is off, see the log"]
+    assert flight.said == [alert(AlertId.DETECTOR_OFF)]
 
 
 def test_a_model_that_is_not_there_is_told_in_flight():
-    said = []
-    detector = BoxDetector(
-        DetectorConfig(model="none.onnx"), cast, pytest.fail, lambda _, text: said.append(text)
-    )
+    said: list[Alert] = []
+    detector = BoxDetector(DetectorConfig(model="none.onnx"), cast, pytest.fail, said.append)
     detector.start()
     detector.stop()
-    assert said == ["PiLoT: the detector is off, see the log"]
+    assert said == [alert(AlertId.DETECTOR_OFF)]
     assert detector.failed == 1
 
 

@@ -10,6 +10,8 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.targets.follow import FollowedPosition
 from localizer.targets.track import TargetTrack, projected
 from localizer.types import Visibility
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from tests.companion.targets import scene
 from tests.companion.targets.scene import MS
 from tests.companion.targets.test_operator import Operator
@@ -199,7 +201,7 @@ def test_a_car_that_leaves_unseen_is_not_held_at_its_place_without_a_word():
     watcher.fly(22)
     click(watcher, lambda t: (*driving(t)[0], 0.0))
     watcher.fly(30)
-    assert watcher.texts[-1] == "PiLoT: target 1 lost: it left its place"
+    assert watcher.alerts[-1] == alert(AlertId.TARGET_LEFT, number=1)
     assert watcher.gone == ["ground station 1"]
 
 
@@ -211,7 +213,7 @@ def test_a_place_that_stands_has_not_left(place):
     click(watcher, lambda _: place)
     watcher.fly(45)
     assert watcher.gone == []
-    assert not [text for text in watcher.texts if "lost" in text or "changed" in text]
+    assert [of.id for of in watcher.alerts] == [AlertId.TARGET_FOUND]
 
 
 def test_a_car_that_does_not_come_back_is_lost_with_a_word():
@@ -222,7 +224,7 @@ def test_a_car_that_does_not_come_back_is_lost_with_a_word():
     watcher.fly(8)
     click(watcher, lambda t: (*driving(t)[0], 0.0))
     watcher.fly(100)
-    assert watcher.texts[-1] == "PiLoT: target 1 lost"
+    assert watcher.alerts[-1] == alert(AlertId.TARGET_LOST, number=1)
     assert watcher.gone == ["ground station 1"]
 
 
@@ -369,8 +371,8 @@ def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeyp
     monkeypatch.setattr(TargetTrack, "see", refuses)
     flown = _flown(_Drives, monkeypatch, 75, (0.9, 0.95))
     is_lost = refused_s > 4.0
-    lost = ["PiLoT: target 1 lost: no map at its place"]
-    assert [text for text in flown.texts if "lost" in text] == (lost if is_lost else [])
+    lost = alert(AlertId.TARGET_NOT_LOCATED, number=1, why="no map at its place")
+    assert flown.alerts.count(lost) == is_lost
     assert bool(flown.gone) == is_lost
 
 

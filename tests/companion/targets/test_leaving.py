@@ -3,6 +3,8 @@
 import numpy as np
 
 from localizer.types import Visibility
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from tests.companion.targets.test_following import Crossing, Watcher, click, watching
 
 AWAY = ((500.0, 500.0), 0.0)
@@ -25,8 +27,8 @@ def _told(until_s, gone_s=np.inf, back_s=np.inf):
 def test_a_parked_car_that_is_gone_may_have_left_until_its_place_looks_as_it_did():
     """Of a grey car beside a zebra crossing a template shows the crossing, which stays."""
     watcher, told = _told(8.2, gone_s=2.4, back_s=7.6)
-    assert watcher.texts[1:] == [
-        "PiLoT: target 1 may have left: look changed", "PiLoT: target 1 is at its place again",
+    assert watcher.alerts[1:] == [
+        alert(AlertId.TARGET_MAY_HAVE_LEFT, number=1), alert(AlertId.TARGET_BACK, number=1),
     ]  # fmt: skip
     before = [f for f, s in told if s < 2.4]
     gone = [f for f, s in told if 7.4 < s < 7.6]
@@ -41,5 +43,5 @@ def test_a_parked_car_that_is_gone_may_have_left_until_its_place_looks_as_it_did
 
 def test_a_car_that_stays_parked_has_not_left():
     watcher, told = _told(4.0)
-    assert len(watcher.texts) == 1
+    assert len(watcher.alerts) == 1
     assert all(f.visibility is not Visibility.HIDDEN for f, _ in told)

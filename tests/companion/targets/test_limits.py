@@ -22,6 +22,8 @@ from localizer.types import (
     TargetSurface,
     TrackingState,
 )
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.ids import AlertId
 
 CAMERA = Camera.from_fov(640, 480, 60)
 SIGMA = np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) ** 2
@@ -105,10 +107,10 @@ def test_a_hole_in_the_first_frames_is_never_told_and_delays_the_right_place_lit
 
 @pytest.mark.parametrize("holed", [range(20, 60), range(20, 21), range(0)])
 def test_a_moving_target_that_is_refused_for_seconds_is_named_once(holed):
-    texts = []
-    errors(set(holed), (8.0, 3.0), lambda _, text: texts.append(text))
-    assert len(texts) == (1 if len(holed) > 20 else 0)
-    assert all(text.startswith("PiLoT: car not told: ") for text in texts)
+    alerts: list[Alert] = []
+    errors(set(holed), (8.0, 3.0), alerts.append)
+    assert len(alerts) == (1 if len(holed) > 20 else 0)
+    assert all(of.id is AlertId.TARGET_SILENT and of.values[0] == "car" for of in alerts)
 
 
 class Holed(Ground):
@@ -127,13 +129,11 @@ class Holed(Ground):
 
 
 def clicked(cast, place):
-    """(fixes, texts) of a click at a place (3,)."""
-    told, texts, estimate = list[TargetEstimate](), list[str](), estimate_at(0)
-    population = TargetManager(
-        TargetConfig(), cast, told.append, lambda _: None, lambda _, text: texts.append(text)
-    )
+    """(fixes, alerts) of a click at a place (3,)."""
+    told, alerts, estimate = list[TargetEstimate](), list[Alert](), estimate_at(0)
+    population = TargetManager(TargetConfig(), cast, told.append, lambda _: None, alerts.append)
     population.begin(Click(1, estimate, projected(estimate, np.array(place))))
-    return told, texts
+    return told, alerts
 
 
 @pytest.mark.parametrize(
@@ -148,9 +148,10 @@ def clicked(cast, place):
 )
 def test_a_click_into_a_hole_of_the_map_or_beside_it_is_refused_with_a_word(floor_m, aside_m, why):
     hole = Holed((20.0, 60.0), 6.0, floor_m)
-    told, texts = clicked(hole.cast, (20.0 + aside_m, 60.0, 0.0))
+    told, (refused,) = clicked(hole.cast, (20.0 + aside_m, 60.0, 0.0))
     assert not told
-    assert texts[0].startswith(f"PiLoT: target 1 refused: {why}")
+    assert refused.id is AlertId.TARGET_REFUSED
+    assert str(refused.values[1]).startswith(why)
     assert clicked(hole.cast, (32.0, 60.0, 0.0))[0]  # and farther on it is told
 
 
@@ -174,7 +175,7 @@ def test_another_object_under_the_same_name_is_told_once_it_was_seen_for_as_long
         if last.objection(_fix([300, 0, 0], k * SECOND // 10), moves=False)
     ]
     assert refused == list(range(100, 130))
-    assert "300 m from where it was" in last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False)
+    assert last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False) == "moved 300 m"
 
 
 def test_what_is_in_the_air_or_beyond_the_map_is_on_no_map():

@@ -11,6 +11,8 @@ from companion.targets.detections import Detection, clicked_name
 from companion.targets.target_manager import TargetManager
 from localizer.targets.track import projected
 from localizer.types import TrackingState, Visibility
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import TrackRequest
 from tests.companion.targets.scene import CAMERA, MS, cast, estimate, pose_at
 
@@ -26,12 +28,12 @@ class Operator:
         )
         self.told: list[Any] = []
         self.gone: list[Any] = []
-        self.texts: list[Any] = []
+        self.alerts: list[Any] = []
         self.population = TargetManager(
-            self.config, cast, self.told.append, self._end, lambda _, text: self.texts.append(text)
+            self.config, cast, self.told.append, self._end, self.alerts.append
         )
         self.begin = self.population.begin
-        self.clicks = ClickPolicy(self, lambda _, text: self.texts.append(text), self.config)
+        self.clicks = ClickPolicy(self, self.alerts.append, self.config)
         self._flown = flown
         self.time_ms = self.count = 0
 
@@ -147,7 +149,7 @@ def test_a_click_waits_for_its_frame_and_is_refused_when_none_comes():
         lost = estimate(pose_at(0.0), operator.time_ms * MS, TrackingState.LOST, accepted=False)
         operator.clicks.add_estimate(lost)
         operator.time_ms += FRAME_MS
-    assert operator.texts[-1] == "PiLoT: no target: the camera's position is not known"
+    assert operator.alerts[-1] == alert(AlertId.NO_TARGET, why="position not known")
 
 
 def test_an_impatient_operator_is_told_once_and_a_place_seen_too_long_ago_is_none():
@@ -156,7 +158,7 @@ def test_an_impatient_operator_is_told_once_and_a_place_seen_too_long_ago_is_non
     operator.now_ms += 3000  # nothing came since
     for _ in range(5):
         operator.clicks_at(0.5, 0.5)
-    assert operator.texts == ["PiLoT: no target: the camera's position is not known"]
+    assert operator.alerts == [alert(AlertId.NO_TARGET, why="position not known")]
     assert not operator.told
 
 
@@ -167,7 +169,7 @@ def test_no_click_is_placed_by_a_pose_that_nothing_confirms(state):
     operator.fly(10)
     operator.fly(1, state)
     operator.clicks_at(0.5, 0.5, after_ms=220)
-    assert operator.texts == ["PiLoT: no target: the camera's position is not confirmed yet"]
+    assert operator.alerts == [alert(AlertId.NO_TARGET, why="position not confirmed yet")]
     operator.fly(10)
     operator.clicks_at(0.5, 0.5)
     assert len(operator.told) == 1
@@ -180,7 +182,7 @@ def test_a_ninth_target_ends_the_first_with_a_word():
         operator.clicks_at(0.1 + 0.08 * k, 0.5)
         operator.fly(2)
     assert operator.gone == [clicked_name(1)]
-    assert "PiLoT: target 1 ended: more than 8" in operator.texts
+    assert alert(AlertId.TARGET_REPLACED, number=1) in operator.alerts
     told = len(operator.told)
     operator.fly(3)
     assert len({t.fix.target_id for t in operator.told[told:]}) == 8
@@ -194,7 +196,7 @@ def test_a_click_without_map_is_refused_with_a_word_and_leaves_room():
     operator = Operator(flown=lambda _: level)
     operator.fly(10)
     number, _ = operator.clicks_at(0.5, 0.95)  # the sky: it hangs upside down
-    assert operator.texts == [f"PiLoT: target {number} refused: no map under it"]
+    assert operator.alerts == [alert(AlertId.TARGET_REFUSED, number=number, why="no map under it")]
     assert operator.gone == [clicked_name(number)]
     assert not operator.told
 
@@ -216,7 +218,7 @@ def test_a_target_is_held_by_geometry_hidden_by_a_roof_and_ends_when_it_is_long_
     for target in operator.told:
         np.testing.assert_allclose(target.fix.position_world, place, atol=0.3)
     assert operator.gone == [clicked_name(1)]
-    assert operator.texts[-1] == "PiLoT: target 1 ended: out of the picture"
+    assert operator.alerts[-1] == alert(AlertId.TARGET_OUT_OF_VIEW, number=1)
 
 
 def test_stop_ends_clicked_targets_and_no_detected_one():

@@ -12,6 +12,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
 
 CAMERA = Camera.from_fov(640, 480, 60)
@@ -156,10 +159,11 @@ def test_a_click_that_no_map_answers_is_refused_and_not_left_alive():
     def unreadable(_origin, _directions):
         raise MapCacheError("tile 7: cannot be read")
 
-    said, gone, ended = [], [], threading.Event()
+    said: list[Alert] = []
+    gone, ended = [], threading.Event()
     reporter = TargetReporter(
         TargetConfig(), unreadable, lambda _: None, lambda name: (gone.append(name), ended.set()),
-        lambda *text: said.append(text),
+        said.append,
     )  # fmt: skip
     reporter.start()
     try:
@@ -168,5 +172,5 @@ def test_a_click_that_no_map_answers_is_refused_and_not_left_alive():
     finally:
         reporter.stop()
     assert gone == ["ground station 3"]
-    assert said == [(4, "PiLoT: target 3 refused: map unreadable?")]
+    assert said == [alert(AlertId.TARGET_UNREADABLE, number=3)]
     assert reporter.failed == 1

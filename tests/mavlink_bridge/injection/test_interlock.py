@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
@@ -28,8 +29,14 @@ def orders(flight: Flight) -> list[float]:
     return [m.param1 for m in sent]
 
 
-def told(flight: Flight, *words: str) -> list[str]:
-    return [t.removeprefix("PiLoT: ") for t in flight.texts if any(w in t for w in words)]
+SHADOW = (AlertId.INJECTION_FORCED, AlertId.INJECTION_NOT_READY, AlertId.INJECTION_UNCHECKED)
+SOURCES = (AlertId.SOURCE_SET_UNKNOWN, AlertId.SOURCE_SET_SELECTED)
+OFF = alert(AlertId.SHADOW_MEDIAN, metres=20.0)
+RATE = alert(AlertId.SHADOW_RATE, hertz=3.0, needed=4.0)
+
+
+def told(flight: Flight, *wanted: AlertId) -> list[AlertId]:
+    return [a.id for a in flight.told(*wanted)]
 
 
 def on_gnss(monkeypatch: pytest.MonkeyPatch, **options: Any) -> Flight:
@@ -48,16 +55,17 @@ def test_a_map_20_m_off_is_neither_injected_nor_switched_to(
     flight.run(45.0)
     assert flight.vision() == []
     assert orders(flight) == []
-    refused = told(flight, "no switch")
+    refused = flight.told(AlertId.SOURCE_SET_HELD)
     assert 4 <= len(refused) <= 5  # again every 10 s
-    assert set(refused) == {"no switch: GNSS 20 m from vision, EKF with GNSS"}
-    assert told(flight, "not sent: no go") == ["not sent: no go: median error 20.0 m"]
+    assert {a.values[::2] for a in refused} == {("GNSS off vision", "EKF with GNSS")}
+    assert told(flight, OFF.id) == [OFF.id]
     # Nor once GNSS is lost, however long ago: what was wrong stays wrong.
     flight.gnss_north_m = None
     flight.run(150.0)
     assert flight.vision() == []
     assert orders(flight) == []
-    assert told(flight, "GNSS lost")[0] == "GNSS lost, nothing is injected"
+    lost = flight.told(AlertId.GNSS_LOST)
+    assert lost == [alert(AlertId.GNSS_LOST, output="nothing is injected")]
 
 
 def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
@@ -78,9 +86,7 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
     again.end.recall()
     again.run(30.0)
     assert again.vision() == []
-    assert told(again, "no go") == [
-        "no go, as before the restart", "not sent: no go: median error 20.0 m",
-    ]  # fmt: skip
+    assert set(told(again, AlertId.SHADOW_RESTORED, OFF.id)) == {AlertId.SHADOW_RESTORED}
     # It is mended: GNSS comes back and agrees.
     again.gnss_north_m = again.north_m = 0.0
     again.run(150.0)
@@ -108,33 +114,33 @@ def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(
     again.end.recall()
     again.run(10.0)
     assert again.vision()
-    assert told(again, "no go") == []
+    assert told(again, AlertId.SHADOW_RESTORED, OFF.id) == []
     for flight in (killed, again):
         flight.end.end()
 
 
-@pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, ["20 m off"])])
+@pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, [True])])
 def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
-    begins: bool, kept: list[str]
+    begins: bool, kept: list[bool]
 ) -> None:
     """A receiver that is led astray while vision is flown on speaks against it, too: without the
     restart it is flown on.
     """
-    told: list[str] = []
+    told: list[bool] = []
     file: Any = SimpleNamespace(
-        keep=lambda what: told.append(what["against"]), drop=lambda: told.append(""),
+        keep=lambda what: told.append(what["against"]), drop=lambda: told.append(False),
         recall=lambda: None,
     )  # fmt: skip
-    scores = [ShadowScore(begins, 100, () if begins else ("3.0 Hz, needs 4",))]
+    scores = [ShadowScore(begins, 100, () if begins else (RATE,))]
     interlock = ShadowInterlock(
         False,
         lambda _: scores[-1],
         lambda: SECOND,
-        StatusNotifier(lambda *_: None),
+        StatusNotifier(lambda _: None),
         ShadowFailureMemory(file),
     )
     interlock.recall()
-    for second, against in ((1, ()), (2, ("20 m off",)), (4, ("20 m off",))):
+    for second, against in ((1, ()), (2, (OFF,)), (4, (OFF,))):
         if against:
             scores.append(ShadowScore(False, 100, against, against=against))
         state = VehicleState(connected=True, gps_fix_type=3, gps_time_ns=second * SECOND)
@@ -155,14 +161,11 @@ def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
     flight.run(6.0)
     assert orders(flight)
     assert set(orders(flight)) == {2.0}
-    assert told(flight, "injecting", "GNSS", "go", "EKF source") == [
-        "injecting",
-        "GNSS lost, injecting",
-        "EKF source set 2: GNSS lost",
-    ]
+    news = (AlertId.INJECTING, AlertId.GNSS_LOST, AlertId.SOURCE_SET_SELECTED, *SHADOW)
+    assert told(flight, *news) == list(news[:3])
     flight.gnss_north_m = 0.0
     flight.run(8.0)
-    assert told(flight, "GNSS is back") == ["GNSS is back"]
+    assert told(flight, AlertId.GNSS_BACK) == [AlertId.GNSS_BACK]
 
 
 def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
@@ -176,16 +179,16 @@ def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
     flight.link.full = True
     flight.run(3.0)
     assert not flight.end.sender.is_good(flight.now_ns)
-    assert told(flight, "not sent") == ["not sent: the link takes no more"]
-    assert flight.end.injection_fault == "not sent: the link takes no more"
+    assert told(flight, AlertId.LINK_FULL) == [AlertId.LINK_FULL]
+    assert flight.end.injection_fault == alert(AlertId.LINK_FULL)
     assert not flight.end.sender.reaches_ekf(flight.now_ns)
     flight.gnss_north_m = None
     flight.run(6.0)
-    assert told(flight, "source set") == []
+    assert told(flight, *SOURCES) == []
     flight.link.full = False
     flight.run(4.0)
-    assert told(flight, "source set") == ["EKF source set 2: GNSS lost"]
-    assert flight.end.injection_fault == ""
+    assert told(flight, *SOURCES) == [AlertId.SOURCE_SET_SELECTED]
+    assert flight.end.injection_fault is None
 
 
 def test_a_port_that_is_full_for_half_a_second_is_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +200,7 @@ def test_a_port_that_is_full_for_half_a_second_is_no_news(monkeypatch: pytest.Mo
         assert flight.end.sender.is_good(flight.now_ns)
         flight.link.full = False
         flight.run(2.0)
-    assert told(flight, "not sent") == []
+    assert told(flight, AlertId.LINK_FULL) == []
 
 
 def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +209,7 @@ def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.Mon
     flight.gnss_north_m = 40.0  # the EKF, inertial, stays
     flight.run(4.0)
     assert set(orders(flight)) == {2.0}
-    assert told(flight, "source set", "no switch") == ["EKF source set 2: GNSS 40 m from vision"]
+    assert told(flight, *SOURCES, AlertId.SOURCE_SET_HELD) == [AlertId.SOURCE_SET_SELECTED]
 
 
 def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
@@ -217,7 +220,7 @@ def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
     begun_ns = flight.now_ns
     flight.run(15.0)
     assert flight.vision()[0][0] - begun_ns < 5 * SECOND  # a restart under denial
-    assert told(flight, "shadow") == ["injecting without shadow check"]
+    assert told(flight, *SHADOW) == [AlertId.INJECTION_UNCHECKED]
 
 
 def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(
@@ -233,7 +236,7 @@ def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(
     flight.gnss_north_m = 0.0
     flight.run(1.0)
     assert flight.vision() == []
-    assert told(flight, "shadow") == []
+    assert told(flight, *SHADOW) == []
 
 
 def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(
@@ -245,11 +248,11 @@ def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(
         for flight.sees, seconds in ((True, 0.1), (False, 0.3)):
             flight.run(seconds)
     assert flight.vision() == []
-    assert told(flight, "not sent: no go")
+    assert told(flight, AlertId.SHADOW_RATE, AlertId.SHADOW_FEW_FIXES)
     flight.sees, flight.gnss_north_m = True, None
     flight.run(6.0)
     assert len(flight.vision()) > 20
-    assert told(flight, "shadow") == ["injecting without shadow check"]
+    assert told(flight, *SHADOW) == [AlertId.INJECTION_UNCHECKED]
 
 
 def chosen(flight: Flight, source_set: int) -> None:
@@ -274,11 +277,9 @@ def test_an_ekf_that_flies_on_vision_since_before_the_start_is_no_word_for_visio
     flight.north_m = flight.ekf_north_m = 20.0  # it follows the wrong map
     flight.run(20.0)
     assert flight.vision() == []
-    assert told(flight, "source set") == [
-        "EKF source set is not known: met in flight",
-        "EKF source set 1: vision gone, GNSS is there",  # injection has not begun
-    ]
-    assert told(flight, "not sent: no go") == ["not sent: no go: median error 20.0 m"]
+    assert told(flight, *SOURCES) == list(SOURCES)  # injection has not begun
+    assert flight.told(*SOURCES)[1].values[0] == 1
+    assert told(flight, OFF.id) == [OFF.id]
 
 
 def test_a_start_in_the_air_on_gnss_is_compared_with_the_receiver_and_switches(
@@ -345,7 +346,9 @@ def test_what_the_pilot_chooses_is_followed_and_not_undone(
     begun = len(orders(flight))
     flight.run(8.0)
     assert len(orders(flight)) == begun
-    assert told(flight, "no switch") == ["no switch: GNSS lost, set 1 was chosen"]
+    assert [a.values for a in flight.told(AlertId.SOURCE_SET_HELD)] == [
+        ("GNSS lost", 0.0, "set 1 chosen")
+    ]
     # Once GNSS was well again, the next fault is another one.
     flight.gnss_north_m = 0.0
     flight.run(4.0)
@@ -376,13 +379,14 @@ def test_a_receiver_that_returns_wrong_is_refused_and_told(monkeypatch: pytest.M
     flight.gnss_north_m = 300.0
     flight.run(15.0)
     assert set(orders(flight)) == {2.0}
-    assert len(told(flight, "GNSS refused")) == 2  # again after 10 s
-    assert told(flight, "GNSS refused")[0].endswith(" m off vision")
-    assert told(flight, "GNSS is back") == []
+    refused = flight.told(AlertId.GNSS_REFUSED)
+    assert len(refused) == 2  # again after 10 s
+    assert refused[0].values[1] == "m off vision"
+    assert told(flight, AlertId.GNSS_BACK) == []
     flight.gnss_north_m = 0.0
     flight.run(9.0)
     assert orders(flight)[-1] == 1.0
-    assert told(flight, "GNSS agrees") == ["GNSS agrees with vision"]
+    assert flight.told(AlertId.GNSS_REFUSED)[2:] == [cleared(AlertId.GNSS_REFUSED)]
 
 
 def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -391,7 +395,7 @@ def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     flight.north_m = 20.0
     flight.run(15.0)
     assert len(flight.vision()) > 50
-    assert told(flight, "shadow") == ["injection forced, no shadow check"]
+    assert told(flight, *SHADOW) == [AlertId.INJECTION_FORCED]
 
 
 def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
@@ -402,7 +406,7 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
     flight.end.inhibit(AlertId.FOCAL_LENGTH)
     flight.run(18.0)
     assert flight.vision() == []
-    assert told(flight, "not sent") == ["not sent: focal length"]
+    assert flight.told(AlertId.INHIBITED) == [alert(AlertId.INHIBITED, alert="focal length")]
     flight.gnss_north_m = None
     flight.run(5.0)
     assert flight.vision() == []
@@ -426,7 +430,7 @@ def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.Mon
     assert enable.command(31010, 1.0) == 0
     flight.run(5.0)
     assert flight.vision()
-    assert told(flight, "go from") == ["injecting without a go from shadow"]
+    assert told(flight, *SHADOW) == [AlertId.INJECTION_NOT_READY]
 
 
 def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
@@ -451,7 +455,7 @@ def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
     flight.run(1.0)
     enable.command(31010, 1.0)
     flight.run(1.0)
-    assert told(flight, "go from") == 2 * ["injecting without a go from shadow"]
+    assert told(flight, *SHADOW) == 2 * [AlertId.INJECTION_NOT_READY]
 
 
 def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(
@@ -471,9 +475,9 @@ class Compared:
         self._go, self._compared_ns = False, 0
         self._interlock = ShadowInterlock(
             False,
-            lambda _: ShadowScore(self._go, 100, () if self._go else ("3.0 Hz, needs 4",)),
+            lambda _: ShadowScore(self._go, 100, () if self._go else (RATE,)),
             lambda: self._compared_ns,
-            StatusNotifier(lambda _severity, _text: None),
+            StatusNotifier(lambda _: None),
         )
 
     def may_switch(self, second: int, *, go: bool, gnss: bool = True) -> bool:
@@ -501,7 +505,7 @@ def test_a_go_is_forgotten_after_ten_minutes_without_gnss() -> None:
 
 @pytest.mark.parametrize(
     ("gnss", "text"),
-    [(None, ["armed without GNSS, injecting"]), (0.0, [])],
+    [(None, ["injecting"]), (0.0, [])],
 )
 def test_arming_without_gnss_tells_whether_positions_flow(
     monkeypatch: pytest.MonkeyPatch, gnss: float | None, text: list[str]
@@ -511,7 +515,7 @@ def test_arming_without_gnss_tells_whether_positions_flow(
     flight.run(10.0)
     flight.armed = True
     flight.run(5.0)
-    assert told(flight, "armed") == text
+    assert [a.values[0] for a in flight.told(AlertId.ARMED_WITHOUT_GNSS)] == text
 
 
 def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -530,17 +534,15 @@ def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
     flight.run(5.0)
     flight.sees = True
     flight.run(20.0)
-    texts = [t.removeprefix("PiLoT: ") for t in flight.texts]
-    assert all(len(f"PiLoT: {t}") <= 50 for t in texts), texts
-    assert texts == [
-        "flight controller found",
-        "EKF origin known",
-        "injecting",
-        "the EKF follows",
-        "GNSS lost, injecting",
-        "EKF source set 2: GNSS lost",
-        "not sent: no fresh fix",
-        "injecting",
+    assert [a.id for a in flight.alerts] == [
+        AlertId.FC_FOUND,
+        AlertId.ORIGIN_KNOWN,
+        AlertId.INJECTING,
+        AlertId.EKF_FOLLOWS,
+        AlertId.GNSS_LOST,
+        AlertId.SOURCE_SET_SELECTED,
+        AlertId.NO_FRESH_FIX,
+        AlertId.INJECTING,
     ]
 
 
@@ -550,15 +552,15 @@ def test_an_overloaded_computer_does_not_fill_the_operators_screen(
     """A second and a half of fixes, as long without, for three minutes: 42 texts before."""
     flight = Flight(monkeypatch)
     flight.run(20.0)
-    before = len(flight.texts)
+    before = len(flight.alerts)
     for _ in range(60):
         flight.sees = False
         flight.run(1.6)
         flight.sees = True
         flight.run(1.9)
-    counts = Counter(flight.texts[before:])
+    counts = Counter(a.id for a in flight.alerts[before:])
     assert max(counts.values()) <= 6, counts
     assert sum(counts.values()) <= 12, counts
     flight.run(70.0)
     # And it is told that it is over.
-    assert flight.texts[-1] in ("PiLoT: injecting", "PiLoT: the EKF follows")
+    assert flight.alerts[-1].id in (AlertId.INJECTING, AlertId.EKF_FOLLOWS)

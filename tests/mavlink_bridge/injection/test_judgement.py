@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import SourceSwitchConfig
 from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScorer
-from mavlink_bridge.injection.switching import SourceSwitch, SwitchOrder
+from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.messages import VehicleState
 
 MS = 1_000_000
@@ -75,23 +77,23 @@ def test_good_vision_is_a_go() -> None:
     assert score.median_m == pytest.approx(0.5, abs=0.1)
     assert score.bias_ne_m == pytest.approx((0.5, 0.0), abs=0.1)
     assert score.rate_hz == pytest.approx(10.0)
-    assert score.line().startswith("go: median 0.5 m")
+    assert score.line().startswith("ready: median 0.5 m")
 
 
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"error_m": 4.0, "sigma": 4.0}, "median error 4.0 m"),
-        ({"error_m": 2.9 * 2, "sigma": 0.1}, "errors exceed the claimed covariance"),
-        ({"error_m": 0.1, "seconds": 3.0}, "only 30 fixes"),
-        ({"error_m": 0.1, "hz": 2.0, "seconds": 40.0}, "2.0 Hz"),
+        ({"error_m": 4.0, "sigma": 4.0}, AlertId.SHADOW_MEDIAN),
+        ({"error_m": 2.9 * 2, "sigma": 0.1}, AlertId.SHADOW_COVARIANCE),
+        ({"error_m": 0.1, "seconds": 3.0}, AlertId.SHADOW_FEW_FIXES),
+        ({"error_m": 0.1, "hz": 2.0, "seconds": 40.0}, AlertId.SHADOW_RATE),
     ],
 )
-def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason: str) -> None:
+def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason: AlertId) -> None:
     score = scored(**options)
     assert not score.go
-    assert any(reason in r for r in score.reasons)
-    assert score.line().startswith("no-go: ")
+    assert reason in {r.id for r in score.reasons}
+    assert score.line().startswith("not ready: ")
 
 
 @pytest.mark.parametrize(("altitude", "go"), [(493.0, True), (547.0, False), (406.0, False)])
@@ -106,21 +108,23 @@ def test_a_wrong_geoid_is_seen_in_the_heights(altitude: float, go: bool) -> None
     score = scorer.score(10 * SECOND, None)
     assert score.height_m == pytest.approx(500.0 - altitude)
     assert score.go is go
-    assert any("check geoid" in reason for reason in score.reasons) is not go
+    assert any(r.id is AlertId.SHADOW_HEIGHT for r in score.reasons) is not go
 
 
 def test_nothing_compared_is_a_no_go() -> None:
     score = ShadowScorer(100.0).score(SECOND, None)
     assert not score.go
     assert score.median_m is score.height_m is score.rate_hz is None
-    assert "no fix could be compared" in score.line()
+    assert score.reasons == (alert(AlertId.SHADOW_NOT_COMPARED),)
 
 
 def test_blocked_yaw_is_a_no_go() -> None:
     scorer = ShadowScorer(100.0)
     for i in range(100):
         scorer.compare(position(i * 100 * MS), (*HOME, 500.0))
-    assert scorer.score(10 * SECOND, math.radians(5.0)).reasons == ("yaw differs by +5.0 deg",)
+    assert scorer.score(10 * SECOND, math.radians(5.0)).reasons == (
+        alert(AlertId.SHADOW_YAW, degrees=pytest.approx(5.0)),
+    )
 
 
 # --- closed loop --------------------------------------------------------------------------------
@@ -139,27 +143,28 @@ def looped(
 
 def test_followed_position_is_used() -> None:
     verdict = looped(0.4)
-    assert verdict == LoopVerdict(True, "", pytest.approx(0.4))
+    assert verdict == LoopVerdict(True, None, pytest.approx(0.4))
 
 
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"ekf_north": 30.0}, "30.0 m from what is sent"),
-        ({"ekf_north": None}, "no local position; check VISO_TYPE=1"),
-        ({"ekf_flags": 128 | 1}, "no position source"),
-        ({"ekf_flags": 1024}, "not initialised"),
-        ({"ekf_horizontal_variance": 1.4}, "innovation gate"),
-        ({"hz": 2.0}, "rate 2.0 Hz is below 4.0 Hz"),
-        ({"message": "gps_input", "hz": 4.5}, "below 4.7 Hz"),
-        ({"message": "gps_input", "ekf_flags": 128}, "GPS1_TYPE=14"),
+        ({"ekf_north": 30.0}, AlertId.EKF_OFF_FIXES),
+        ({"ekf_north": None}, AlertId.EKF_NO_POSITION),
+        ({"ekf_flags": 128 | 1}, AlertId.EKF_NO_SOURCE),
+        ({"ekf_flags": 1024}, AlertId.EKF_NOT_INITIALISED),
+        ({"ekf_horizontal_variance": 1.4}, AlertId.EKF_REJECTS_FIXES),
+        ({"hz": 2.0}, AlertId.FIX_RATE_LOW),
+        ({"message": "gps_input", "hz": 4.5}, AlertId.FIX_RATE_LOW),
+        ({"message": "gps_input", "ekf_flags": 128}, AlertId.EKF_NO_SOURCE),
     ],
 )
-def test_reason_in_one_line(options: dict[str, Any], reason: str) -> None:
+def test_reason_in_one_line(options: dict[str, Any], reason: AlertId) -> None:
     verdict = looped(**options)
     assert verdict is not None
     assert not verdict.used
-    assert reason in verdict.reason
+    assert verdict.reason is not None
+    assert verdict.reason.id is reason
 
 
 def test_no_verdict_before_it_has_settled_or_after_sending_ended() -> None:
@@ -228,14 +233,14 @@ def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) 
     [
         ({"gps": False}, "GNSS lost"),
         ({"flags": 32768}, "GNSS glitch"),
-        ({"north": 12.0}, "GNSS 12 m from vision"),
+        ({"north": 12.0}, "GNSS off vision"),
     ],
 )
 def test_bad_gnss_switches_once_to_vision(how: dict[str, Any], reason: str) -> None:
     switch = SourceSwitch(CONFIG)
     assert drive(switch, 5.0) == []
     orders = drive(switch, 6.0, 5.0, **how)
-    assert [order for _, order in orders] == [SwitchOrder(2, reason)]
+    assert [(o.source_set, o.cause) for _, o in orders] == [(2, reason)]
     assert orders[0][0] == pytest.approx(6.5, abs=0.15)
     assert switch.current == 2
 
@@ -288,21 +293,25 @@ def test_healthy_gnss_is_not_left_for_a_wrong_map() -> None:
     """The EKF's inertial navigation is with the receiver: two against one."""
     switch = SourceSwitch(CONFIG)
     assert drive(switch, 20.0, north=20.0, ekf=0.5) == []
-    assert switch.refusal == "GNSS 20 m from vision, EKF with GNSS"
+    assert switch.refusal == alert(
+        AlertId.SOURCE_SET_HELD, cause="GNSS off vision", why="EKF with GNSS",
+        metres=pytest.approx(20.0, abs=0.5),
+    )  # fmt: skip
     assert drive(switch, 5.0, 20.0) == []
-    assert switch.refusal == ""
+    assert switch.refusal is None
 
 
 @pytest.mark.parametrize("how", [{"gps": False}, {"flags": 32768}, {"north": 12.0}])
 def test_no_switch_without_a_go_of_the_shadow_score(how: dict[str, Any]) -> None:
     switch = SourceSwitch(CONFIG)
     assert drive(switch, 10.0, proven=False, **how) == []
-    assert switch.refusal.endswith("no go from shadow")
+    assert switch.refusal is not None
+    assert switch.refusal.values[2] == "not ready"
 
 
 def test_a_receiver_that_claims_to_be_bad_hides_nothing() -> None:
     orders = drive(SourceSwitch(CONFIG), 5.0, north=60.0, claimed=12.0)
-    assert [order.reason for _, order in orders] == ["GNSS 60 m from vision"]
+    assert [order.cause for _, order in orders] == ["GNSS off vision"]
     assert drive(SourceSwitch(CONFIG), 5.0, north=20.0, claimed=12.0) == []
 
 

@@ -15,6 +15,9 @@ from typing import Any
 
 import pytest
 
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
@@ -58,8 +61,8 @@ def killed(path: Path, by: str) -> None:
     child.stdout.close()
 
 
-def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[str]]:
-    told: list[str] = []
+def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[Alert]]:
+    told: list[Alert] = []
     kept = json.loads(path.read_text()) if path.exists() else {}
     memory = RestartMemory(
         path,
@@ -79,7 +82,7 @@ def test_a_killed_process_leaves_the_gate_open(tmp_path: Path, by: str) -> None:
     assert path.stat().st_mode & 0o777 == 0o600
     enable, told = restarted(path)
     assert enable.open
-    assert told == ["injection on (restored, 4 s old)"]
+    assert told == [alert(AlertId.INJECTION_RESTORED, seconds=pytest.approx(4.0, abs=0.6))]
     enable.channels(LOW)
     # The switch was turned off meanwhile; a low channel says nothing against a command.
     assert enable.open is (by == "command")
@@ -131,7 +134,7 @@ def test_an_old_file_and_one_from_the_future_count_for_nothing(
     path.chmod(0o600)
     enable, told = restarted(path, later_s)
     assert not enable.open
-    assert told == ["injection off, shadow (at the start)"]
+    assert told == [alert(AlertId.INJECTION_OFF, by="at the start")]
     enable.stop()
 
 
@@ -151,14 +154,12 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
     memory.stop()
 
 
-@pytest.mark.parametrize(
-    ("flown", "kept"), [("map a", "20 m off"), ("map b", ""), ("", "20 m off")]
-)
-def test_a_no_go_is_of_the_map_that_was_seen(tmp_path: Path, flown: str, kept: str) -> None:
+@pytest.mark.parametrize(("flown", "kept"), [("map a", True), ("map b", False), ("", True)])
+def test_a_no_go_is_of_the_map_that_was_seen(tmp_path: Path, flown: str, kept: bool) -> None:
     """The map was exchanged for the right one, and ten minutes long nothing was injected."""
     path = tmp_path / "no-go.json"
     killed = ShadowFailureMemory(RestartMemory(path, about="map a"))
-    killed.note("20 m off")
+    killed.note(True)
     while not path.exists():
         pass
     left = path.read_text()
@@ -175,7 +176,7 @@ def test_a_no_go_of_an_older_version_is_of_any_map(tmp_path: Path) -> None:
     path.write_text(json.dumps({"against": "20 m off", "utc_s": time.time()}))
     path.chmod(0o600)
     memory = ShadowFailureMemory(RestartMemory(path, about="map a"))
-    assert memory.recall() == "20 m off"
+    assert memory.recall()
     memory.stop()
 
 
@@ -186,7 +187,7 @@ def test_a_no_go_of_nonsense_is_none(tmp_path: Path, against: object) -> None:
     path.write_text(json.dumps({"against": against} | stamps))
     path.chmod(0o600)
     memory = ShadowFailureMemory(RestartMemory(path))
-    assert memory.recall() == ""
+    assert not memory.recall()
     memory.stop()
 
 
@@ -216,20 +217,20 @@ def _left_open(path: Path) -> None:
     path.chmod(0o600)
 
 
-def _bridge(path: Path, connection: str, told: list[str]) -> Bridge:
+def _bridge(path: Path, connection: str, told: list[Alert]) -> Bridge:
     config = BridgeConfig(connection=connection, mode="rc", state_file=path)
-    return Bridge(config, 0.0, on_text=lambda _, text, _alert: told.append(text))
+    return Bridge(config, 0.0, on_alert=told.append)
 
 
 def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(
     tmp_path: Path, autopilot: Any
 ) -> None:
-    path, told = tmp_path / "gate.json", list[str]()
+    path, told = tmp_path / "gate.json", list[Alert]()
     _left_open(path)
     with _bridge(path, f"udpout:127.0.0.1:{autopilot.port}", told):
         # Told once somebody may hear it: after the first word about the flight controller.
-        assert sleep_until(lambda: any("injection on (restored" in text for text in told), 30.0)
-    assert "flight controller" in told[0]
+        assert sleep_until(lambda: any(a.id is AlertId.INJECTION_RESTORED for a in told), 30.0)
+    assert told[0].id in (AlertId.FC_FOUND, AlertId.FC_SILENT)
     assert not path.exists()
 
 

@@ -18,6 +18,8 @@ from typing import Any
 import pytest
 
 from mavlink_bridge import Bridge, BridgeConfig, TargetReport
+from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
 from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
@@ -25,7 +27,8 @@ from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
 
 PROGRAM = shutil.which(os.environ.get("MAVPROXY", "mavproxy.py"))
 HOME = Location(47.397742, 8.545594, 488.0)
-TEXT = "PiLoT: output held: no match"
+ALERT = alert(AlertId.HEIGHT_MISMATCH, metres=9.0)
+TEXT = text(ALERT)
 REAL = [
     pytest.mark.sitl,
     pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
@@ -86,7 +89,7 @@ def _converse(bridge: Bridge, console: Console) -> None:
 
     def told() -> bool:
         bridge.tell_figures({"VPS_SIGNAL": 2.0})
-        bridge.say(4, TEXT)
+        bridge.report_alert(ALERT)
         bridge.report(TargetReport(time.monotonic_ns(), 47.398, 8.546, 535.3, h_accuracy_m=2.0))
         console.ask("status NAMED_VALUE_FLOAT*")
         console.ask("status CAMERA_TRACKING_GEO*")

@@ -17,6 +17,8 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.link.tlog import TlogRecorder, read_tlog
@@ -47,9 +49,8 @@ def test_a_full_disk_is_told_once_and_costs_the_record_only(autopilot: Any) -> N
     with Bridge(config, 0.0) as bridge:
         assert sleep_until(lambda: int(bridge.counters()["tlog_dropped"]) > 20, 30.0)
         assert sleep_until(lambda: bridge.state().connected, 30.0)
-        assert [t for t in bridge.texts() if "tlog" in t] == [
-            "PiLoT: tlog is incomplete: No space left on device"
-        ]
+        incomplete = alert(AlertId.TLOG_INCOMPLETE, why="No space left on device")
+        assert bridge.alerts().count(incomplete) == 1
         assert bridge.counters()["fc_handler_errors"] == 0
 
 

@@ -9,8 +9,12 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.vehicle.crash_notifier import say_without_bridge
+from mavlink_bridge.vehicle.crash_notifier import report_without_bridge
+
+DIED = alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")
 
 
 class Autopilot:
@@ -57,18 +61,18 @@ def port() -> int:
 def test_the_line_goes_out_as_the_vehicle_s_own_companion(port: int) -> None:
     config = BridgeConfig(connection=f"udpin:127.0.0.1:{port}")
     with Autopilot(port) as autopilot:
-        assert say_without_bridge(config, 2, "PiLoT: companion died (SIGKILL), restarting", 5.0)
+        assert report_without_bridge(config, DIED, 5.0)
         while not autopilot.heard:  # it was sent
             pass
     line = autopilot.heard[0]
     assert line.get_type() == "STATUSTEXT"
-    assert line.text == "PiLoT: companion died (SIGKILL), restarting"
+    assert line.text == text(DIED)
     assert (line.severity, line.get_srcSystem(), line.get_srcComponent()) == (2, 7, 191)
 
 
 def test_nobody_there_costs_less_than_a_second_and_no_error(port: int) -> None:
     """The restart waits for it: the patience is bounded whatever is missing."""
     silent = BridgeConfig(connection=f"udpin:127.0.0.1:{port}")
-    assert say_without_bridge(silent, 2, "PiLoT: dead", 5.0)  # said into the dark, as system 1
+    assert report_without_bridge(silent, DIED, 5.0)  # said into the dark, as system 1
     gone = BridgeConfig(connection="serial:/dev/nonexistent:57600")
-    assert not say_without_bridge(gone, 2, "PiLoT: dead", 0.1)
+    assert not report_without_bridge(gone, DIED, 0.1)

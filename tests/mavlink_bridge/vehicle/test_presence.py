@@ -15,6 +15,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
 from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
 from mavlink_bridge.status import OperatorStatus
@@ -184,96 +187,85 @@ def test_loss_is_told_on_the_ground_link_within_seconds(
             assert time.monotonic() - spoke_at > 3.0
             over.set()
             time.sleep(0.5)
-            lines = [text for text in bridge.texts() if "lost" in text]
-            assert lines == ["PiLoT: flight controller lost: no heartbeat for 3 s"]
+            assert [a.id for a in bridge.alerts()].count(AlertId.FC_LOST) == 1
 
 
 def test_each_change_is_told_once() -> None:
-    told: list[str] = []
-    watch = VehicleWatch(lambda _, text: told.append(text))
+    told: list[Alert] = []
+    watch = VehicleWatch(told.append)
     state = VehicleState()
     for connected in (False, True, True, False, False, True, False):
         watch.check(replace(state, connected=connected))
-    assert [text.removeprefix("PiLoT: flight controller ") for text in told] == [
-        "found",
-        "lost: no heartbeat for 3 s",
-        "is back",
-        "lost: no heartbeat for 3 s",
-    ]
+    wanted = [AlertId.FC_FOUND, AlertId.FC_LOST, AlertId.FC_BACK, AlertId.FC_LOST]
+    assert [a.id for a in told] == wanted
 
 
 def test_a_vehicle_that_never_speaks_is_told() -> None:
     """Five seconds after the first tick, however long the application took to get there."""
     now_ns = [10**12]
-    told: list[str] = []
-    watch = VehicleWatch(lambda _, text: told.append(text), clock=lambda: now_ns[0])
+    told: list[Alert] = []
+    watch = VehicleWatch(told.append, clock=lambda: now_ns[0])
     for seconds, connected, texts in ((100, False, 0), (4, False, 0), (2, False, 1), (1, True, 2)):
         now_ns[0] += seconds * 10**9
         watch.check(VehicleState(connected=connected))
         assert len(told) == texts
-    assert told == [
-        "PiLoT: no heartbeat from the flight controller",
-        "PiLoT: flight controller found",
-    ]
+    assert [a.id for a in told] == [AlertId.FC_SILENT, AlertId.FC_FOUND]
 
 
 def test_what_the_operator_reads_is_logged_and_recorded_once(
     autopilot: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    recorded: list[tuple[int, str]] = []
-
-    def record(severity: int, text: str, _alert: object) -> None:
-        recorded.append((severity, text))
-
+    recorded: list[Alert] = []
+    degraded = alert(AlertId.DEGRADED)
+    bridging = [alert(AlertId.BRIDGING, seconds=s, metres=9.0) for s in (3.0, 4.0, 5.0)]
     config = BridgeConfig(connection=f"udpout:127.0.0.1:{autopilot.port}")
-    bridge = Bridge(config, 0.0, on_text=record)
+    bridge = Bridge(config, 0.0, on_alert=recorded.append)
     with caplog.at_level("INFO"):
         for _ in range(3):
-            bridge.set_health(HealthLevel.DEGRADED, "localization degraded")
-        for i in range(3):
-            bridge.set_health(HealthLevel.DEGRADED, f"no map at north {-9590.3 + i:.1f} m")
-        bridge.set_health(HealthLevel.DEGRADED, "no heartbeat", tell=False)
+            bridge.set_health(HealthLevel.DEGRADED, [degraded])
+        for news in bridging:
+            bridge.set_health(HealthLevel.DEGRADED, [news])
+        bridge.set_health(HealthLevel.DEGRADED, [alert(AlertId.FC_SILENT)], tell=False)
     bridge.stop()
     lines = [r.getMessage() for r in caplog.records if "localization" in r.getMessage()]
     assert lines == ["PiLoT: localization degraded"]
-    assert recorded == [
-        (mavlink.MAV_SEVERITY_WARNING, "PiLoT: localization degraded"),
-        (mavlink.MAV_SEVERITY_WARNING, "PiLoT: no map at north -9590.3 m"),
-    ]
+    assert recorded == [degraded, bridging[0]]
 
 
 def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
     """Well and ill by turns for a minute: each bad text once in 10 s, the end once it lasts."""
-    told: list[str] = []
-    status = OperatorStatus(lambda *_: None, lambda _, text, _alert: told.append(text))
+    told: list[Alert] = []
+    status = OperatorStatus(lambda *_: None, told.append)
     second = 10**9
 
-    def report(at_s: int, level: HealthLevel, text: str) -> None:
-        status.set_health(level, text, tell=True, now_ns=at_s * second)
+    tracking = alert(AlertId.TRACKING)
+
+    def report(at_s: int, level: HealthLevel, news: Alert) -> None:
+        status.set_health(level, [news], tell=True, now_ns=at_s * second)
         assert status.level is level  # the heartbeats say what is
 
-    report(0, HealthLevel.OK, "localization tracking")
+    report(0, HealthLevel.OK, tracking)
     for at_s in range(1, 61):
         if at_s % 2:
-            report(at_s, HealthLevel.DEGRADED, f"overloaded, {at_s % 3} of 10 frames/s")
+            overloaded = alert(AlertId.OVERLOADED, done=float(at_s % 3), offered=10.0)
+            report(at_s, HealthLevel.DEGRADED, overloaded)
         else:
-            report(at_s, HealthLevel.OK, "localization tracking")
-    assert told[:2] == [
-        "PiLoT: localization tracking",
-        "PiLoT: overloaded, 1 of 10 frames/s",
-    ]
+            report(at_s, HealthLevel.OK, tracking)
+    assert told[:2] == [tracking, alert(AlertId.OVERLOADED, done=1.0, offered=10.0)]
     assert len(told) == 2  # 60 before
     for at_s in range(61, 66):
-        report(at_s, HealthLevel.OK, "localization tracking")
-    assert told[2:] == ["PiLoT: localization tracking"]
+        report(at_s, HealthLevel.OK, tracking)
+    assert told[2:] == [tracking]
 
 
 def test_a_worse_state_is_told_at_once_and_an_older_one_again_after_a_while() -> None:
-    told: list[str] = []
-    status = OperatorStatus(lambda *_: None, lambda _, text, _alert: told.append(text))
-    degraded, lost = (HealthLevel.DEGRADED, "bridging"), (HealthLevel.FAILED, "lost")
+    told: list[Alert] = []
+    status = OperatorStatus(lambda *_: None, told.append)
+    degraded, lost = (
+        (HealthLevel.DEGRADED, AlertId.DEGRADED),
+        (HealthLevel.FAILED, AlertId.NO_FRAME),
+    )
     steps = [(0, degraded), (1, lost), (2, degraded), (3, lost), (12, degraded), (13, lost)]
-    for at_s, (level, text) in steps:
-        status.set_health(level, text, tell=True, now_ns=at_s * 10**9)
-    names = [text.removeprefix("PiLoT: ") for text in told]
-    assert names == ["bridging", "lost", "bridging", "lost"]  # at 0, 1, 12 and 13 s
+    for at_s, (level, of) in steps:
+        status.set_health(level, [alert(of)], tell=True, now_ns=at_s * 10**9)
+    assert [a.id for a in told] == [AlertId.DEGRADED, AlertId.NO_FRAME] * 2  # at 0, 1, 12 and 13 s

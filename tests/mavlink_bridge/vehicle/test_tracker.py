@@ -12,6 +12,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -419,7 +422,7 @@ def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     read = mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000)
     news = keeper.on_origin(read, armed=True)
     assert news is not None
-    assert "from the configured one" in news
+    assert news.id is AlertId.ORIGIN_DIFFERS
     assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
     assert keeper.tick(10 * SECOND, 1, asked.append) is None
 
@@ -496,13 +499,13 @@ def test_the_angles_of_two_gimbals_are_not_mixed(other: tuple[int, int]) -> None
     assert looks(it, 2025) == pytest.approx(10.0, abs=0.01)
     assert looks(it, 2075) == pytest.approx(10.0, abs=0.01)
     assert it.other_gimbals == (other,)
-    told: list[str] = []
-    teller = StatusNotifier(lambda _, text: told.append(text))
+    told: list[Alert] = []
+    teller = StatusNotifier(told.append)
     watch = UnexpectedSenderMonitor(BridgeConfig(), it, teller, Counter())
     link: Any = SimpleNamespace(stranger="", system_id=1)
     for _ in range(3):
         watch.check(link, 20 * SECOND)
-    assert told == [f"PiLoT: another gimbal ignored: {other[0]}, device {other[1]}"]
+    assert told == [alert(AlertId.GIMBAL_IGNORED, component=other[0], device=other[1])]
 
 
 def test_the_configured_gimbal_counts_whoever_spoke_first() -> None:

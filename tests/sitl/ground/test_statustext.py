@@ -2,7 +2,6 @@
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.status import status_texts
 from sitl.ground.statustext import TextLog
 
 LONG = "not sent: vision yaw differs from the autopilot's by +5.1 deg, and this line goes on"
@@ -18,7 +17,12 @@ def _taken(*messages):
 
 
 def _chunks(text, number, component=191):
-    return [(message, component) for message in status_texts(6, text, number)]
+    raw = text.encode()
+    parts = [raw[i : i + 50] for i in range(0, len(raw), 50)] + [b""] * (len(raw) % 50 == 0)
+    made = mavlink.MAVLink_statustext_message
+    if len(parts) == 1:
+        return [(made(6, raw), component)]
+    return [(made(6, part, number, i), component) for i, part in enumerate(parts)]
 
 
 def test_chunks_of_two_components_are_joined_each_to_its_own():

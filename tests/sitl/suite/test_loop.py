@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from mavlink_bridge.alerts.ids import AlertId
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.case import Expectation, load_loop_cases
 from sitl.suite.loop.judge import (
@@ -55,7 +56,7 @@ def test_every_expectation_can_fail() -> None:
         never_modes=("LAND",),
         max_error_m=3.0,
         ends_tracking=True,
-        says=("video frozen",),
+        reports=(AlertId.VIDEO_FROZEN,),
         silent=True,
     )
     good = {h.what: h.ok for h in judge(record(flight([0.5] * 4)), expect)}
@@ -75,7 +76,7 @@ def test_who_is_back_too_late_or_never_is_missed(injects_s: float, ok: bool) -> 
 
 
 def replace_says(expect: Expectation) -> Expectation:
-    return expect.model_copy(update={"says": ("another text",)})
+    return expect.model_copy(update={"reports": (AlertId.BORESIGHT,)})
 
 
 def test_texts_that_cycle_are_counted_figures_aside() -> None:
@@ -86,8 +87,8 @@ def test_texts_that_cycle_are_counted_figures_aside() -> None:
     )
     cycling = LoopRecord(flight([0.5] * 4), texts, (0.2,))
     held = {h.what: h for h in judge(cycling, Expectation(repeats=2))}
-    assert not held["says nothing more than 2 times"].ok
-    assert held["says nothing more than 2 times"].seen.startswith("3 times 'PiLoT: overloaded")
+    assert not held["reports nothing more than 2 times"].ok
+    assert held["reports nothing more than 2 times"].seen == "3 times overloaded"
     assert all(h.ok for h in judge(cycling, Expectation(repeats=3)))
 
 

@@ -185,12 +185,15 @@ def test_texts_are_looked_for_by_sender_and_time() -> None:
     flown = record()
     flown.texts += [
         Text(5.0, "vehicle", "EKF Failsafe: changed to LAND Mode"),
-        Text(6.0, "bridge", "no"),
+        Text(6.0, "bridge", "PiLoT: output held: position jumped 7 m"),
     ]
     said = {"check": "text", "contains": "LAND"}
     assert expectation(**said).judge(flown).ok
     assert not expectation(**said, to_s=4).judge(flown).ok
-    assert not expectation(**said, sender="bridge").judge(flown).ok
+    jump = {"check": "alert", "alert": "position_jump"}
+    assert expectation(**jump).judge(flown).ok
+    assert not expectation(**jump, to_s=4).judge(flown).ok
+    assert not expectation(check="alert", alert="ekf_follows").judge(flown).ok
     assert not expectation(**said, absent=True).judge(flown).ok
     assert not expectation(check="no_warning").judge(flown).ok
     assert expectation(check="no_warning", from_s=5.5).judge(flown).ok
