@@ -5,8 +5,8 @@
 
 FOLDER keeps the maps between runs. Each image begins from a prior up to 10 m off; roll, pitch and
 the height (3 m) are reported with the stated sigma, or not at all. A registration is right where
-the middle of its image lies on its true ground. NEES: squared error of the accepted over the told
-covariance and the truth's own, per degree of freedom, the median. --search: each image without a
+the middle of its image lies on its true ground. NEES: squared error over the claimed covariance and
+the truth's own, per degree of freedom, the median of the accepted. --search: each image without a
 prior, heading unknown, on its map and on one that does not hold it. --rivals: SIFT, XFeat and
 ALIKED + LightGlue on the same images, those that are installed.
 """

@@ -42,7 +42,7 @@ _USUAL_M = 100.0  # to the ground, where the map has none in the middle of the v
 class JudgedImage:
     """attitude_deg: sigma of roll and pitch, None: not reported. centre_m: error on the ground in
     the middle of the image; right: whether that is small enough for the set. horizontal_m, up_m:
-    error of the position; nees, nees_attitude: squared error over the told covariance and the
+    error of the position; nees, nees_attitude: squared error over the claimed covariance and the
     truth's, per degree of freedom; inside, inside_horizontal: within the 95 % bound; level_m: the
     horizontal protection level; beyond_level: by more than the truth's three sigmas.
     """

@@ -46,7 +46,7 @@ def page() -> str:
 
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
-    ended = f"{spec.cleared} (`{body(cleared(spec.id))}`)" if spec.cleared else "not told"
+    ended = f"{spec.cleared} (`{body(cleared(spec.id))}`)" if spec.cleared else "not reported"
     inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
     action = ", ".join(
         [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]

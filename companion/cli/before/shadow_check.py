@@ -49,7 +49,7 @@ def shadow_check_command(
 ) -> None:
     """Play a recorded flight through bridge and integrity monitor, as in shadow mode.
 
-    Exit code 0: the shadow score is a go; 1: no-go.
+    Exit code 0: ready; 1: not ready.
     """
     from companion.config import load_config
     from companion.offline.shadow_check import shadow_check
@@ -105,7 +105,7 @@ def _show(found: ShadowCheck) -> None:
     for note in found.notes:
         Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
     out = Console()
-    table = Table("at, s", "the operator would have been told")
+    table = Table("at, s", "the operator would have read")
     for line in found.lines:
         if line.severity <= _WARNING:
             table.add_row(f"{line.at_s:.0f}", escape(line.text))
