@@ -35,12 +35,13 @@ class HeadingChange:
 
 def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
     """None where one of the two headings is not known."""
-    if attitude is None or fix.yaw_rad is None:
+    yaw_rad = fix.yaw_rad
+    if attitude is None or yaw_rad is None:
         return None
     return HeadingChange(
         fix.time_ns,
-        wrap_pi(fix.yaw_rad - attitude.gyro_heading_rad),
-        wrap_pi(fix.yaw_rad - attitude.yaw_rad),
+        wrap_pi(yaw_rad - attitude.gyro_heading_rad),
+        wrap_pi(yaw_rad - attitude.yaw_rad),
         fix.attitude_sigma_rad,
     )
 

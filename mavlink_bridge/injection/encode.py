@@ -12,7 +12,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.injection.propagate import PropagatedFix
-from mavlink_bridge.messages import or_nan
 from mavlink_bridge.vehicle.profile import CovarianceFormula, covariance_entry
 
 NAN = math.nan
@@ -32,20 +31,17 @@ _BEST_SATELLITES, _ENOUGH_SATELLITES = 12, 6
 _RISK_SIGMAS = 3.7  # of 1e-3, where nobody gives a protection level
 
 
-Angles = tuple[float | None, float | None, float | None]
-
-
 @dataclass(frozen=True)
 class EncodedEstimate:
-    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), None where
-    it is not known.
+    """What is about to be sent. position: as propagated; quaternion: body to NED, None where it is
+    not known.
 
     fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
     another time: its velocity is no new measurement. protection_m: horizontal and vertical level.
     """
 
     position: PropagatedFix
-    attitude: Angles
+    quaternion: quat.Quaternion | None
     attitude_sigma_rad: float
     quality: int
     reset_counter: int
@@ -101,7 +97,7 @@ def vision_position_estimate(
 ) -> Any:
     """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
-    angles = (or_nan(angle) for angle in e.attitude)
+    angles = (NAN, NAN, NAN) if e.quaternion is None else quat.to_euler(e.quaternion)
     return mavlink.MAVLink_vision_position_estimate_message(
         e.position.time_ns // 1000, *ned, *angles, covariance, e.reset_counter
     )
@@ -109,7 +105,7 @@ def vision_position_estimate(
 
 def odometry(
     e: EncodedEstimate,
-    attitude: tuple[float, float, float],
+    q: quat.Quaternion,
     ned: tuple[float, float, float],
     formula: CovarianceFormula,
     frame: int,
@@ -118,7 +114,6 @@ def odometry(
 
     A repeated velocity is NaN, "unknown": the EKF would take its error for an independent one.
     """
-    q = quat.from_euler(*attitude)
     vn, ve, vd = (float(v) for v in e.position.velocity_ned)
     body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
@@ -157,8 +152,8 @@ def gps_input(
     p = e.position
     horizontal_m, vertical_m = e.levels_m
     yaw = 0  # 0 means none; north is 36000
-    if config.gps_yaw and e.attitude[2] is not None:
-        yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
+    if config.gps_yaw and e.quaternion is not None:
+        yaw = round(math.degrees(quat.to_euler(e.quaternion)[2]) % 360.0 * 100.0) or 36000
     vn, ve, vd = (float(v) for v in p.velocity_ned) if config.gps_velocity else (0.0, 0.0, 0.0)
     week, ms = week_ms
     return mavlink.MAVLink_gps_input_message(

@@ -1,60 +1,29 @@
-"""Fixes between threads, how old they come, and that a jump survives the fix that told of it."""
+"""Fixes between threads, and how old they come."""
 
 from __future__ import annotations
 
 import statistics
 import threading
 from collections import deque
-from dataclasses import replace
 
 from mavlink_bridge.messages import VisionFix
 
 _AGES = 50
 
 
-class PendingJump:
-    """That the position jumped, until it has been told: who drops a fix notes it here first.
-
-    The EKF is told by the reset counter of the next message. One that was not told of a jump takes
-    it for an error of the position and refuses what follows.
-    """
-
-    def __init__(self, *, pending: bool = False) -> None:
-        self.pending = pending
-
-    def note(self, fix: VisionFix) -> None:
-        """A fix is dropped or is about to be sent: a jump that it tells of is to be told."""
-        self.pending = self.pending or fix.reset
-
-    def announce(self) -> None:
-        """A jump is to be told, whichever fix comes next."""
-        self.pending = True
-
-    def told(self) -> None:
-        """A message with it went out."""
-        self.pending = False
-
-
 class FixQueue:
-    """Fixes on their way from any thread to the link's; the oldest go first when it is full.
-
-    A jump that went with a dropped fix is told by the next.
-    """
+    """Fixes on their way from any thread to the link's; the oldest go first when it is full."""
 
     def __init__(self, length: int) -> None:
-        self._length = length
-        self._fixes: deque[VisionFix] = deque()
-        self._jump = PendingJump()
+        self._fixes: deque[VisionFix] = deque(maxlen=length)
         self._lock = threading.Lock()
         self.dropped = 0
 
     def put(self, fix: VisionFix) -> None:
         """Append; never blocks for long."""
         with self._lock:
+            self.dropped += len(self._fixes) == self._fixes.maxlen
             self._fixes.append(fix)
-            if len(self._fixes) > self._length:
-                self.dropped += 1
-                self._jump.note(self._fixes.popleft())
 
     def __len__(self) -> int:
         return len(self._fixes)
@@ -66,9 +35,6 @@ class FixQueue:
         with self._lock:
             fixes = list(self._fixes)
             self._fixes.clear()
-            if self._jump.pending:
-                fixes[0] = replace(fixes[0], reset=True)
-                self._jump.told()
         return fixes
 
 

@@ -13,7 +13,6 @@ from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.encode import (
-    Angles,
     EncodedEstimate,
     global_position_sensor,
     gps_input,
@@ -53,22 +52,15 @@ class InjectionContext:
     attitude_at: Callable[[int], Attitude | None]
 
 
-def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> Angles:
+def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat.Quaternion | None:
     """Vision attitude at time_ns: the fix's, turned as the autopilot turned since."""
-    angles = (fix.roll_rad, fix.pitch_rad, fix.yaw_rad)
-    known = _all_known(angles)
-    if time_ns == fix.time_ns or known is None:
-        return angles
+    if time_ns == fix.time_ns or fix.quaternion is None:
+        return fix.quaternion
     then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)
     if then is None or now is None:
-        return angles
+        return fix.quaternion
     turned = quat.multiply(quat.conjugate(then.quaternion), now.quaternion)
-    return quat.to_euler(quat.multiply(quat.from_euler(*known), turned))
-
-
-def _all_known(angles: Angles) -> tuple[float, float, float] | None:
-    roll, pitch, yaw = angles
-    return None if roll is None or pitch is None or yaw is None else (roll, pitch, yaw)
+    return quat.multiply(fix.quaternion, turned)
 
 
 class MessageMaker:
@@ -108,7 +100,7 @@ class MessageMaker:
         if kind == "odometry":
             return self._odometry(e, ned, formula, context)
         if not self._config.send_attitude:
-            e = replace(e, attitude=(None, None, None))
+            e = replace(e, quaternion=None)
         return EncodedMessage(vision_position_estimate(e, ned, formula), e)
 
     def _odometry(
@@ -119,12 +111,11 @@ class MessageMaker:
         context: InjectionContext,
     ) -> EncodedMessage | HeldOutput:
         """Velocity is rotated by the message's quaternion, so there must be one."""
-        attitude = _all_known(e.attitude)
-        if attitude is None:
+        q = e.quaternion
+        if q is None:
             now = context.attitude_at(e.position.time_ns)
             if now is None:
                 return HeldOutput(alert(AlertId.NO_ATTITUDE), "withheld_no_attitude")
-            attitude = (now.roll_rad, now.pitch_rad, now.yaw_rad)
-            e = replace(e, attitude=attitude)
+            q = now.quaternion
         frame = context.profile.odometry_frame
-        return EncodedMessage(odometry(e, attitude, ned, formula, frame), e)
+        return EncodedMessage(odometry(e, q, ned, formula, frame), e)

@@ -303,7 +303,12 @@ _COMMANDS = (
 # --- what goes in on our own side --------------------------------------------------------------
 
 FIX = VisionFix(
-    SECOND, *HOME, 500.0, 0.0, 0.0, 0.0, velocity_ned=(0.0, 0.0, 0.0), protection_m=(1.0, 1.0)
+    SECOND,
+    *HOME,
+    500.0,
+    (1.0, 0.0, 0.0, 0.0),
+    velocity_ned=(0.0, 0.0, 0.0),
+    protection_m=(1.0, 1.0),
 )
 TARGET = TargetReport(
     SECOND, *HOME, 500.0, (0.0, 0.0, 0.0), 1.0, 1.0, (0.5, 0.5), 1, 0.1, (0.1, 0.1, 0.2, 0.2), 0.5

@@ -70,9 +70,7 @@ def injected(kind: Any, sent_ns: int = 10 * SECOND + 80 * MS) -> Any:
             HOME[0] + math.degrees(100.0 / 6371000.0),  # on PX4's sphere
             HOME[1],
             488.0 + 60.0 + GEOID,
-            0.0,
-            0.0,
-            YAW,
+            from_euler(0.0, 0.0, YAW),
             P,
             attitude_sigma_rad=0.03,
             quality=77,
