@@ -19,9 +19,8 @@ from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig
-from mavlink_bridge.injection.encode import EncodedEstimate
-from mavlink_bridge.injection.fix_queue import Latency
-from mavlink_bridge.injection.message_maker import (
+from mavlink_bridge.injection.encode import (
+    EncodedEstimate,
     EncodedMessage,
     HeldOutput,
     InjectionContext,
@@ -37,6 +36,33 @@ _QUEUE = 32
 _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
+_AGES = 50
+
+
+class Latency:
+    """Ages of the last 50 fixes, from exposure to when they came, milliseconds."""
+
+    def __init__(self) -> None:
+        self._ages_ms: deque[float] = deque(maxlen=_AGES)
+
+    def take(self, age_ms: float) -> None:
+        """Of one fix."""
+        self._ages_ms.append(age_ms)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough fixes came to judge by."""
+        return len(self._ages_ms) == _AGES
+
+    @property
+    def median_ms(self) -> float | None:
+        """None before the first fix."""
+        return statistics.median(self._ages_ms) if self._ages_ms else None
+
+    @property
+    def least_ms(self) -> float | None:
+        """Of the youngest; None before the first fix."""
+        return min(self._ages_ms, default=None)
 
 
 class _FixRate:

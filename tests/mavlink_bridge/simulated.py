@@ -175,7 +175,7 @@ class Flight:
             np.eye(3) * 0.04,
             reset_count=self.reset_count,
         )
-        self.end.sender.fixes.put(fix)
+        self.end.sender.put(fix)
 
     def _vehicle(self, step: int) -> None:
         boot_ms = self.boot_ns(self.now_ns) // MS

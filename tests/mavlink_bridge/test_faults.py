@@ -13,13 +13,12 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import TargetReport, VisionFix
+from mavlink_bridge import TargetReport
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.ground import GroundEnd
-from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
@@ -180,15 +179,6 @@ def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
     jumps = [(a, b) for a, b in itertools.pairwise(messages) if abs(a.x - b.x) > 0.5]
     assert len(jumps) > 290
     assert all((a.reset_counter + 1) % 256 == b.reset_counter for a, b in jumps)
-
-
-def test_a_full_queue_drops_the_oldest_fix() -> None:
-    queue = FixQueue(4)
-    for i in range(10):
-        queue.put(VisionFix(i + 1, *HOME, 500.0))
-    assert [f.time_ns for f in queue.take()] == [7, 8, 9, 10]
-    assert queue.dropped == 6
-    assert queue.take() == []
 
 
 def test_no_position_from_an_origin_on_another_continent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.injection.encode import InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin
 from mavlink_bridge.preflight.doctor import check_parameters

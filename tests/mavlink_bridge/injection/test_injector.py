@@ -14,9 +14,8 @@ import pytest
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, YawGuardConfig
-from mavlink_bridge.injection.encode import DIAGONAL
+from mavlink_bridge.injection.encode import DIAGONAL, EncodedMessage, InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.quaternion import from_euler
