@@ -22,7 +22,6 @@ from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import VisionFix
 
 Array = NDArray[np.float64]
-_BIAS_WALK = 0.002  # m/s^2/sqrt(s): of tilt and accelerometer together, in north and east
 _SIGMA_FLOOR_M = 0.2
 _SIGMAS = 4.0
 # The noisier the fixes, the longer the filter lives by the IMU alone, and the further an error of
@@ -104,7 +103,7 @@ class MotionCheck:
         """Predict by the IMU, note the deviation, and take the fix in. Per axis: p, v, bias."""
         h = (moved.time_ns - last.time_ns) * 1e-9
         F = np.array([[1.0, h, -0.5 * h * h], [0.0, 1.0, -h], [0.0, 0.0, 1.0]])
-        q, b = SENSORS.imu_noise**2, _BIAS_WALK**2
+        q, b = SENSORS.imu_noise**2, SENSORS.imu_bias_walk**2
         Q = np.array(
             [[h**3 / 3 * q, h * h / 2 * q, 0.0], [h * h / 2 * q, h * q, 0.0], [0, 0, b * h]]
         )

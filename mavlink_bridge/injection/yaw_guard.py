@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from mavlink_bridge.config import YawGuardConfig
 from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import wrap_pi
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _BASELINE_NS = 1_000_000_000
 _RELEASE_SHARE = 0.7
 _BLIND_AFTER = 20  # fixes in a row
-_DRIFT_RAD_PER_S = math.radians(0.3)  # of the gyros while no fix is seen
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class YawGuard:
             return near
         recent = [entry for entry in self._accepted if newest_ns - entry[0] <= _BASELINE_NS]
         turned = abs(statistics.median(wrap_pi(to_gyros - entry[1]) for entry in recent))
-        if turned <= min(limit + _DRIFT_RAD_PER_S * gap_s, gross):
+        if turned <= min(limit + VEHICLE_SENSORS.gyro_drift_radps * gap_s, gross):
             return True
         # The gyro heading suffers where ATTITUDE was lost in a turn; the autopilot's yaw does not.
         against = abs(statistics.median(wrap_pi(difference - entry[2]) for entry in recent))
