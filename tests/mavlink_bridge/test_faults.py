@@ -171,7 +171,7 @@ def test_step_of_our_wall_clock_is_in_no_stamp(
 def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
     for i in range(300):
         flight.north_m, flight.reset_count = float(i % 7), i + 1
-        flight.run(0.5)
+        flight.run(0.3)
     messages = [m for _, m in flight.vision()]
     counters = [m.reset_counter for m in messages]
     assert max(counters) == 255
