@@ -71,7 +71,7 @@ class Calibrated:
 
 
 @dataclass(frozen=True)
-class _Picture:
+class _ChosenFrame:
     """One that was chosen, on the disk: two hundred of a 4K camera fill 5 GB. window: by the
     autopilot; pose: where it was registered.
     """
@@ -152,7 +152,7 @@ def mount_of(config: CompanionConfig) -> Array:
 
 def _chosen(
     record: FlightRecord, stack: MapStack, mount: Array, most: int
-) -> tuple[list[_Picture], float]:
+) -> tuple[list[_ChosenFrame], float]:
     """At most so many accepted estimates with their pictures, and the receiver's own error, m."""
     config, bridge = record.config, record.config.bridge
     autopilot = RecordedAutopilot(bridge, record.log, record.tables.start_ns)
@@ -169,7 +169,7 @@ def _chosen(
     picked = np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))
     geoid_m, frame = stack.cache.manifest.geoid_separation_m, stack.cache.frame
     trusted = bridge.mode not in _OURS
-    pictures: list[_Picture] = []
+    pictures: list[_ChosenFrame] = []
     accuracies_m: list[float | None] = []
     for index in picked:
         picture, estimate = good[index]
@@ -183,7 +183,7 @@ def _chosen(
             window = replace(window, place=np.full_like(window.place, np.nan))
         elif window.has_place:
             accuracies_m.append(state.gps_h_accuracy_m)
-        pictures.append(_Picture(picture, time_ns, window, estimate.world_from_camera))
+        pictures.append(_ChosenFrame(picture, time_ns, window, estimate.world_from_camera))
     if len(pictures) < _LEAST_FRAMES:
         raise RecordError(
             f"{record.log.path}: attitude and gimbal are known at {len(pictures)} of {len(picked)} "
@@ -192,7 +192,7 @@ def _chosen(
     return pictures, receiver_bias_m(accuracies_m)
 
 
-def _stream_camera(record: FlightRecord, pictures: list[_Picture]) -> Camera:
+def _stream_camera(record: FlightRecord, pictures: list[_ChosenFrame]) -> Camera:
     """The deployment's at the size of the first picture that can be read."""
     for picture in pictures:
         if (frame := _read(picture, record.flight.camera.camera)) is not None:
@@ -200,7 +200,7 @@ def _stream_camera(record: FlightRecord, pictures: list[_Picture]) -> Camera:
     raise RecordError(f"{record.folder}: none of its pictures can be read")
 
 
-def _read(picture: _Picture, camera: Camera) -> Frame | None:
+def _read(picture: _ChosenFrame, camera: Camera) -> Frame | None:
     """None of one that was cut off, as by a loss of power."""
     try:
         return picture.recorded.load(camera, picture.time_ns)
@@ -229,9 +229,9 @@ def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
 
 
 def _sighted(
-    pictures: list[_Picture], reader: PictureReader, camera: Camera, late_s: float,
+    pictures: list[_ChosenFrame], reader: PictureReader, camera: Camera, late_s: float,
     progress: Callable[[int], None],
-) -> tuple[list[_Picture], list[CalibrationFrame]]:  # fmt: skip
+) -> tuple[list[_ChosenFrame], list[CalibrationFrame]]:  # fmt: skip
     kept, sighted = [], []
     for number, picture in enumerate(pictures):
         progress(number + 1)
