@@ -1,4 +1,4 @@
-"""From an estimate to the configured message of four, or to the reason why there can be none."""
+"""From an estimate to the configured message of five, or to the reason why there can be none."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
@@ -29,6 +29,7 @@ _IGNORE_VELOCITY = (
     | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
     | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
 )
+_WRAPS_S = 36_000.0  # of a time in a float, as the command's definition proposes
 GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
 # What a receiver would claim of such an error. ArduPilot refuses to arm with hdop ignored, above
 # GPS_HDOP_GOOD (1.4: a protection level of 3.5 m) or below 6 satellites.
@@ -210,6 +211,32 @@ def global_position_sensor(e: EncodedEstimate, altitude_amsl_m: float, now_ns: i
     )
 
 
+def external_position_estimate(
+    e: EncodedEstimate, system_id: int, now_ns: int, since_ns: int
+) -> Any:
+    """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) to an autopilot, as COMMAND_INT (75).
+
+    It says when it is sent, seconds since since_ns, and how long before that the exposure was. It
+    has no height: ArduPilot refuses another frame and another altitude than NaN.
+    """
+    p = e.position
+    return mavlink.MAVLink_command_int_message(
+        system_id,
+        mavlink.MAV_COMP_ID_AUTOPILOT1,
+        mavlink.MAV_FRAME_GLOBAL,
+        mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
+        0,
+        0,
+        (now_ns - since_ns) * 1e-9 % _WRAPS_S,
+        max(0, now_ns - p.time_ns) * 1e-9,
+        p.horizontal_sigma_m,
+        NAN,
+        round(p.latitude_deg * 1e7),
+        round(p.longitude_deg * 1e7),
+        NAN,
+    )
+
+
 @dataclass(frozen=True)
 class HeldOutput:
     """Why nothing is sent although it is time. counter: the name it is counted under."""
@@ -233,6 +260,7 @@ class InjectionContext:
     origin: Origin | None
     profile: FirmwareProfile
     attitude_at: Callable[[int], Attitude | None]
+    system_id: int = 1
 
 
 def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat.Quaternion | None:
@@ -253,6 +281,7 @@ class MessageMaker:
         self._config = config
         self._geoid_m = geoid_separation_m
         self._utc = utc
+        self._begun_ns: int | None = None
 
     def make(
         self, e: EncodedEstimate, now_ns: int, context: InjectionContext
@@ -260,11 +289,9 @@ class MessageMaker:
         """The configured message of an estimate."""
         kind = self._config.message
         altitude = e.position.height_m - self._geoid_m
-        if kind == "gps_input":
-            week_ms = self._utc.gps_week_ms(e.position.time_ns)
-            return EncodedMessage(gps_input(e, altitude, week_ms, self._config), e)
-        if kind == "global_position_sensor":
-            return EncodedMessage(global_position_sensor(e, altitude, now_ns), e)
+        message = self._global(kind, e, altitude, now_ns, context.system_id)
+        if message is not None:
+            return EncodedMessage(message, e)
         if context.origin is None:
             return HeldOutput(alert(AlertId.EKF_NO_ORIGIN), "withheld_no_origin")
         ned = ned_from_origin(
@@ -285,6 +312,25 @@ class MessageMaker:
         if not self._config.send_attitude:
             e = replace(e, quaternion=None)
         return EncodedMessage(vision_position_estimate(e, ned, formula), e)
+
+    def _global(
+        self,
+        kind: InjectionMessage,
+        e: EncodedEstimate,
+        altitude_amsl_m: float,
+        now_ns: int,
+        system_id: int,
+    ) -> Any:
+        """The message where it has a latitude and a longitude; None for local ones."""
+        if kind == "gps_input":
+            week_ms = self._utc.gps_week_ms(e.position.time_ns)
+            return gps_input(e, altitude_amsl_m, week_ms, self._config)
+        if kind == "global_position_sensor":
+            return global_position_sensor(e, altitude_amsl_m, now_ns)
+        if kind == "external_position_estimate":
+            self._begun_ns = self._begun_ns or now_ns
+            return external_position_estimate(e, system_id, now_ns, self._begun_ns)
+        return None
 
     def _odometry(
         self,
