@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mavlink_bridge.alerts.alert import AlertSpec, Inhibits, OutputAction, Severity
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CalibrationError, GnssDisagreement
 
 _CALIBRATE = "run `companion calibrate flight` on this flight's record before the next flight"
 _STABILIZE = "fly in STABILIZE or ALT_HOLD until it clears; land if it lasts and there is no GNSS"
@@ -174,7 +175,7 @@ INTEGRITY = (
         Severity.WARNING,
         "focal length",
         "focal length {percent:.1f} % {direction}",
-        {"percent": "%", "direction": ""},
+        {"percent": "%", "direction": CalibrationError},
         "the focal length that fits the map differs from the calibration by `focal_share` for 2 s",
         "it is within the limit for 10 s",
         "heights and positions are off by this share of the height above ground",
@@ -189,7 +190,7 @@ INTEGRITY = (
         Severity.WARNING,
         "boresight",
         "camera {degrees:.0f} deg off in {axis}",
-        {"degrees": "deg", "axis": ""},
+        {"degrees": "deg", "axis": CalibrationError},
         "the camera's attitude differs from the gimbal's and autopilot's by `boresight_deg`, 3 s",
         "it is within the limit for 10 s",
         "the camera is mounted otherwise than the deployment says",
@@ -204,7 +205,7 @@ INTEGRITY = (
         Severity.WARNING,
         "time offset",
         "video timestamps {milliseconds:.0f} ms {direction}",
-        {"milliseconds": "ms", "direction": ""},
+        {"milliseconds": "ms", "direction": CalibrationError},
         "vision's motion lags or leads the IMU's by more than `time_s` for 1 s",
         "it is within the limit for 10 s",
         "positions trail or lead the vehicle by the speed times this",
@@ -249,7 +250,7 @@ MONITOR = (
         Severity.WARNING,
         "component stalled",
         "{component} stalled {seconds:.0f} s",
-        {"seconds": "s", "component": ""},
+        {"seconds": "s", "component": "name"},
         "a thread makes no progress for 4 s",
         "it makes progress for 3 s",
         "what that component reports is old",
@@ -264,7 +265,7 @@ SOURCES = (
         Severity.WARNING,
         "GNSS refused",
         "GNSS refused: {size:.1f} {why}",
-        {"size": "m or m/s", "why": ""},
+        {"size": "m or m/s", "why": GnssDisagreement},
         "GNSS is there while vision flies, and is away from vision, moves otherwise than vision or "
         "the IMU, scatters, or claims more than 5 m",
         "it agrees for 5 s",
