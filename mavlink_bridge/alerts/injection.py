@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mavlink_bridge.alerts.alert import AlertSpec, Kind, Severity, condition, event
 from mavlink_bridge.alerts.ids import AlertId as A
-from mavlink_bridge.alerts.words import InjectionOrder, RcChannel
+from mavlink_bridge.alerts.words import CommandAnswer, InjectionOrder, RcChannel
 
 WARNING, NOTICE, INFO = Severity.WARNING, Severity.NOTICE, Severity.INFO
 _NOT_SENT, _NOT_READY = "not sent: ", "not ready: "
@@ -24,6 +24,10 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.LINK_FULL, WARNING, "the link takes no more", {},
               "the port does not take a message", "the port takes messages again",
               "the EKF gets no position", "check cable and baud rate", lead=_NOT_SENT),
+    condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
+              "the autopilot does not accept EXTERNAL_POSITION_ESTIMATE while GNSS is good",
+              "the autopilot accepts it", "its firmware does not fuse the command",
+              "choose another bridge.injection.message", lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {}, "no GPS_GLOBAL_ORIGIN came",
               "GPS_GLOBAL_ORIGIN comes", "positions have no reference",
               "set bridge.injection.origin", lead=_NOT_SENT),

@@ -6,6 +6,7 @@ from mavlink_bridge.alerts.alert import AlertSpec, Severity, condition, event
 from mavlink_bridge.alerts.ids import AlertId as A
 from mavlink_bridge.alerts.words import (
     ChosenSet,
+    CommandAnswer,
     GnssProblem,
     LookAtRefusal,
     Output,
@@ -103,7 +104,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "a look-at at a target that does not exist", "the gimbal stays", "correct the request"),
     event(A.LOOK_AT_UNANSWERED, WARNING, "autopilot does not answer look-at", {},
           "no answer for 3 s", "the gimbal may not turn", "check the gimbal's driver"),
-    event(A.LOOK_AT_DENIED, WARNING, "autopilot: look-at {result}", {"result": "name"},
+    event(A.LOOK_AT_DENIED, WARNING, "autopilot: look-at {result}", {"result": CommandAnswer},
           "the autopilot refuses the command", "the gimbal stays", "check the gimbal's driver"),
     event(A.LOOK_AT_ENDED, INFO, "target {number} ended, the gimbal stays", {"number": ""},
           "the target that the gimbal followed ended", "the gimbal keeps its last direction",

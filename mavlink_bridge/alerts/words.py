@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 from typing import NewType
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 Name = NewType("Name", str)
 """A name from outside the catalogue: an address, a parameter, a target, a system error."""
 
@@ -36,6 +38,29 @@ class LookAtRefusal(Word):
     OFF = "bridge.look_at is off"
     FIXED_CAMERA = "the camera is fixed"
     NO_PLACE = "no place on Earth"
+
+
+class CommandAnswer(Word):
+    """The autopilot's MAV_RESULT, or why there is none."""
+
+    NOT_ASKED = "not asked, no GNSS"
+    NOT_ANSWERED = "not answered"
+    ACCEPTED = "accepted"
+    TEMPORARILY_REJECTED = "temporarily rejected"
+    DENIED = "denied"
+    UNSUPPORTED = "unsupported"
+    FAILED = "failed"
+    IN_PROGRESS = "in progress"
+    COMMAND_LONG_ONLY = "command long only"
+    COMMAND_INT_ONLY = "command int only"
+    UNKNOWN = "unknown"
+
+    @classmethod
+    def of(cls, result: int) -> CommandAnswer:
+        """Of a MAV_RESULT."""
+        known = mavlink.enums["MAV_RESULT"].get(result)
+        name = "" if known is None else known.name.removeprefix("MAV_RESULT_")
+        return cls.__members__.get(name, cls.UNKNOWN)
 
 
 class InjectionOrder(Word):

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import LookAtRefusal, Name
+from mavlink_bridge.alerts.words import CommandAnswer, LookAtRefusal
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
 from mavlink_bridge.vehicle.origin import north_east
@@ -124,9 +124,7 @@ class LookAt:
             if result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
                 return
             self._wanted, self._number = None, 0
-        name = mavlink.enums["MAV_RESULT"].get(result)
-        result_name = "unknown" if name is None else name.name.removeprefix("MAV_RESULT_").lower()
-        self._report(alert(AlertId.LOOK_AT_DENIED, result=Name(result_name)))
+        self._report(alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.of(result)))
 
     def _obey(self, message: Any) -> Alert | None:
         """Why not; None if it is done."""

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, BridgeConfig, TargetReport
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import LookAtRefusal, Name
+from mavlink_bridge.alerts.words import CommandAnswer, LookAtRefusal
 from mavlink_bridge.camera.look_at import LOOK_AHEAD, LOOK_AT_PLACE, LOOK_AT_TARGET, LookAt
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.link.link import sleep_until
@@ -115,7 +115,7 @@ def test_an_autopilot_that_refuses_or_does_not_answer_is_told():
     assert station.look.due(10 * SECOND) is not None
     assert station.look.due(14 * SECOND) is None
     assert station.said == [
-        alert(AlertId.LOOK_AT_DENIED, result=Name("unsupported")),
+        alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.UNSUPPORTED),
         alert(AlertId.LOOK_AT_UNANSWERED),
     ]
 
@@ -141,7 +141,7 @@ def test_a_stations_command_reaches_the_autopilot_through_the_bridge(autopilot):
             LOOK_AT_PLACE, mavlink.MAV_RESULT_FAILED, 0, 0, 1, 191
         )
         autopilot.send(refused)
-        news = alert(AlertId.LOOK_AT_DENIED, result=Name("failed"))
+        news = alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.FAILED)
         assert sleep_until(lambda: news in bridge.alerts(), 30.0)
 
 

@@ -24,7 +24,7 @@ NUMBERS = {
 }  # fmt: skip
 NAMES = {  # the longest that comes from outside
     "sender": "10.0.0.2:1", "host": "255.255.255.255", "message": "VISION_POSITION_ESTIMATE",
-    "result": "temporarily_rejected", "component": "integrity monitor", "what": "localizati",
+    "component": "integrity monitor", "what": "localizati",
     "name": "car 12",
 }  # fmt: skip
 WHY = {

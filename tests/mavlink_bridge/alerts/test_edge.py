@@ -30,7 +30,6 @@ OUTSIDE = {  # why a value is a `Name` and none of a closed list
     "mavlink_bridge/bridge.py": "the system's error",
     "mavlink_bridge/ground.py": "an address",
     "mavlink_bridge/vehicle/unexpected_senders.py": "an address",
-    "mavlink_bridge/camera/look_at.py": "MAV_RESULT as MAVLink names it",
     "mavlink_bridge/injection/fix_warnings.py": "a MAVLink message of the configuration",
     "companion/flight/component_table.py": "an address",
     "companion/integrity_monitor/integrity_monitor.py": "a thread",
