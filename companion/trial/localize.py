@@ -28,7 +28,8 @@ _FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
 @dataclass(frozen=True)
 class Localized:
     """One frame's result. pose: the registration's, also where it was not accepted; covariance:
-    (6, 6) as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose; beside_map: its view does not meet the map.
+    (6, 6) as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose; beside_map: its
+    view does not meet the map.
     """
 
     name: str

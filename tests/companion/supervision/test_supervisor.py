@@ -191,7 +191,8 @@ def test_quick_deaths_never_end_it_and_cold_starts_wait_longer_and_longer() -> N
     stage = Stage([*(Scripted(2, 1) for _ in range(9)), Scripted(2, 0)], standby_after_s=1e3)
     assert stage.supervisor.run() == 0
     assert len(stage.spawned) == 10
-    waits = [("died (exit 1)",)] * 4 + [("died (exit 1)", float(s)) for s in (2, 4, 8, 16, 30)]
+    how = (ProcessFault.DIED, "exit 1")
+    waits = [how] * 4 + [(*how, float(s)) for s in (2, 4, 8, 16, 30)]
     assert [told.values for told in stage.told] == waits
     assert stage.waited_s == 2 + 4 + 8 + 16 + 30
     assert stage.marked == [body(told) for told in stage.told]

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import Output
+from mavlink_bridge.alerts.words import ChosenSet, GnssProblem, Output
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.interlock import ShadowInterlock
@@ -348,7 +348,7 @@ def test_what_the_pilot_chooses_is_followed_and_not_undone(
     flight.run(8.0)
     assert len(orders(flight)) == begun
     assert [a.values for a in flight.told(AlertId.SOURCE_SET_HELD)] == [
-        ("GNSS lost", 0.0, "set 1 chosen")
+        (GnssProblem.LOST, 0.0, ChosenSet(1))
     ]
     # Once GNSS was well again, the next fault is another one.
     flight.gnss_north_m = 0.0

@@ -132,8 +132,6 @@ def test_a_vehicle_that_stops_accepting_is_asked_until_it_accepts_again(
     assert 9 <= len(vehicle.commands(refused_ns)) <= 11
     failed = alert(AlertId.COMMAND_NOT_TAKEN, answer=CommandAnswer.FAILED)
     assert vehicle.end.sender.refusal == failed
-        AlertId.COMMAND_NOT_TAKEN, answer=CommandAnswer.FAILED
-    )
     vehicle.result, again_ns = ACCEPTED, vehicle.now_ns
     vehicle.run(10.0)
     assert len(vehicle.commands(again_ns)) > 80
