@@ -21,6 +21,7 @@ from companion.calibration_watch.position_filter import PositionFilter
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.inertial import InertialDisplacement, InertialTrack, VehicleTelemetry
 from localizer.geometry.pose import matrix_from_quaternion, so3_log
+from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
@@ -46,7 +47,7 @@ class CalibrationFigures:
     focal: CalibrationEstimate
     late_s: CalibrationEstimate
     boresight_deg: CalibrationEstimate
-    axis: str
+    axis: CalibrationError
 
 
 @dataclass(frozen=True)
