@@ -186,7 +186,7 @@ class IntegrityChecks:
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
-        # The jump has a line of its own; how the place moves after it is judged anew. An announced
+        # The jump has a line of its own; how the place moves after it is judged again. An announced
         # one is announced with each fix until one has passed: it began with the first.
         leaps = self._jumps.leaps or (fix.reset and not self._announced)
         self._announced = fix.reset
@@ -317,7 +317,7 @@ class IntegrityChecks:
 
     def _frozen(self, now_ns: int, state: VehicleState) -> CheckResult:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
-            return CheckResult(None)  # a feed that ended is told as such
+            return CheckResult(None)  # a feed that ended is reported as such
         verdict = self._picture[1]
         if verdict.contrast < _SHOWS_GRAY:
             return CheckResult(

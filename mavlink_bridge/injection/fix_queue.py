@@ -1,4 +1,4 @@
-"""Fixes between threads, how old they come, and that a jump survives the fix that told of it."""
+"""Queue of fixes between threads; measures their latency and keeps the mark of a position jump."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ _AGES = 50
 
 
 class PendingJump:
-    """That the position jumped, until it has been told: who drops a fix notes it here first.
+    """Keeps a position jump until a message has announced it. Whoever drops a fix calls `note`.
 
-    The EKF is told by the reset counter of the next message. One that was not told of a jump takes
-    it for an error of the position and refuses what follows.
+    The reset counter of the next message announces the jump. An EKF without that announcement takes
+    the jump for an error and rejects the following positions.
     """
 
     def __init__(self, *, pending: bool = False) -> None:
         self.pending = pending
 
     def note(self, fix: VisionFix) -> None:
-        """A fix is dropped or is about to be sent: a jump that it tells of is to be told."""
+        """A fix is dropped or about to be sent: keep its jump."""
         self.pending = self.pending or fix.reset
 
     def announce(self) -> None:
-        """A jump is to be told, whichever fix comes next."""
+        """Announce a jump with the next fix."""
         self.pending = True
 
     def told(self) -> None:
@@ -38,7 +38,7 @@ class PendingJump:
 class FixQueue:
     """Fixes on their way from any thread to the link's; the oldest go first when it is full.
 
-    A jump that went with a dropped fix is told by the next.
+    The next fix announces the jump of a dropped one.
     """
 
     def __init__(self, length: int) -> None:
