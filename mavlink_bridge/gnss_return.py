@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_bridge.alerts.words import GnssDisagreement
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState
@@ -33,10 +34,10 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GnssRefusal:
-    """Why a receiver is not believed. why: the unit of size, and what it measures."""
+    """Why a receiver is not believed. size: in the unit that `why` names."""
 
     size: float
-    why: str
+    why: GnssDisagreement
 
 
 @dataclass(frozen=True)
@@ -134,22 +135,23 @@ class GnssReturnCheck:
         reports = self._reports
         claims = [_SIGMA_M if r.claimed_m is None else r.claimed_m for r in reports]
         if max(claims) > _CLAIM_M:
-            return GnssRefusal(max(claims), "m claimed")
+            return GnssRefusal(max(claims), GnssDisagreement.CLAIMED)
         accuracy = min(max(float(np.mean(claims)), _SIGMA_FLOOR_M), _SIGMA_CAP_M)
         sigma = math.hypot(accuracy, float(np.mean([r.sigma_m for r in reports])))
         speed = float(np.mean([r.speed_mps for r in reports]))
         off = np.array([r.off_m for r in reports])
         apart = float(np.hypot(*off.mean(axis=0)))
         if apart > _SIGMAS * sigma + speed * _LAG_ERROR_S:
-            return GnssRefusal(apart, "m off vision")
+            return GnssRefusal(apart, GnssDisagreement.OFF_VISION)
         times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
         drift, drift_sigma, scatter = _motion(times, off)
         if scatter > _SCATTER_M + sigma / 2:
-            return GnssRefusal(scatter, "m noise")
+            return GnssRefusal(scatter, GnssDisagreement.NOISE)
         slip, slip_sigma, _ = _motion(times, np.array([r.slipped_m for r in reports]))
-        for rate, rate_sigma, what in ((drift, drift_sigma, "vision"), (slip, slip_sigma, "IMU")):
-            if rate > _DRIFT_MPS + _SIGMAS * rate_sigma:
-                return GnssRefusal(rate, f"m/s off {what}")
+        if drift > _DRIFT_MPS + _SIGMAS * drift_sigma:
+            return GnssRefusal(drift, GnssDisagreement.DRIFTS_FROM_VISION)
+        if slip > _DRIFT_MPS + _SIGMAS * slip_sigma:
+            return GnssRefusal(slip, GnssDisagreement.DRIFTS_FROM_IMU)
         return None
 
 

@@ -15,9 +15,10 @@ from companion.calibration_watch.observation import (
     CalibrationObservation,
 )
 from localizer.geometry.pose import so3_log
+from mavlink_bridge.alerts.words import CalibrationError
 
 Array = NDArray[np.float64]
-AXES = ("yaw", "pitch", "roll")
+AXES = (CalibrationError.YAW, CalibrationError.PITCH, CalibrationError.ROLL)
 _LATE = 3  # index of the delay; before it the angles, rad
 _SIGMAS = np.array([*np.radians([10.0, 5.0, 5.0]), 0.3])
 _WALKS = np.array([*np.radians([0.15, 0.05, 0.05]), 0.006])  # per root second

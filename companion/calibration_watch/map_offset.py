@@ -21,6 +21,7 @@ from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Compass, MapOffsetUse
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
 
@@ -36,7 +37,7 @@ _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's m
 _AGAIN_M = 2.0  # by which another estimate is told anew
 _OUTLIER = 3.0  # robust sigmas of a block's median
 _SLEW_M_S = 0.2  # of what is applied: far below what the EKF or the monitor take for a motion
-_WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+_WINDS = tuple(Compass)
 
 Policy = Literal["tell", "apply"]
 
@@ -69,8 +70,8 @@ class MapOffset:
     significant: bool
 
     @property
-    def direction(self) -> str:
-        """Of the map from GNSS, e.g. "east"."""
+    def direction(self) -> Compass:
+        """Of the map from GNSS."""
         north, east = self.ne_m
         return _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]
 
@@ -178,7 +179,7 @@ class MapOffsetEstimator:
         if told is not None and math.dist(told, shift.ne_m) < _AGAIN_M:
             return
         self._told = shift.ne_m
-        applied = ", applied" if self._policy == "apply" else ""
+        applied = MapOffsetUse.APPLIED if self._policy == "apply" else MapOffsetUse.REPORTED
         self._vehicle.report_alert(
             alert(AlertId.MAP_OFFSET, metres=math.hypot(*shift.ne_m), direction=shift.direction,
                   applied=applied)

@@ -21,6 +21,7 @@ from companion.calibration_watch.observation import (
 from companion.calibration_watch.position_filter import PositionFilter
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.pose import matrix_from_quaternion, so3_log
+from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
@@ -93,7 +94,7 @@ class CalibrationFigures:
     focal: CalibrationEstimate
     late_s: CalibrationEstimate
     boresight_deg: CalibrationEstimate
-    axis: str
+    axis: CalibrationError
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, severity, text
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.injection.restart_memory import RestartMemory
@@ -154,7 +155,7 @@ def _source(making: BuildContext) -> FrameSource:
         events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
 
     def on_stranger(host: str) -> None:
-        bridge.report_alert(alert(AlertId.VIDEO_SENDER_IGNORED, host=host))
+        bridge.report_alert(alert(AlertId.VIDEO_SENDER_IGNORED, host=Name(host)))
 
     model = camera.model.camera()
     wanted: tuple[PacketTap | None, ...] = (making.get(KlvRelay), making.get(FrameTimes))

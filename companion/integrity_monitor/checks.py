@@ -34,6 +34,7 @@ from localizer.types import Image
 from mavlink_bridge.alerts.alert import Alert, Inhibits, OutputAction
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.integrity import INTEGRITY
+from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _AIRBORNE_M = 3.0
@@ -123,7 +124,7 @@ class IntegrityChecks:
         return {
             one.spec.id: (one.figure, one.word)
             for one in self._active()
-            if Inhibits.INJECTION in one.spec.inhibits
+            if Inhibits.INJECTION in one.spec.inhibits and isinstance(one.word, CalibrationError)
         }
 
     def _active(self) -> list[AlertDebouncer]:
@@ -293,8 +294,8 @@ class IntegrityChecks:
     def _calibration_checks(self) -> dict[AlertId, Callable[[], CheckResult]]:
         limits, known = self._config.calibration, self._calibration.figures()
         share, late = known.focal, known.late_s
-        long = "long" if share.value > 0.0 else "short"
-        when = "late" if late.value > 0.0 else "early"
+        long = CalibrationError.LONG if share.value > 0.0 else CalibrationError.SHORT
+        when = CalibrationError.LATE if late.value > 0.0 else CalibrationError.EARLY
         return {
             AlertId.FOCAL_LENGTH: lambda: _beyond(share, limits.focal_share, 100.0, long),
             AlertId.BORESIGHT: lambda: _beyond(
@@ -392,7 +393,9 @@ class IntegrityChecks:
         return CheckResult(level_m > self._limits.alert_limit_m, level_m)
 
 
-def _beyond(figure: CalibrationEstimate, limit: float, scale: float, word: str) -> CheckResult:
+def _beyond(
+    figure: CalibrationEstimate, limit: float, scale: float, word: CalibrationError
+) -> CheckResult:
     """Beyond its limit for sure, surely not, or not known."""
     bad = figure.exceeds(limit)
     if not bad and not figure.is_within(limit):

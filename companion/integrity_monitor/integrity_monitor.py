@@ -17,6 +17,7 @@ from localizer.types import Image
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import CATALOGUE
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import VisionFix
@@ -198,7 +199,7 @@ class IntegrityMonitor:
         last_ticks_ns = self._turns()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
-        stalled = CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, name)
+        stalled = CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, Name(name))
         alert = self._stands.update(now_ns, stalled)
         if alert is not None:
             self._bridge.report_alert(alert)

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CommandAnswer
 from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.injector import Injector
@@ -42,15 +43,14 @@ class PositionCommand:
     """
 
     def __init__(self) -> None:
-        self.answer = "not asked, no GNSS"
+        self.answer = CommandAnswer.NOT_ASKED
         self._fuses: bool | None = None
         self._asked_ns = self._accepted_ns = 0
         self._held_ns = self._held_since_ns = 0  # fixes that were not sent
 
     def take(self, result: int, now_ns: int) -> None:
         """The MAV_RESULT of one that was sent."""
-        name = mavlink.enums["MAV_RESULT"][result].name if result in _RESULTS else str(result)
-        self.answer = name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
+        self.answer = CommandAnswer.of(result)
         is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
         if self._fuses is None:
             self._fuses = is_accepted
@@ -75,16 +75,13 @@ class PositionCommand:
             return False
         self._asked_ns = now_ns
         if self._fuses is None:
-            self.answer = "not answered"
+            self.answer = CommandAnswer.NOT_ANSWERED
         return True
 
     def is_held(self, now_ns: int) -> bool:
         """Whether fixes were not sent for so long that an answer would have come."""
         is_recent = now_ns - self._held_ns < _ASK_NS
         return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
-
-
-_RESULTS = frozenset(mavlink.enums["MAV_RESULT"])
 
 
 class FixSender:

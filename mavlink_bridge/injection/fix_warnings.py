@@ -5,6 +5,7 @@ from __future__ import annotations
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.shared import Shared
@@ -33,7 +34,7 @@ class FixWarnings:
         if not profile.known:
             problem = alert(AlertId.UNKNOWN_FIRMWARE)
         elif self._config.message not in profile.messages:
-            message = self._config.message.upper()
+            message = Name(self._config.message.upper())
             problem = alert(AlertId.MESSAGE_UNSUPPORTED, message=message)
         self._teller.tell("profile", problem)
 

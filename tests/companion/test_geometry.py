@@ -80,7 +80,7 @@ def test_the_lever_arm_turns_with_the_body() -> None:
 
 
 def test_agrees_with_the_pose_files_angles() -> None:
-    """PiLoT: pitch 0 is the nadir, yaw counter-clockwise from north."""
+    """As PiLoT has it: pitch 0 is the nadir, yaw counter-clockwise from north."""
     frame = LocalFrame(Geodetic(47.0, 8.0, 400.0))
     body = _attitude(roll=3, pitch=5, yaw=70)
     R = camera_attitude(body, _gimbal(-50), LEVEL)
