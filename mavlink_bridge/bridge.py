@@ -201,7 +201,7 @@ class Bridge:
 
     def submit(self, fix: VisionFix) -> None:
         """Hand over a fix; never blocks."""
-        self._fc.sender.fixes.put(fix)
+        self._fc.sender.put(fix)
         self._fc_link.wake()
 
     def report(self, target: TargetReport) -> None:

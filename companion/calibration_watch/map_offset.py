@@ -16,7 +16,6 @@ from typing import Literal, Protocol
 import numpy as np
 
 from localizer.geometry.pose import Array
-from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
@@ -24,13 +23,13 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Compass, MapOffsetUse
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _BLOCK_NS = 10_000_000_000  # differences within it are one: GNSS errors last for seconds
 _LEAST_IN_BLOCK = 20
 _BLOCKS = 30  # five minutes
 _LEAST_BLOCKS = 6
 _BIAS_FLOOR_M = 0.5  # per axis: of the receiver, for minutes, however good it says it is
-_UNTOLD_ACCURACY_M = SENSORS.gnss_m  # of a receiver that does not say
 _SIGNIFICANT = 11.83  # chi-square of two degrees of freedom, 99.73 %
 _WAITS_NS, _WAITING = 700_000_000, 64  # until the EKF's report of the exposure is there
 _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's matter
@@ -166,7 +165,7 @@ class MapOffsetEstimator:
             return
         self._blocks.append(np.median(block, axis=0))
         if len(self._blocks) >= _LEAST_BLOCKS:
-            accuracy = self._vehicle.state().gps_h_accuracy_m or _UNTOLD_ACCURACY_M
+            accuracy = self._vehicle.state().gps_h_accuracy_m or VEHICLE_SENSORS.gnss_m
             bias_m = max(_BIAS_FLOOR_M, accuracy)  # receivers are optimistic: not over root two
             self._note(estimate(np.array(self._blocks), bias_m))
 

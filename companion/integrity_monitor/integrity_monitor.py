@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from companion.calibration_watch.observation import CalibrationObservation
+from companion.inertial import InertialTrack
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import AlertDebouncer, CheckResult, InhibitMemory
@@ -50,9 +51,10 @@ class IntegrityMonitor:
         bridge: Bridge,
         memory: InhibitMemory | None = None,
         clock: Callable[[], int] = monotonic_ns,
+        track: InertialTrack | None = None,
     ) -> None:
         self._clock = clock
-        self._monitor, self._memory = IntegrityChecks(config, limits), memory
+        self._monitor, self._memory = IntegrityChecks(config, limits, track), memory
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None

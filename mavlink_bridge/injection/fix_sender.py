@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -12,14 +12,13 @@ from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import CommandAnswer
 from mavlink_bridge.config import Mode
-from mavlink_bridge.injection.fix_queue import FixQueue
+from mavlink_bridge.injection.encode import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
@@ -85,7 +84,7 @@ class PositionCommand:
 
 
 class FixSender:
-    """Runs in the flight-controller link's thread; only `fixes` is filled from outside.
+    """Runs in the flight-controller link's thread; only `put` is called from others.
 
     vision: the last position that was sent or scored.
     """
@@ -98,7 +97,9 @@ class FixSender:
         teller: StatusNotifier,
         counters: Counter[str],
     ) -> None:
-        self.fixes = FixQueue(_QUEUE)
+        self.dropped = 0
+        """Fixes that the link's thread came too late for."""
+        self._fixes: deque[VisionFix] = deque(maxlen=_QUEUE)
         self.injector = Injector(shared.config.injection, shared.geoid_separation_m, shared.utc)
         self.vision: PropagatedFix | None = None
         commands = shared.config.injection.message == "external_position_estimate"
@@ -114,10 +115,15 @@ class FixSender:
         self._delivered_ns = 0
         self._sent_ns: int | None = None  # to the flight controller
 
+    def put(self, fix: VisionFix) -> None:
+        """Append a fix; the oldest is dropped where too many wait. Never blocks."""
+        self.dropped += len(self._fixes) == _QUEUE
+        self._fixes.append(fix)
+
     def take(self, now_ns: int) -> None:
-        """The fixes that came since the last call."""
-        for fix in self.fixes.take():
-            self.injector.submit(fix, now_ns)
+        """The fixes that came since the last call, oldest first."""
+        while self._fixes:
+            self.injector.submit(self._fixes.popleft(), now_ns)
 
     def acknowledged(self, link: Link, ack: Any, now_ns: int) -> None:
         """A COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE; a ground station sends that command, too."""
@@ -178,7 +184,7 @@ class FixSender:
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""
-        return {"fixes": len(self.fixes), "due": self.injector.waiting}
+        return {"fixes": len(self._fixes), "due": self.injector.waiting}
 
     def _deliver(
         self, link: Link, state: VehicleState, mode: Mode, injection: EncodedMessage, now_ns: int

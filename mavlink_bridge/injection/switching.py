@@ -29,9 +29,9 @@ from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _RETRY_NS = 1_000_000_000
-_GNSS_SIGMA_M = 2.5  # where the receiver does not say
 _SPEED_SLACK_S = 0.4  # a receiver's report is this much older than its time of arrival
 _VISION_FRESH_NS = 1_000_000_000
 _LARGEST_SIGMA_M = 5.0  # a receiver that claims to be bad must not hide an error in its claim
@@ -83,8 +83,7 @@ def _inconsistent_m(state: VehicleState, vision: PropagatedFix | None, sigmas: f
     if vision is None or receiver is None:
         return 0.0
     apart = _apart_m(receiver, (vision.latitude_deg, vision.longitude_deg))
-    claimed = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
-    accuracy = min(claimed, _LARGEST_SIGMA_M)
+    accuracy = VEHICLE_SENSORS.gnss_sigma_m(state.gps_h_accuracy_m, _LARGEST_SIGMA_M)
     speed = math.hypot(*vision.velocity_ned[:2])
     limit = sigmas * math.hypot(accuracy, vision.horizontal_sigma_m) + speed * _SPEED_SLACK_S
     return apart if apart > limit else 0.0

@@ -143,8 +143,6 @@ def make_fix(**options: Any) -> VisionFix:
         latitude_deg=HOME[0],
         longitude_deg=HOME[1],
         height_m=488.0 + GEOID + 60.0,
-        roll_rad=0.0,
-        pitch_rad=0.0,
         **options,
     )
 
@@ -490,8 +488,8 @@ def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge])
         {"position_covariance_ned": np.diag([1.0, 1.0, -1.0])},
         {"position_covariance_ned": np.array([[1.0, 5.0, 0], [5.0, 1.0, 0], [0, 0, 1.0]])},
         {"position_covariance_ned": np.array([[1.0, 0.5, 0], [0.0, 1.0, 0], [0, 0, 1.0]])},
-        {"yaw_rad": math.inf},
-        {"yaw_rad": math.nan},
+        {"quaternion": (math.nan, 0.0, 0.0, 0.0)},
+        {"quaternion": (0.0, 0.0, 0.0, 0.0)},
         {"attitude_sigma_rad": math.nan},
         {"velocity_sigma_mps": -1.0},
         {"quality": 101},
