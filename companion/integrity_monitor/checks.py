@@ -184,7 +184,7 @@ class IntegrityChecks:
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
-        # The jump has a line of its own; how the place moves after it is judged anew.
+        # The jump has a line of its own; how the place moves after it is judged again.
         before, self._newest = self._newest, fix
         leaps = before is not None and fix.reset_count != before.reset_count
         self._waiting.append((fix, self._jumps.leaps or leaps))
@@ -310,7 +310,7 @@ class IntegrityChecks:
 
     def _frozen(self, now_ns: int, state: VehicleState) -> CheckResult:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
-            return CheckResult(None)  # a feed that ended is told as such
+            return CheckResult(None)  # a feed that ended is reported as such
         verdict = self._picture[1]
         if verdict.contrast < _SHOWS_GRAY:
             return CheckResult(
