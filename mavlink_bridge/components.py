@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import SenderRefusal
 from mavlink_bridge.camera.component import TRACKING, CameraComponent
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.injection.injection_enable import COMMANDS
@@ -159,7 +160,7 @@ class Components:
         link.send(ack, message.target_component)
         if system not in self._refused and len(self._refused) < _MOST_REFUSED:
             self._refused.add(system)
-            why = "not allowed" if self._is_trusted else "not signed"
+            why = SenderRefusal.NOT_ALLOWED if self._is_trusted else SenderRefusal.NOT_SIGNED
             is_last = len(self._refused) == _MOST_REFUSED
             refused = AlertId.SENDERS_REFUSED if is_last else AlertId.SENDER_REFUSED
             self._shared.report(alert(refused, system=system, why=why))

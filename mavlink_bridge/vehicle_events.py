@@ -5,6 +5,7 @@ from __future__ import annotations
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Output
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -67,5 +68,5 @@ class VehicleEvents:
             self._teller.report(alert(AlertId.GNSS_LOST, output=_output(injecting)))
 
 
-def _output(injecting: bool) -> str:
-    return "injecting" if injecting else "nothing is injected"
+def _output(injecting: bool) -> Output:
+    return Output.INJECTING if injecting else Output.NOTHING

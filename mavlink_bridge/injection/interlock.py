@@ -90,8 +90,8 @@ class ShadowInterlock:
         if self._open:
             return None
         if self.inhibited_by:
-            title = min(CATALOGUE[of].title for of in self.inhibited_by)
-            return alert(AlertId.INHIBITED, alert=title)
+            first = min(self.inhibited_by, key=lambda of: CATALOGUE[of].title)
+            return alert(AlertId.INHIBITED, alert=first)
         return self._reason
 
     def may_switch(self, now_ns: int) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -57,7 +58,8 @@ class UnexpectedSenderMonitor:
     def check(self, link: Link, now_ns: int) -> None:
         """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
         if link.stranger:
-            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=link.stranger))
+            ignored = alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
+            self._teller.tell("foreign", ignored)
         others = self._tracker.other_gimbals
         if others and not self._config.camera.gimbal_component:
             component, device = others[0]

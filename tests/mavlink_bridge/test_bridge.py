@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, TargetReport, TrackRequest, VisionFix
 from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import InjectionOrder, RcChannel
 from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, FixError
 from mavlink_bridge.link.link import sleep_until
@@ -130,7 +131,7 @@ def shadowed(bridge: Bridge, count: int) -> Callable[[], bool]:
     return lambda: now() >= wanted
 
 
-def switched(bridge: Bridge, by: str) -> list[AlertId]:
+def switched(bridge: Bridge, by: RcChannel | InjectionOrder) -> list[AlertId]:
     """How this switched injection, in order."""
     return [a.id for a in bridge.alerts() if a.values == (by,)]
 
@@ -142,8 +143,6 @@ def make_fix(**options: Any) -> VisionFix:
         latitude_deg=HOME[0],
         longitude_deg=HOME[1],
         height_m=488.0 + GEOID + 60.0,
-        roll_rad=0.0,
-        pitch_rad=0.0,
         **options,
     )
 
@@ -206,7 +205,7 @@ def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) 
     assert bridge.injecting
     autopilot.rc = {9: 1100}
     assert sleep_until(lambda: not bridge.injecting, 30.0)
-    assert switched(bridge, "channel 9") == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
+    assert switched(bridge, RcChannel(9)) == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
 
 
 @pytest.mark.parametrize("over_ground", [False, True])
@@ -247,7 +246,7 @@ def test_command_gates_injection(
     feed(bridge, more(autopilot, 4))
     assert ask(mavlink.MAV_CMD_USER_1, 0.0) == mavlink.MAV_RESULT_ACCEPTED
     assert not bridge.injecting
-    assert switched(bridge, "command") == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
+    assert switched(bridge, InjectionOrder.COMMAND) == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
 
 
 def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
@@ -489,8 +488,8 @@ def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge])
         {"position_covariance_ned": np.diag([1.0, 1.0, -1.0])},
         {"position_covariance_ned": np.array([[1.0, 5.0, 0], [5.0, 1.0, 0], [0, 0, 1.0]])},
         {"position_covariance_ned": np.array([[1.0, 0.5, 0], [0.0, 1.0, 0], [0, 0, 1.0]])},
-        {"yaw_rad": math.inf},
-        {"yaw_rad": math.nan},
+        {"quaternion": (math.nan, 0.0, 0.0, 0.0)},
+        {"quaternion": (0.0, 0.0, 0.0, 0.0)},
         {"attitude_sigma_rad": math.nan},
         {"velocity_sigma_mps": -1.0},
         {"quality": 101},

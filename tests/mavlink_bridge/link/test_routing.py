@@ -20,6 +20,9 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import values_of
+from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
@@ -153,11 +156,14 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     assert not bridge.injecting
     assert station.command(mavlink.MAV_CMD_USER_2, 197, 1.0) == mavlink.MAV_RESULT_UNSUPPORTED
 
-    def texts() -> list[str]:
-        return [m["text"] for m in station.heard["STATUSTEXT"] if "injection" in m["text"]]
+    def alerts() -> list[Any]:
+        switched = (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
+        read = [values_of(m["text"]) for m in station.heard["STATUSTEXT"]]
+        return [one for one in read if one is not None and one[0] in switched]
 
-    assert sleep_until(lambda: len(texts()) == 2, 30.0), station.heard["STATUSTEXT"]
-    assert texts() == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
+    assert sleep_until(lambda: len(alerts()) == 2, 30.0), station.heard["STATUSTEXT"]
+    by = {"by": InjectionOrder.COMMAND.value}
+    assert alerts() == [(AlertId.INJECTION_ON, by), (AlertId.INJECTION_OFF, by)]
 
     def gimbal() -> Any:
         return bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
