@@ -62,7 +62,7 @@ def vision_fix(
     """The vehicle's position and attitude as the camera's estimate implies them.
 
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
-    Without them the vehicle's attitude is unknown, and the place that is told is the camera's: the
+    Without them the vehicle's attitude is unknown, and the camera's position is reported: the
     lever arm's length is added to its covariance.
     """
     frame, arm, pose = extrinsics.frame, extrinsics.lever_arm_m, estimate.world_from_camera

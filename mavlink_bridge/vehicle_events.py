@@ -17,7 +17,7 @@ _HELD_NS = 10_000_000_000
 
 
 class VehicleEvents:
-    """Looks ten times a second; one thread. Each change is told once, and only when it lasts."""
+    """Called ten times a second by one thread. Reports each change that lasts, once."""
 
     def __init__(self, teller: StatusNotifier) -> None:
         self._teller = teller
@@ -42,7 +42,7 @@ class VehicleEvents:
     def held(self, reason: Alert | None, now_ns: int) -> None:
         """Why fixes that come are not sent, from the interlock; None when they are or none come.
 
-        A score needs some seconds: what goes by itself is no news.
+        The shadow check needs some seconds, so a reason that passes soon is not reported.
         """
         if reason is None:
             self._held_ns = None

@@ -264,7 +264,7 @@ def _detector(making: BuildContext) -> BoxDetector:
 
 
 def _target_counts(making: BuildContext) -> Callable[[], dict[str, int]]:
-    """What was asked of the targets and could not be told, for the health and the report."""
+    """What was asked of the targets and could not be reported, for the health and the report."""
     targets, times = making.later(TargetReporter), making.get(FrameTimes)
     has_detector = making.config.targets.detector is not None
     detector = making.later(BoxDetector) if has_detector else None

@@ -37,7 +37,7 @@ class EkfDisplacement:
         self._way: deque[tuple[int, Metres, Metres]] = deque(maxlen=_KEPT)  # time, velocity, way
 
     def add(self, state: VehicleState) -> None:
-        """The newest velocity; after a hole in them, or of the clock, the way begins anew."""
+        """The newest velocity; after a hole in them, or of the clock, the way restarts."""
         if state.local_velocity_ned is None:
             return
         north, east, _ = state.local_velocity_ned
@@ -128,7 +128,7 @@ class JumpCheck:
         """Whether the newest fix says that the estimate jumped since the one that passed last."""
         self.leaps = False
         """Whether the newest fix is at another place than the one before: how it moves is judged
-        anew from here on.
+        again from here on.
         """
 
     def hear(self, state: VehicleState) -> None:
@@ -199,7 +199,7 @@ class JumpCheck:
         return self._headings.contradict(turn)
 
     def _hold(self, fix: VisionFix) -> _Held:
-        """The fixes held by now, with this one; one that does not follow them begins anew."""
+        """The held fixes with this one; a fix that does not follow them starts a new series."""
         held = self._held
         if held is None or not self._follows(held.newest, fix):
             held = self._held = _Held(fix)

@@ -3,7 +3,7 @@
 It waits for the flight process to end, and for the signs of life of its parts: one that hangs is
 ended. A death is told to the operator and marked in ``health.json`` within a second, and a standby
 process, with map and network in memory, takes over. Deaths that come fast never end it, since the
-aircraft may fly without GNSS: cold starts wait longer and longer, and each is told.
+aircraft may fly without GNSS: cold starts wait longer and longer, and each is reported.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
 _LOOKED_AWAY_S = 1.5  # after which it was the supervisor that stood still, or the computer
 _PAUSE_S = 0.25  # between looks whether to go on waiting
 _MOST_DEATHS = 64  # that are remembered: more within the window wait no longer
-_WORDS_S = 3.0  # for a death to be told, or marked
+_WORDS_S = 3.0  # for a death to be reported, or marked
 _PART = 10  # characters of a part's name, so that the line is one STATUSTEXT
 _USAGE = 2  # exit code of a named error
 
@@ -296,8 +296,8 @@ class Supervisor:
 
 
 def _do_in_time(name: str, do: Callable[[], None]) -> None:
-    """What cannot be told must not keep the aircraft waiting: neither an error nor a disk or a port
-    that stands still, which may be what the flight process died of.
+    """Run it with a time limit: a report that fails must not delay the restart. The disk or port
+    that does not respond may be what the flight process died of.
     """
 
     def guarded() -> None:

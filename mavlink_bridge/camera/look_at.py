@@ -79,7 +79,7 @@ class LookAt:
                 self._wanted = self._place_of(target)
 
     def forget(self, number: int) -> None:
-        """A target ended; the gimbal stays where it was last seen, and the operator is told."""
+        """A target ended: the gimbal keeps its direction, which is reported."""
         with self._lock:
             self._targets.pop(number, None)
             if self._number != number:
@@ -88,7 +88,7 @@ class LookAt:
         self._report(alert(AlertId.LOOK_AT_ENDED, number=number))
 
     def command(self, message: Any) -> int:
-        """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is told, too."""
+        """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is reported, too."""
         refused = self._obey(message)
         if refused is None:
             return int(mavlink.MAV_RESULT_ACCEPTED)
@@ -114,8 +114,8 @@ class LookAt:
             return (LOOK_AT_PLACE, wanted.frame, x, y, wanted.altitude_m)
 
     def answered(self, result: int) -> None:
-        """The autopilot's answer to a look-at: what it refuses is told and not tried again. One
-        to nobody's question says nothing.
+        """The autopilot's answer to a look-at. A refusal is reported and not tried again. An answer
+        without a question is ignored.
         """
         with self._lock:
             if self._asked_ns is None:

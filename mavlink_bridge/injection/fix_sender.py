@@ -1,4 +1,4 @@
-"""Fixes from any thread to positions on the link, or to nothing with a reason that is told."""
+"""Turns fixes from any thread into positions on the link, or reports why none is sent."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
 
 _QUEUE = 64
-_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
+_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is reported
 _BRIEF = (AlertId.NO_FRESH_FIX, AlertId.LINK_FULL)
 _GOOD_NS = 1_000_000_000
 _FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
@@ -137,7 +137,7 @@ class FixSender:
         self._command = None if self._command is None else PositionCommand()
 
     def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
-        """Send what is due, as the mode allows, and tell why not. mode: not ``off``."""
+        """Send what is due if the mode allows it, else report why not. mode: not ``off``."""
         profile = select_profile(state.autopilot, state.version)
         context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)
         injection = self.injector.step(now_ns, context)
@@ -160,24 +160,24 @@ class FixSender:
             self._teller.tell_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
-        """Whether positions came of late (and went, where they are to), and the yaw guard is
-        content.
+        """Whether positions came lately (and were sent, in mode ``inject``), and the yaw guard does
+        not block.
         """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
     def reaches_ekf(self, now_ns: int) -> bool:
-        """Whether positions went to the flight controller of late: not while a shadow, withheld,
-        or refused by the port.
+        """Whether positions were sent to the flight controller lately: not in shadow mode, while
+        output is held, or while the port takes none.
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
 
     def fed(self, now_ns: int) -> bool:
-        """Whether what the EKF says may still be made of our positions."""
+        """Whether the EKF's state may still depend on our positions."""
         return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
 
     @property
     def refusal(self) -> Alert | None:
-        """Why positions that are due are not made, once it has lasted and was told; else None."""
+        """Why due positions are not sent, once that has lasted and was reported; else None."""
         reported = self._teller.reported("inject")
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None

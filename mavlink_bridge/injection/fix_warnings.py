@@ -1,4 +1,4 @@
-"""What is wrong with the fixes themselves or with who takes them, told once."""
+"""Warnings about late, unchecked or undated fixes and about firmware, each reported once."""
 
 from __future__ import annotations
 
@@ -69,6 +69,6 @@ class FixWarnings:
         if lag > limit:
             return late
         is_told = is_over or last is AlertId.FIXES_LATE
-        if is_told and lag > _RELIEF_SHARE * limit:  # not yet over, but nothing new to say
+        if is_told and lag > _RELIEF_SHARE * limit:  # not yet over, but nothing new to report
             return over if is_over else late
         return None

@@ -28,13 +28,13 @@ COMMANDS = {
 
 
 class InjectionEnable:
-    """Open or closed by whoever spoke last: the channel when it is moved, or a command.
+    """The last order decides: the RC channel when it is moved, or a command.
 
-    A receiver that falls silent changes nothing: to take the position from the EKF at that moment
-    would turn the vehicle's way home into a landing. Any thread may call.
+    If the RC receiver goes silent, injection continues: without a position, ArduPilot would land
+    instead of returning. Any thread may call.
 
-    changed: called with an alert when it opens or closes. memory: of the gate that
-    a process before this one left open.
+    changed: called with an alert when injection is enabled or disabled. memory: whether a process
+    before this one had enabled it.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class InjectionEnable:
         self._at_start = alert(AlertId.INJECTION_OFF, by=InjectionOrder.START)
 
     def recall(self) -> None:
-        """Open it if it was left open by a process that did not end in order; `announce` tells."""
+        """Enable injection if a process that crashed had enabled it; `announce` reports it."""
         remembered = self._memory.recall() if self._memory is not None else None
         if remembered is None:
             return
@@ -66,7 +66,7 @@ class InjectionEnable:
             self._memory.opened(by_channel=by_channel)
 
     def announce(self) -> None:
-        """Tell how it stood at the start: once the links have somebody who hears it."""
+        """Report the state at the start, once a link is connected."""
         self._changed(self._at_start)
 
     def stop(self, *, clean_shutdown: bool = True) -> None:

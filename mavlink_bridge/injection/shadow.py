@@ -40,7 +40,7 @@ class ShadowScore:
 
     Without samples nothing of that is known: None. bias_ne_m: mean north and east difference.
     height_m: median difference of the heights. consistency: median squared Mahalanobis distance
-    (1.4 is ideal). reasons: why it is a no-go; empty if it is a go. against: those of them
+    (1.4 is ideal). reasons: why it is not ready; empty if it is a go. against: those of them
     that speak against the positions themselves, not against how many came.
     """
 

@@ -116,7 +116,7 @@ class GnssFault:
 def gnss_fault(
     state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
 ) -> GnssFault | None:
-    """Why GNSS is bad: lost, glitching, or away from vision by more than both errors; or None."""
+    """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; or None."""
     if not gnss_healthy(state, now_ns):
         return GnssFault(GnssProblem.LOST, proven=True)
     glitch = mavlink.EKF_GPS_GLITCHING if state.autopilot == "ardupilot" else 0
@@ -154,7 +154,7 @@ class SourceSwitch:
         self._was_chosen = self._overruled = False
 
     def met_in_flight(self) -> None:
-        """The flight controller has flown before it was heard: nobody says on which set."""
+        """The first heartbeat was of a vehicle in flight: its source set is unknown."""
         self.current = None
 
     def chosen(self, source_set: int) -> None:
@@ -201,7 +201,7 @@ class SourceSwitch:
         )
         self._bad_since_ns = None if fault is None else self._bad_since_ns or now_ns
         self._overruled = self._overruled and fault is not None
-        # As far as GNSS alone is asked: vision's word against it does not count once that is gone.
+        # Judged by GNSS alone: a contradiction with vision does not count once vision is gone.
         sound = fault is None or not fault.is_of_receiver
         self._sound_since_ns = (self._sound_since_ns or now_ns) if sound else None
         if self._vision_ns is None or (fresh and good):
@@ -296,8 +296,8 @@ class SourceOrders:
         return self._switch.returning.refusal is not None
 
     def met(self, state: VehicleState) -> None:
-        """The vehicle is heard. An ArduPilot that was in the air before this process (it died, and
-        began anew) may be on any set; one on the ground has begun with its first.
+        """The first message of the vehicle. An ArduPilot in flight may be on any source set (this
+        process was restarted); on the ground it has started with its first.
         """
         if self._has_met:
             return

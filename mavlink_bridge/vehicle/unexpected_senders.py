@@ -1,4 +1,4 @@
-"""Others on the link who mean a wiring or a start by mistake: a second vehicle, a second us."""
+"""Detects a second vehicle, a second companion and other senders: wrong wiring, or forgery."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LIES = 3  # of TIMESYNC, which is asked once a second
 
 
 class UnexpectedSenderMonitor:
-    """Tells the operator of them, once each; one thread."""
+    """Reports each once; one thread."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class UnexpectedSenderMonitor:
             self._teller.tell("twins", twins)
 
     def _check_answers(self, now: int, now_ns: int) -> None:
-        """Answers to TIMESYNC of quite another time than the vehicle's stamps are another's."""
+        """TIMESYNC answers far from the vehicle's own time stamps come from another sender."""
         lies, since_ns = self._lies
         if now - lies >= _LIES:
             self._teller.tell("answers", alert(AlertId.TIMESYNC_CONTRADICTS))
@@ -82,7 +82,7 @@ class UnexpectedSenderMonitor:
             self._lies = (now, now_ns)
 
     def _check_arming(self, link: Link, now_ns: int) -> None:
-        """Forged heartbeats of the autopilot's ids: what is shut while armed stays shut then."""
+        """Heartbeats that alternate between armed and disarmed are forged."""
         turns, since_ns = self._turns
         now = self._tracker.arming.turns
         if now - turns >= _TURNS:
