@@ -261,6 +261,7 @@ class IntegrityChecks:
             AlertId.VIDEO_FROZEN: lambda: (
                 self._frozen(now_ns, state) if flies else CheckResult(False)
             ),
+            AlertId.LOW_CONTRAST: lambda: self._dim(now_ns) if flies else CheckResult(False),
             AlertId.VIDEO_REPEATS: lambda: self._repeats(now_ns) if flies else CheckResult(False),
             AlertId.VISION_IMU_MISMATCH: lambda: self._moves_otherwise() if fresh else none,
             AlertId.HEIGHT_MISMATCH: lambda: self._height_reading if fresh else none,
@@ -319,6 +320,12 @@ class IntegrityChecks:
         still = verdict.still_s >= self._still_s(now_ns, state)
         still = still or self._should_have_moved(state, verdict)
         return CheckResult(identical or still, verdict.still_s)
+
+    def _dim(self, now_ns: int) -> CheckResult:
+        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+            return CheckResult(None)
+        shown = self._picture[1].detail
+        return CheckResult(shown < self._config.picture.low_detail, shown)
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:

@@ -11,6 +11,7 @@ class AlertId(str, enum.Enum):
     # integrity monitor
     VIDEO_FROZEN = "video_frozen"
     VIDEO_REPEATS = "video_repeats"
+    LOW_CONTRAST = "low_contrast"
     VISION_IMU_MISMATCH = "vision_imu_mismatch"
     HEIGHT_MISMATCH = "height_mismatch"
     POSITION_JUMP = "position_jump"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -67,6 +68,7 @@ class Filmed:
 
     flight: Flight
     looks_at: Path
+    light: Callable[[float], float] = lambda at_s: 1.0
 
     def fly(self, until_s: float) -> Flight:
         """On to a time of the flight, with a picture every 0.1 s."""
@@ -77,6 +79,7 @@ class Filmed:
             y, x = 60 + 5.0 * north, 200 + 5.0 * east
             shift = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y]])
             picture = cv2.warpAffine(ground, shift, (320, 240))[..., None].astype(np.float64)
+            picture *= self.light(self.flight.at_s)
             noisy = np.clip(picture + rng.normal(0.0, 2.0, (240, 320, 3)), 0, 255)
             self.flight.monitor.see(second(self.flight.at_s), noisy.astype(np.uint8))
             self.flight.fly(self.flight.at_s + 0.1)
@@ -96,7 +99,16 @@ def test_fog_is_no_frozen_video() -> None:
     fog = Flight(monitor(), leg, noise_m=0.03)
     while fog.fly(fog.at_s + 0.1).at_s < 12.0:
         fog.monitor.see(second(fog.at_s), np.full((240, 320, 3), 205, np.uint8))
-    assert fog.lines == []
+    assert {one.id for _, one in fog.lines} == {AlertId.LOW_CONTRAST}
+
+
+def test_low_light_is_told_after_2_s_and_ends_after_5_s_and_holds_nothing() -> None:
+    dark = Filmed(Flight(monitor(), leg, noise_m=0.03), leg, lambda s: 0.02 if 8 <= s < 14 else 1.0)
+    flight = dark.fly(22.0)
+    assert 10.0 <= flight.told(AlertId.LOW_CONTRAST) <= 10.4
+    assert 19.0 <= flight.ended(AlertId.LOW_CONTRAST) <= 19.4
+    assert {one.id for _, one in flight.lines} == {AlertId.LOW_CONTRAST}
+    assert flight.held == []
 
 
 def test_a_filmed_flight_is_left_alone() -> None:
