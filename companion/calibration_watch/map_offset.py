@@ -20,7 +20,7 @@ from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import Compass, MapOffsetUse
+from mavlink_bridge.alerts.words import Direction, MapOffsetUse
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
 from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
@@ -36,7 +36,7 @@ _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's m
 _AGAIN_M = 2.0  # by which another estimate is reported again
 _OUTLIER = 3.0  # robust sigmas of a block's median
 _SLEW_M_S = 0.2  # of what is applied: far below what the EKF or the monitor take for a motion
-_WINDS = tuple(Compass)
+_WINDS = tuple(Direction)
 
 Policy = Literal["tell", "apply"]
 
@@ -69,7 +69,7 @@ class MapOffset:
     significant: bool
 
     @property
-    def direction(self) -> Compass:
+    def direction(self) -> Direction:
         """Of the map from GNSS."""
         north, east = self.ne_m
         return _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]

@@ -216,7 +216,7 @@ class IntegrityChecks:
         if not state.armed:
             self._steps.begins_anew()
         elif self._jumps.announced and admitted:
-            self._steps.is_found_anew()
+            self._steps.is_found_again()
         elif self._jumps.step is not None:
             found = self._steps.add(self._jumps.step)
             if found is not None:

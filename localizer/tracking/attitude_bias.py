@@ -81,7 +81,7 @@ class AttitudeBias:
         return float(pitch), float(roll)
 
     @property
-    def told_deg(self) -> tuple[float, float, float]:
+    def reported_deg(self) -> tuple[float, float, float]:
         """The constant, and the sigma of the rest: for reports."""
         pitch, roll, sigma = (
             round(float(v), 2) for v in (*self.off_deg, np.degrees(self.sigma_rad))

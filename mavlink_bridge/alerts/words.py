@@ -128,7 +128,7 @@ class CalibrationError(Word):
     YAW = "yaw"
 
 
-class Compass(Word):
+class Direction(Word):
     """Eight directions, clockwise."""
 
     NORTH = "north"
