@@ -354,7 +354,7 @@ class Recorder:
 
 
 def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | None:
-    """``record.mcap``; None, and told, where it cannot be had: the tables suffice."""
+    """Open ``record.mcap``. None, with a warning, if that fails: the tables hold the record."""
     try:
         from companion.export.mcap_file import McapFile
 
