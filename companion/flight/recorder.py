@@ -369,7 +369,7 @@ def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | 
 
 
 class RecordKeeper:
-    """The record of one process, where the disk takes one: this may be a restart in the air.
+    """The record of one process, if the disk takes one (this may be a restart in the air).
 
     say_incomplete: tells the operator why something is missing in it; from any thread.
     """
