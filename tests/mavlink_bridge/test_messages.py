@@ -55,6 +55,20 @@ def test_what_no_message_can_carry_is_named(
         make(bad)
 
 
+@pytest.mark.parametrize(
+    "P",
+    [
+        np.eye(2),
+        np.diag([1.0, 1.0, -1.0]),
+        np.array([[1.0, 5.0, 0], [5.0, 1.0, 0], [0, 0, 1.0]]),
+        np.array([[1.0, 0.5, 0], [0.0, 1.0, 0], [0, 0, 1.0]]),
+    ],
+)
+def test_what_is_no_covariance_is_named(P: np.ndarray) -> None:
+    with pytest.raises(FixError, match="covariance"):
+        fix(position_covariance_ned=P)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -1.0, 1e300])
 @pytest.mark.parametrize("field", ["h_accuracy_m", "v_accuracy_m"])
 def test_accuracies_that_are_none_are_named(field: str, bad: float) -> None:
