@@ -58,9 +58,9 @@ class LastFix:
     autopilot_ns: int | None = None
     origin: tuple[float, float, float] | None = None
 
-    def counts_alike(self, state: VehicleState, time_ns: int) -> bool:
+    def has_same_origin(self, state: VehicleState, time_ns: int) -> bool:
         """Whether the EKF still counts its position from where it did: not after a reboot of the
-        autopilot, whose clock began anew, nor about another origin.
+        autopilot, whose clock restarted, nor about another origin.
         """
         offset_ns, origin = state.clock_offset_ns, _place(state.origin)
         since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS
@@ -186,7 +186,7 @@ class FixMemory:
         local, rotation = self._local_at(time_ns), self._autopilot.rotation(time_ns)
         if local is None or rotation is None:
             return None
-        if not last.counts_alike(self._state(), time_ns):
+        if not last.has_same_origin(self._state(), time_ns):
             self._before = None
             return None
         way = np.array(local[:3]) - np.array(last.local_ned)

@@ -182,7 +182,7 @@ class StepUncertainty:
         """Known since the last step: it was no delay, so what lies along the way is none."""
         self._leave(0.0, self._across_m)
 
-    def is_found_anew(self) -> None:
+    def is_found_again(self) -> None:
         """The place was searched and confirmed: what lies across the way is settled."""
         self._finder.forget()
         self._leave(self._along_m, 0.0)

@@ -29,7 +29,7 @@ class AmbiguousPosition:
     distance_m: float
 
 
-def likest_rival(
+def most_similar_rival(
     optimizer: JNGO, levels: tuple[LevelProblem, ...], origin: Array, truth: Pose, width_m: float
 ) -> AmbiguousPosition:
     """The best mode that displaced poses run into, away from the true one.

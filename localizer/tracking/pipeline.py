@@ -36,7 +36,7 @@ from localizer.render.holes import fill_holes
 from localizer.tracking.attitude_bias import AttitudeBias
 from localizer.tracking.dead_reckoning import DeadReckoning
 from localizer.tracking.motion import AuxiliarySensors
-from localizer.tracking.reference import lead_share, still_serves
+from localizer.tracking.reference import is_still_valid, lead_share
 from localizer.tracking.sensor_fusion import SensorFusion, distance_m
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
@@ -308,7 +308,7 @@ class Localizer:
                     features = query() if query is not None else self.extract_query(frame)
             estimate = self.localize(frame, features, bundle.anchors)
             if remaining and estimate.status is RegistrationStatus.OK:
-                # The same image again is no new evidence: start anew from its result, halving sigma
+                # The same image is no new evidence: start again from its result, halving sigma
                 self.set_prior(
                     PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
                 )
@@ -330,7 +330,7 @@ class Localizer:
         interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
         if last is None or not steady or shift_px == 0:
             return self.make_reference(prior, wait=wait)
-        if still_serves(last, pose, self.camera, time_ns, shift_px):
+        if is_still_valid(last, pose, self.camera, time_ns, shift_px):
             return last
         later = self.predict(time_ns + _LEAD_NS)
         if later is not None:
@@ -405,7 +405,7 @@ class Localizer:
                 result = self._fusion.fuse(image, frame.exposure_time_ns)
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
         if anchors is not None and image is not None and estimate.status is RegistrationStatus.OK:
-            # Added to what is told and not to what is filtered: the next frame errs alike.
+            # Added to what is reported, not to what is filtered: the next frame has the same error.
             moving = (ahead.velocity, ahead.rate)
             unknown = calibration_covariance(
                 self._config.calibration, anchors.points_world, estimate.world_from_camera,

@@ -11,6 +11,7 @@ class AlertId(str, enum.Enum):
     # integrity monitor
     VIDEO_FROZEN = "video_frozen"
     VIDEO_REPEATS = "video_repeats"
+    LOW_CONTRAST = "low_contrast"
     VISION_IMU_MISMATCH = "vision_imu_mismatch"
     HEIGHT_MISMATCH = "height_mismatch"
     POSITION_JUMP = "position_jump"
@@ -55,6 +56,7 @@ class AlertId(str, enum.Enum):
     SOURCE_SET_REFUSED = "source_set_refused"
     SOURCE_SET_HELD = "source_set_held"
     LOOK_AT_REFUSED = "look_at_refused"
+    LOOK_AT_NO_TARGET = "look_at_no_target"
     LOOK_AT_UNANSWERED = "look_at_unanswered"
     LOOK_AT_DENIED = "look_at_denied"
     LOOK_AT_ENDED = "look_at_ended"
@@ -67,6 +69,7 @@ class AlertId(str, enum.Enum):
     NO_FIX_YET = "no_fix_yet"
     NO_FRESH_FIX = "no_fresh_fix"
     LINK_FULL = "link_full"
+    COMMAND_NOT_TAKEN = "command_not_taken"
     EKF_NO_ORIGIN = "ekf_no_origin"
     EKF_ORIGIN_FAR = "ekf_origin_far"
     NO_ATTITUDE = "no_attitude"
@@ -103,7 +106,6 @@ class AlertId(str, enum.Enum):
     CLOCK_NOT_SET = "clock_not_set"
     TLOG_INCOMPLETE = "tlog_incomplete"
     # companion
-    STARTING = "starting"
     INITIALIZING = "initializing"
     TRACKING = "tracking"
     DEGRADED = "degraded"

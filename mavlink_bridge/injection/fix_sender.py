@@ -1,33 +1,90 @@
-"""Fixes from any thread to positions on the link, or to nothing with a reason that is told."""
+"""Turns fixes from any thread into positions on the link, or reports why none is sent."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CommandAnswer
 from mavlink_bridge.config import Mode
-from mavlink_bridge.injection.fix_queue import FixQueue
+from mavlink_bridge.injection.encode import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
+from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
-from mavlink_bridge.vehicle.profile import FirmwareProfile
+from mavlink_bridge.vehicle.profile import select_profile
 
 _QUEUE = 64
-_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
+_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is reported
 _BRIEF = (AlertId.NO_FRESH_FIX, AlertId.LINK_FULL)
 _GOOD_NS = 1_000_000_000
 _FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
+_ASK_NS = 1_000_000_000
+_ANSWERED_NS = 2_000_000_000
+
+
+class PositionCommand:
+    """Whether the autopilot fuses MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
+
+    It says so by accepting the command while GNSS aids its EKF. ArduPilot 4.7 refuses it then and
+    accepts it after the loss of GNSS, as a reset: streamed so, the vehicle landed after 8 s all the
+    same. Who refused is not asked again until a reboot.
+    """
+
+    def __init__(self) -> None:
+        self.answer = CommandAnswer.NOT_ASKED
+        self._fuses: bool | None = None
+        self._asked_ns = self._accepted_ns = 0
+        self._held_ns = self._held_since_ns = 0  # fixes that were not sent
+
+    def take(self, result: int, now_ns: int) -> None:
+        """The MAV_RESULT of one that was sent."""
+        self.answer = CommandAnswer.of(result)
+        is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
+        if self._fuses is None:
+            self._fuses = is_accepted
+        if is_accepted:
+            self._accepted_ns = now_ns
+
+    def flows(self, now_ns: int) -> bool:
+        """Whether commands are accepted: each fix is sent."""
+        return bool(self._fuses) and now_ns - self._accepted_ns < _ANSWERED_NS
+
+    def asks(self, state: VehicleState, now_ns: int) -> bool:
+        """Whether to send a fix although they are not, to hear what the autopilot says now."""
+        if now_ns - self._held_ns > _ASK_NS:
+            self._held_since_ns = now_ns
+        self._held_ns = now_ns
+        if self._fuses is None:
+            aided = bool(state.ekf_flags & mavlink.EKF_POS_HORIZ_ABS)
+            may_ask = aided and gnss_healthy(state, now_ns)
+        else:
+            may_ask = self._fuses
+        if not may_ask or now_ns - self._asked_ns < _ASK_NS:
+            return False
+        self._asked_ns = now_ns
+        if self._fuses is None:
+            self.answer = CommandAnswer.NOT_ANSWERED
+        return True
+
+    def is_held(self, now_ns: int) -> bool:
+        """Whether fixes were not sent for so long that an answer would have come."""
+        is_recent = now_ns - self._held_ns < _ASK_NS
+        return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
 
 
 class FixSender:
-    """Runs in the flight-controller link's thread; only `fixes` is filled from outside.
+    """Runs in the flight-controller link's thread; only `put` is called from others.
 
     vision: the last position that was sent or scored.
     """
@@ -40,9 +97,13 @@ class FixSender:
         teller: StatusNotifier,
         counters: Counter[str],
     ) -> None:
-        self.fixes = FixQueue(_QUEUE)
+        self.dropped = 0
+        """Fixes that the link's thread came too late for."""
+        self._fixes: deque[VisionFix] = deque(maxlen=_QUEUE)
         self.injector = Injector(shared.config.injection, shared.geoid_separation_m, shared.utc)
         self.vision: PropagatedFix | None = None
+        commands = shared.config.injection.message == "external_position_estimate"
+        self._command = PositionCommand() if commands else None
         self._component = shared.config.localizer_component
         self._attitude_at = shared.tracker.attitude_at
         self._origin = origin
@@ -54,58 +115,89 @@ class FixSender:
         self._delivered_ns = 0
         self._sent_ns: int | None = None  # to the flight controller
 
-    def take(self, now_ns: int) -> None:
-        """The fixes that came since the last call."""
-        for fix in self.fixes.take():
-            self.injector.submit(fix, now_ns)
+    def put(self, fix: VisionFix) -> None:
+        """Append a fix; the oldest is dropped where too many wait. Never blocks."""
+        self.dropped += len(self._fixes) == _QUEUE
+        self._fixes.append(fix)
 
-    def step(self, link: Link, profile: FirmwareProfile, mode: Mode, now_ns: int) -> None:
-        """Send what is due, as the mode allows, and tell why not. mode: not ``off``."""
-        context = InjectionContext(self._origin.origin, profile, self._attitude_at)
+    def take(self, now_ns: int) -> None:
+        """The fixes that came since the last call, oldest first."""
+        while self._fixes:
+            self.injector.submit(self._fixes.popleft(), now_ns)
+
+    def acknowledged(self, link: Link, ack: Any, now_ns: int) -> None:
+        """A COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE; a ground station sends that command, too."""
+        ours = ack.target_system in (0, link.system_id)
+        if self._command is not None and ours and ack.target_component in (0, self._component):
+            self._command.take(ack.result, now_ns)
+
+    def rebooted(self) -> None:
+        """The autopilot starts over."""
+        self.injector.guard.reset()
+        self._command = None if self._command is None else PositionCommand()
+
+    def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
+        """Send what is due if the mode allows it, else report why not. mode: not ``off``."""
+        profile = select_profile(state.autopilot, state.version)
+        context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)
         injection = self.injector.step(now_ns, context)
         if injection is not None:
             self.vision = injection.estimate.position
-            self._deliver(link, mode, injection, now_ns)
+            self._deliver(link, state, mode, injection, now_ns)
         reason = self.injector.reason
+        command = self._command if mode == "inject" else None
+        if reason is None and command is not None and not command.flows(now_ns):
+            reason = alert(AlertId.COMMAND_NOT_TAKEN, answer=command.answer)
         if reason is None and not self._taken:
             reason = alert(AlertId.LINK_FULL)
         self._reason = reason
         # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
         recent = now_ns - self._delivered_ns < _NEWS_AFTER_NS
         of = None if reason is None else reason.id
-        if of is not AlertId.NO_FIX_YET and not (recent and of in _BRIEF):
+        waits = of is AlertId.COMMAND_NOT_TAKEN and command and not command.is_held(now_ns)
+        if of is not AlertId.NO_FIX_YET and not (recent and of in _BRIEF) and not waits:
             relief = alert(AlertId.INJECTING) if mode == "inject" else None
             self._teller.tell_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
-        """Whether positions came of late (and went, where they are to), and the yaw guard is
-        content.
+        """Whether positions came lately (and were sent, in mode ``inject``), and the yaw guard does
+        not block.
         """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
     def reaches_ekf(self, now_ns: int) -> bool:
-        """Whether positions went to the flight controller of late: not while a shadow, withheld,
-        or refused by the port.
+        """Whether positions were sent to the flight controller lately: not in shadow mode, while
+        output is held, or while the port takes none.
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
 
     def fed(self, now_ns: int) -> bool:
-        """Whether what the EKF says may still be made of our positions."""
+        """Whether the EKF's state may still depend on our positions."""
         return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
 
     @property
     def refusal(self) -> Alert | None:
-        """Why positions that are due are not made, once it has lasted and was told; else None."""
+        """Why due positions are not sent, once that has lasted and was reported; else None."""
         reported = self._teller.reported("inject")
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""
-        return {"fixes": len(self.fixes), "due": self.injector.waiting}
+        return {"fixes": len(self._fixes), "due": self.injector.waiting}
 
-    def _deliver(self, link: Link, mode: Mode, injection: EncodedMessage, now_ns: int) -> None:
+    def _deliver(
+        self, link: Link, state: VehicleState, mode: Mode, injection: EncodedMessage, now_ns: int
+    ) -> None:
         self._outcome.made(injection.estimate)
+        if self._command is not None and mode == "inject":
+            if not injection.estimate.fresh:
+                return  # it has its age with it: nothing is propagated
+            if not self._command.flows(now_ns):
+                if self._command.asks(state, now_ns):
+                    self._counters["position_commands"] += 1
+                    link.send(injection.message, self._component)
+                return
         # What a port that is full does not take, the EKF does not have: no source to switch to.
         self._taken = mode != "inject" or link.send(injection.message, self._component)
         if not self._taken:
