@@ -56,9 +56,7 @@ def test_one_photo_from_a_prior_that_is_off(small_assets, small_sequence, tmp_pa
     assert tum[1:4] == pytest.approx(position, abs=1e-3)
 
 
-def test_a_measured_height_and_attitude_make_the_pose_surer(
-    small_assets, small_sequence, tmp_path
-):
+def test_a_measured_height_and_attitude_make_the_pose_surer(small_assets, small_sequence, tmp_path):
     row = read_poses(small_sequence / "poses.txt")[0]
     p = row.position
     prior = ",".join(map(str, (p.latitude_deg + 5 / 111e3, p.longitude_deg, p.height_m,
