@@ -1,7 +1,7 @@
-"""How far the map lies beside GNSS: estimated while GNSS is healthy, told, applied on wish.
+"""Estimates, reports and optionally applies the map's offset from GNSS.
 
-Orthophotos are often metres off. As long as GNSS is followed that shows as a constant difference
-between vision and the EKF; afterwards nothing would tell it any more.
+Orthophotos are often metres off. While the EKF follows GNSS, the offset is a constant difference
+between vision and the EKF. After the loss of GNSS it cannot be observed.
 """
 
 from __future__ import annotations
@@ -93,11 +93,11 @@ def estimate(blocks: Array, bias_m: float) -> MapOffset:
 
 
 class MapOffsetEstimator:
-    """A judge of fixes (`FixInjection.add_judge`) that leaves them as they are, or shifts them.
+    """A judge of fixes (`FixInjection.add_judge`) that passes them on unchanged or shifted.
 
-    It stands before the others: whatever compares fixes with GNSS compares what is injected. What
-    it knows it keeps when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the receiver
-    that the vehicle reports is our own injection, of which nothing can be learned.
+    It comes before the other judges, so that they compare with GNSS what is injected. It keeps its
+    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the vehicle's receiver
+    is our own GPS_INPUT, which shows nothing.
     """
 
     def __init__(

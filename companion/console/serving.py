@@ -1,7 +1,7 @@
-"""The HTTP server under the page: uvicorn's, with no patience for requests that never become whole.
+"""The page's HTTP server: uvicorn with a time limit for incomplete requests.
 
-uvicorn waits for ever for the rest of a request, and counts who waits among the connections that
-may be open: a hundred clients that send half a line each would keep the operator out.
+uvicorn waits without limit for the rest of a request and counts it among the open connections. So a
+hundred clients that send half a line each would lock the operator out.
 """
 
 from __future__ import annotations

@@ -159,8 +159,8 @@ class FixMemory:
         self._leaves = True
 
     def stop(self) -> None:
-        """Stop keeping; a flight that ended in order leaves nothing to go on from. A disk that
-        stands still is left behind.
+        """Stop keeping. A flight that ended in order leaves no fix to start from. A disk that does
+        not respond is not waited for.
         """
         self._stop.set()
         if joined(self._thread) and self._path is not None and not self._leaves:

@@ -1,10 +1,10 @@
-"""Vision's displacement against the IMU's over 1, 3 and 10 s.
+"""Compares vision's displacement with the IMU's over 1, 3 and 10 s.
 
-The EKF cannot be asked: on vision alone it follows what it is fed. A small filter of its own
-predicts each fix from those before and the IMU; a frozen or foreign picture of a moving aircraft
-is metres off that prediction within a second. A hover gives the IMU little to contradict: a tenth
-of a metre per second squared is what its tilt may be wrong by. There the pictures must tell; a
-position that stands still is no fault by itself, only no proof that a fault is over.
+The EKF cannot be the reference: on vision alone it follows what it is fed. A small filter predicts
+each fix from earlier fixes and the IMU. A frozen or foreign image of a moving aircraft is metres
+off that prediction within a second. In a hover the IMU shows little: its tilt may be wrong by a
+tenth of a metre per second squared. There the images must show a fault. A position that does not
+move is no fault, but it does not prove that a fault is over.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class MotionCheck:
         if moved is None:
             self._moved = None
             return MotionVerdict(False, 0.0, 0.0, still_s)
-        sigma = max(_sigma(fix), _SIGMA_FLOOR_M)
+        sigma = max(fix.horizontal_sigma_m, _SIGMA_FLOOR_M)
         last = self._moved
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
         anew = self._restarts != self._track.restarts or gap_s > _GAP_S or leaps
@@ -158,7 +158,3 @@ class StillPosition:
                 self._reference = (self._block_ns, mean)
             self._block = []
         return 0.0 if self._reference is None else (time_ns - self._reference[0]) * 1e-9
-
-
-def _sigma(fix: VisionFix) -> float:
-    return float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))

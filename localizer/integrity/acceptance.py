@@ -1,10 +1,10 @@
 """Which estimates may be used.
 
-An estimate is acceptable when the registration succeeded, enough anchors were seen, it shows the
-right place by all its evidence (`localizer.integrity.probability`), and it agrees with the
-prediction (Mahalanobis distance). A wide prior holds more places that look alike, so it asks for
-more evidence. A place on trial is refused where another focal length fits better. What runs of
-acceptances and rejections make of the tracker's state stands in `localizer.tracking.states`.
+An estimate is acceptable if the registration succeeded, enough anchors were seen, all evidence
+together shows the right position (`localizer.integrity.probability`), and it agrees with the
+prediction (Mahalanobis distance). A wide prior contains more positions that look similar, so it
+needs more evidence. A tentative track is refused if another focal length fits better.
+`localizer.tracking.states` derives the tracker's state from runs of acceptances and rejections.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ class IntegrityConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
+    # Of 9,400 wrong registrations of ten maps, each by a fit without its kind, the highest lie at
+    # 3.8 among equal roofs, at 1.3 on an outdated map, and at -0.2 on all others.
     min_log_odds: float = Field(
-        2.0,
+        1.0,
         ge=-20,
         le=50,
         description="natural log odds that a registration shows the right place",

@@ -1,4 +1,4 @@
-"""One frame's way through the algorithm, without threads: the two halves that the engine runs.
+"""The algorithm for one frame, without threads, in the two halves that the engine runs.
 
 `Localizer.make_reference` is the render thread's half (predict, render, extract, anchors),
 `Localizer.localize` the localization thread's (extract, register, judge, filter).

@@ -76,7 +76,7 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.MAP_UNREADABLE, WARNING, "map unreadable", {}, "parts of the map cannot be read",
               "every part is read", "coarser levels replace them", "check the disk after landing"),
     condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {}, "the record cannot be written",
-              "not in this flight", "part of the flight is not recorded", _RECORD),
+              "not before the next flight", "part of the flight is not recorded", _RECORD),
     event(A.ENDING, NOTICE, "ending, nothing is injected any more", {}, "the process ends",
           "no position is sent", _NONE),
     event(A.COMPANION_RESTARTS, CRITICAL, "companion {how} ({what}), restarting",

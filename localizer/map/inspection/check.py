@@ -235,7 +235,7 @@ def _intact(cache: TileCache) -> list[MapFinding]:
 
 
 def _source_finding(cache: TileCache) -> list[MapFinding]:
-    """What the build doubted and did not stop for."""
+    """The warnings of the build."""
     warnings = cache.manifest.warnings
     if not warnings:
         return []
