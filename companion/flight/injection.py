@@ -93,7 +93,8 @@ class FixInjection:
         )
         fix = self._judged(estimate, fix)
         if fix is not None:
-            self._jump.carried()
+            if not fix.position_withheld:
+                self._jump.carried()
             self._bridge.submit(fix)
 
     def _judged(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:

@@ -129,6 +129,12 @@ class IntegrityChecks:
     def _active(self) -> list[AlertDebouncer]:
         return [debouncer for debouncer in self._debouncers.values() if debouncer.raised]
 
+    @property
+    def _is_only_uncertain(self) -> bool:
+        """Whether the protection level alone holds output: how the position changes is right."""
+        holding = {one.spec.id for one in self._active() if one.spec.action >= OutputAction.HOLD}
+        return holding == {AlertId.HPL_OVER_LIMIT}
+
     def restore(self, found: ActiveAlerts) -> None:
         """What stood in a process before this one stands until evidence speaks against it."""
         for of, (figure, word) in found.items():
@@ -166,7 +172,8 @@ class IntegrityChecks:
         *,
         held: bool = False,
     ) -> VisionFix | None:
-        """The fix, if it may be injected; with a reset where the last ones were wrong.
+        """The fix, if it may be injected; with a reset where the last ones were wrong. One of the
+        odometry that its protection level alone speaks against is `position_withheld`.
 
         attitude: the autopilot's at the fix's time, None where it is not known; withheld: another
         has a reason against it, and a reset stays due.
@@ -195,7 +202,8 @@ class IntegrityChecks:
             self._reset_due = (
                 self._reset_due or self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
             )
-            return None
+            moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
+            return replace(fix, position_withheld=True) if moves_right else None
         if held:
             return None
         resets, self._reset_due = self._reset_due or fix.reset, False

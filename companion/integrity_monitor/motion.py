@@ -24,6 +24,9 @@ from mavlink_bridge.messages import VisionFix
 Array = NDArray[np.float64]
 _BIAS_WALK = 0.002  # m/s^2/sqrt(s): of tilt and accelerometer together, in north and east
 _SIGMA_FLOOR_M = 0.2
+# Of the odometry's from fix to fix, with what its scale error does in a turn; its sigma would hide
+# a frozen picture.
+_BY_ODOMETRY_M = 0.5
 _SIGMAS = 4.0
 # The noisier the fixes, the longer the filter lives by the IMU alone, and the further an error of
 # tilt that it does not model carries it: honest fixes of sigma 2 m were withheld for 4 m (SITL).
@@ -162,4 +165,5 @@ class StillPosition:
 
 
 def _sigma(fix: VisionFix) -> float:
-    return float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))
+    return min(sigma, _BY_ODOMETRY_M) if fix.by_odometry else sigma

@@ -55,12 +55,15 @@ class PropagationResult(Enum):
 
 @dataclass(frozen=True)
 class PropagatedPose:
-    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED."""
+    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED; noise
+    (6, 6): for the motion model.
+    """
 
     status: PropagationResult
     world_from_camera: Pose | None = None
     covariance: Array | None = None
     quality: float = 0.0
+    noise: Array | None = None
 
 
 _NOTHING = PropagatedPose(PropagationResult.NONE)
@@ -69,6 +72,9 @@ _NOTHING = PropagatedPose(PropagationResult.NONE)
 # Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
+
+# The frames share a large error: taken for noise, it would have them followed late in a turn.
+_FOLLOWED_M = 2.0
 
 
 class DeadReckoning:
@@ -86,6 +92,7 @@ class DeadReckoning:
         registration = odometry_optimizer(optimizer, threads)
         self._odometry = VisualOdometry(camera, registration, config, terrain)
         self._longest_sigma_m = config.longest_sigma_m
+        self._off_map_sigma_m = config.off_map_sigma_m
 
     @property
     def is_ready(self) -> bool:
@@ -135,15 +142,17 @@ class DeadReckoning:
             return PropagatedPose(PropagationResult.BROKEN)
         if not estimate.usable:
             return PropagatedPose(PropagationResult.GAP)
-        if np.sqrt(estimate.covariance.diagonal()[:3].max()) > self._longest_sigma_m:
+        P = estimate.covariance
+        sigma_m, longest_m = float(np.sqrt(P.diagonal()[:3].max())), self._longest_sigma_m
+        if sigma_m > (longest_m if anchors is not None else self._off_map_sigma_m):
             self._odometry.forget()
             return PropagatedPose(PropagationResult.BROKEN)
+        share = min(_FOLLOWED_M / sigma_m, 1.0) if sigma_m > longest_m else 1.0
+        less = np.diag([share] * 3 + [1.0] * 3)
         return PropagatedPose(
-            PropagationResult.CARRIED,
-            estimate.world_from_camera,
-            estimate.covariance,
-            estimate.quality,
-        )
+            PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality,
+            less @ P @ less,
+        )  # fmt: skip
 
     def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
         """about: where the camera is, to some metres."""

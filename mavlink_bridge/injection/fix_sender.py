@@ -66,6 +66,9 @@ class FixSender:
         if injection is not None:
             self.vision = injection.estimate.position
             self._deliver(link, mode, injection, now_ns)
+        delta = self.injector.take_delta()
+        if delta is not None and mode == "inject" and link.send(delta, self._component):
+            self._counters["injected_deltas"] += 1
         reason = self.injector.reason
         if reason is None and not self._taken:
             reason = alert(AlertId.LINK_FULL)

@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter, deque
+from typing import Any
 
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig
-from mavlink_bridge.injection.encode import EncodedEstimate
+from mavlink_bridge.injection.encode import EncodedEstimate, vision_position_delta
 from mavlink_bridge.injection.fix_queue import Latency, PendingJump
 from mavlink_bridge.injection.message_maker import (
     EncodedMessage,
@@ -37,6 +38,7 @@ _QUEUE = 32
 _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
+_DELTA_NS = 500_000_000  # between two fixes that give a velocity
 
 
 class _FixRate:
@@ -90,6 +92,8 @@ class Injector:
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
         self._last_was_fill = False
+        self._withheld: VisionFix | None = None
+        self._delta: Any | None = None
         self._pace = _FixRate(config.overdue_intervals)
         self._sent_fix_ns = 0
         self.yaw_difference_rad: float | None = None
@@ -163,6 +167,11 @@ class Injector:
         self.counters["sent_fresh" if outcome.estimate.fresh else "sent_propagated"] += 1
         return outcome
 
+    def take_delta(self) -> Any | None:
+        """The message of how the vehicle moved while its position is withheld, once."""
+        delta, self._delta = self._delta, None
+        return delta
+
     def next_due_ns(self, now_ns: int) -> int:
         """When `step` must be called next."""
         due = [now_ns + self._period_ns]
@@ -187,12 +196,23 @@ class Injector:
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
+            if fix.position_withheld:
+                self._note_withheld(fix, context)
+                continue
             last = self._propagator.fix
             self._pace.note(fix.time_ns, None if last is None else last.time_ns, now_ns)
             self._propagator.update(fix)
             if self._fresh is not None:
                 self.counters["fixes_superseded"] += 1
             self._fresh = fix
+
+    def _note_withheld(self, fix: VisionFix, context: InjectionContext) -> None:
+        before, self._withheld = self._withheld, fix
+        if before is None or not context.profile.position_delta:
+            return
+        then, now = context.attitude_at(before.time_ns), context.attitude_at(fix.time_ns)
+        if then is not None and now is not None and fix.time_ns - before.time_ns <= _DELTA_NS:
+            self._delta = vision_position_delta((before, then), (fix, now))
 
     # --- what to send ----------------------------------------------------------------------------
 

@@ -91,6 +91,16 @@ def test_a_jump_survives_the_fix_that_a_judge_withholds():
     assert widths == pytest.approx([4e-4, 1e-4])
 
 
+def test_a_withheld_position_is_handed_on_and_does_not_carry_the_jump():
+    bridge, withholds = FakeBridge(), iter([True, False])
+    injection = FixInjection(bridge, INSTALLATION)
+    injection.add_judge(lambda _, fix: replace(fix, position_withheld=next(withholds)))
+    for state in (BRIDGING, TRACKING):
+        injection.add_estimate(_estimate(state), None)
+    told = [(fix.by_odometry, fix.position_withheld, fix.reset) for fix in bridge.fixes]
+    assert told == [(True, True, True), (False, False, True)]
+
+
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
     bridge, broken = FakeBridge(), [False]
 
