@@ -139,27 +139,28 @@ class GnssReturnCheck:
         sigma = math.hypot(accuracy, float(np.mean([r.sigma_m for r in reports])))
         speed = float(np.mean([r.speed_mps for r in reports]))
         off = np.array([r.off_m for r in reports])
-        apart = float(np.hypot(*off.mean(axis=0)))
+        times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
+        drift, drift_sigma, scatter, now = _motion(times, off)
+        apart = max(float(np.hypot(*off.mean(axis=0))), now)  # what drifts away goes on
         if apart > _SIGMAS * sigma + speed * _LAG_ERROR_S:
             return GnssRefusal(apart, "m off vision")
-        times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
-        drift, drift_sigma, scatter = _motion(times, off)
         if scatter > _SCATTER_M + sigma / 2:
             return GnssRefusal(scatter, "m noise")
-        slip, slip_sigma, _ = _motion(times, np.array([r.slipped_m for r in reports]))
+        slip, slip_sigma, *_ = _motion(times, np.array([r.slipped_m for r in reports]))
         for rate, rate_sigma, what in ((drift, drift_sigma, "vision"), (slip, slip_sigma, "IMU")):
             if rate > _DRIFT_MPS + _SIGMAS * rate_sigma:
                 return GnssRefusal(rate, f"m/s off {what}")
         return None
 
 
-def _motion(times: _Array, positions: _Array) -> tuple[float, float, float]:
-    """Speed of the straight line through positions (n, 2), its sigma, and the rms distance to it;
-    m/s and m.
+def _motion(times: _Array, positions: _Array) -> tuple[float, float, float, float]:
+    """Speed of the straight line through positions (n, 2), its sigma, the rms distance to it, and
+    the length of its end; m/s and m.
     """
     t = times - times.mean()
     spread = float(t @ t)
     rate = t @ positions / spread
     left = positions - positions.mean(axis=0) - np.outer(t, rate)
     scatter = float(np.sqrt((left**2).sum(axis=1).mean()))
-    return float(np.hypot(*rate)), scatter / math.sqrt(2 * spread), scatter
+    end = float(np.hypot(*(positions.mean(axis=0) + t[-1] * rate)))
+    return float(np.hypot(*rate)), scatter / math.sqrt(2 * spread), scatter, end
