@@ -8,7 +8,7 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from companion.errors import ConfigError
 from companion.integrity_monitor.config import IntegrityMonitorConfig
@@ -23,18 +23,14 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import MAX_READOUT_MS, Camera, lens_fault
 from localizer.geometry.lens import LensModel, whole_coefficients
 from localizer.sensors.error_model import SENSORS
-from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.config import BridgeConfig, StrictModel
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
 _CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
 _SQUAREST = 1.5  # between fx and fy: pixels of 4:3 and 16:11 are the oddest in use
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class CameraModel(_Model):
+class CameraModel(StrictModel):
     """Intrinsics in pixels of the stream as it arrives (pixel centres at + 0.5)."""
 
     width: int = Field(ge=8, le=8192)
@@ -95,7 +91,7 @@ OLD_CALIBRATION_DAYS = 90
 Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were given in cm or mm
 
 
-class FeedConfig(_Model):
+class FeedConfig(StrictModel):
     """Where the video comes from. How the camera is mounted stands under ``bridge.camera``."""
 
     source: str = Field(
@@ -137,7 +133,7 @@ class FeedConfig(_Model):
         return self
 
 
-class DetectorConfig(_Model):
+class DetectorConfig(StrictModel):
     """An object detector in the companion's own process."""
 
     model: Path = Field(description="ONNX file of a YOLO network")
@@ -163,7 +159,7 @@ class DetectorConfig(_Model):
         return value
 
 
-class TargetConfig(_Model):
+class TargetConfig(StrictModel):
     """Target geo-localization."""
 
     detections: str | None = Field(None, description="host:port for pixel detections")
@@ -206,7 +202,7 @@ class PriorConfig:
     recall_s: float = 20.0  # oldest confirmed position that a restart uses
 
 
-class RecordConfig(_Model):
+class RecordConfig(StrictModel):
     """What is kept of a flight."""
 
     folder: Path = Field(description="folder of the record")
@@ -216,7 +212,7 @@ class RecordConfig(_Model):
     mcap: bool = Field(False, description="also write record.mcap (extra `mcap`)")
 
 
-class KlvConfig(_Model):
+class KlvConfig(StrictModel):
     """The video sent on, with where each picture was taken in it (MISB ST 0601)."""
 
     output: str = Field(
@@ -226,7 +222,7 @@ class KlvConfig(_Model):
     hold_ms: float = Field(200.0, exclude=True)  # longest time that a frame waits for its pose
 
 
-class CompanionConfig(_Model):
+class CompanionConfig(StrictModel):
     """One deployment."""
 
     map: Path = Field(description="tile cache made by `companion map build`")

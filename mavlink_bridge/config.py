@@ -15,11 +15,13 @@ InjectionMessage = Literal[
 Mode = Literal["off", "shadow", "inject", "rc"]
 
 
-class _Model(BaseModel):
+class StrictModel(BaseModel):
+    """Settings that are read once: no unknown key, no infinity, no change."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class OriginConfig(_Model):
+class OriginConfig(StrictModel):
     """The EKF origin to set when the vehicle has none: WGS84 degrees and metres AMSL.
 
     ArduPilot ignores a second origin, so an origin that the vehicle already has wins.
@@ -45,7 +47,7 @@ class YawGuardConfig:
     minimum_samples: int = 5  # fixes compared: the majority blocks, all release
 
 
-class InjectionConfig(_Model):
+class InjectionConfig(StrictModel):
     """What is sent to the flight controller, how often, and when it is withheld."""
 
     message: InjectionMessage = "vision_position_estimate"
@@ -93,7 +95,7 @@ class InjectionConfig(_Model):
         return self
 
 
-class SourceSwitchConfig(_Model):
+class SourceSwitchConfig(StrictModel):
     """Automatic change of the EKF source set when GNSS is judged bad (42007)."""
 
     enabled: bool = False
@@ -110,7 +112,7 @@ class SourceSwitchConfig(_Model):
         return self
 
 
-class InjectionEnableConfig(_Model):
+class InjectionEnableConfig(StrictModel):
     """In mode ``rc`` a channel's pulse width or a command decides between shadow and inject."""
 
     channel: int = Field(default=9, ge=1, le=18)
@@ -121,7 +123,7 @@ class InjectionEnableConfig(_Model):
     )
 
 
-class CameraConfig(_Model):
+class CameraConfig(StrictModel):
     """What the ground station is told about the camera, and how it is mounted."""
 
     announce: bool = True
@@ -155,7 +157,7 @@ class CameraConfig(_Model):
         return math.degrees(2.0 * math.atan(half * self.height_px / self.width_px))
 
 
-class TargetsConfig(_Model):
+class TargetsConfig(StrictModel):
     """How targets are reported."""
 
     rate_hz: float = Field(5.0, exclude=True)
@@ -187,7 +189,7 @@ class TargetsConfig(_Model):
         return value
 
 
-class SigningConfig(_Model):
+class SigningConfig(StrictModel):
     """MAVLink 2 signing: a 32-byte key as 64 hexadecimal digits in a file of mode 0600."""
 
     key_file: Path
@@ -204,7 +206,7 @@ class SigningConfig(_Model):
 SystemId = Annotated[int, Field(ge=1, le=255)]
 
 
-class BridgeConfig(_Model):
+class BridgeConfig(StrictModel):
     """Everything the bridge needs to know.
 
     connection strings: ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT``,

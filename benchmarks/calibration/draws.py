@@ -22,7 +22,7 @@ from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
 from sitl.demo.flight import home_of
 from sitl.demo.scenario import CameraSpec
-from sitl.desk.film import Exposed, Eye, Localized, exposures, write_record
+from sitl.desk.film import EstimateWithTruth, Exposed, Eye, exposures, write_record
 from sitl.desk.flight import Corner, DeskAircraft, DeskFlight, DeskFlightRecord
 from sitl.desk.port import RecordedPort
 
@@ -123,7 +123,7 @@ class Sortie:
         """As the camera takes them."""
         return exposures(self.eye, self.flown, TileCache.open(self.deployment.map), seed)
 
-    def localized(self, config: CompanionConfig, seed: int, keep: bool) -> list[Localized]:
+    def localized(self, config: CompanionConfig, seed: int, keep: bool) -> list[EstimateWithTruth]:
         """The pictures localized under a deployment."""
         tlog = self.folder / "flight.tlog"
         return write_record(self.pictures(seed), config, tlog, self.clocks, keep)

@@ -19,7 +19,7 @@ from localizer.geometry.pose import Array, euler_from_matrix, so3_log
 from sitl.camera.gimbal_error import GimbalError
 from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import CameraSpec
-from sitl.desk.film import Localized
+from sitl.desk.film import EstimateWithTruth
 
 TRUTH = "truth.json"
 _FRAMES = 200  # as the command's default
@@ -88,7 +88,7 @@ def _noise(found: Calibrated) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _errors(seen: list[Localized]) -> dict[str, float]:
+def _errors(seen: list[EstimateWithTruth]) -> dict[str, float]:
     """Of accepted poses against the truth, m; completeness as a share."""
     off = [
         x.estimate.world_from_camera.distance_to(x.truth)[0]

@@ -77,7 +77,7 @@ class Calibrated:
 
 
 @dataclass(frozen=True)
-class _Picture:
+class _ChosenFrame:
     """One that was chosen, on the disk: two hundred of a 4K camera fill 5 GB. said: by the
     autopilot; pose: where it was registered.
     """
@@ -162,7 +162,7 @@ def mount_of(config: CompanionConfig) -> Array:
 
 def _chosen(
     record: FlightRecord, tlog: Path, stack: MapStack, mount: Array, most: int
-) -> tuple[list[_Picture], float]:
+) -> tuple[list[_ChosenFrame], float]:
     """At most so many accepted estimates with their pictures, and the receiver's own error, m."""
     config, bridge = record.config, record.config.bridge
     autopilot = RecordedAutopilot(bridge, tlog, record.start_ns, record.utc_minus_monotonic_ns)
@@ -179,7 +179,7 @@ def _chosen(
     picked = np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))
     geoid_m, frame = stack.cache.manifest.geoid_separation_m, stack.cache.frame
     trusted = bridge.mode not in _OURS
-    pictures: list[_Picture] = []
+    pictures: list[_ChosenFrame] = []
     accuracies_m: list[float | None] = []
     for index in picked:
         estimate = good[index]
@@ -193,7 +193,7 @@ def _chosen(
         elif window.has_place:
             accuracies_m.append(state.gps_h_accuracy_m)
         path = image_path(record.folder, estimate)
-        pictures.append(_Picture(estimate, path, window, estimate.world_from_camera))
+        pictures.append(_ChosenFrame(estimate, path, window, estimate.world_from_camera))
     if len(pictures) < _LEAST_FRAMES:
         raise RecordError(
             f"{tlog}: attitude and gimbal are known at {len(pictures)} of {len(picked)} pictures; "
@@ -202,7 +202,7 @@ def _chosen(
     return pictures, receiver_bias_m(accuracies_m)
 
 
-def _first_size(record: FlightRecord, pictures: list[_Picture]) -> tuple[int, int]:
+def _first_size(record: FlightRecord, pictures: list[_ChosenFrame]) -> tuple[int, int]:
     """Width and height of the first picture that can be read."""
     for picture in pictures:
         if (image := _read(picture)) is not None:
@@ -210,7 +210,7 @@ def _first_size(record: FlightRecord, pictures: list[_Picture]) -> tuple[int, in
     raise RecordError(f"{record.folder}: none of its pictures can be read")
 
 
-def _read(picture: _Picture) -> Image | None:
+def _read(picture: _ChosenFrame) -> Image | None:
     """None of one that was cut off, as by a loss of power."""
     try:
         return read_image(picture.path)
@@ -239,9 +239,9 @@ def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
 
 
 def _sighted(
-    pictures: list[_Picture], reader: PictureReader, camera: Camera, late_s: float,
+    pictures: list[_ChosenFrame], reader: PictureReader, camera: Camera, late_s: float,
     progress: Callable[[int], None],
-) -> tuple[list[_Picture], list[CalibrationFrame]]:  # fmt: skip
+) -> tuple[list[_ChosenFrame], list[CalibrationFrame]]:  # fmt: skip
     kept, sighted = [], []
     for number, picture in enumerate(pictures):
         progress(number + 1)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from companion.calibration_watch.config import CalibrationLimits
 from localizer.sensors.error_model import SENSORS
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+from mavlink_bridge.config import StrictModel
 
 
 @dataclass(frozen=True)
@@ -34,7 +31,7 @@ class MotionCheckConfig:
     still_m: float = 0.1  # position changes below this do not count as motion
 
 
-class ProtectionConfig(_Model):
+class ProtectionConfig(StrictModel):
     """The budget of a protection level: what a fix's covariance does not know of, each as one
     standard deviation along an axis.
 
@@ -58,7 +55,7 @@ class ProtectionConfig(_Model):
         return self.model_copy(update={"calibration_share": share})
 
 
-class IntegrityMonitorConfig(_Model):
+class IntegrityMonitorConfig(StrictModel):
     """The independent monitor: what it watches and when it withholds fixes."""
 
     enabled: bool = True

@@ -59,7 +59,7 @@ class LogTrack:
 
 
 @dataclass
-class _Raw:
+class _LogRows:
     """Rows of a log by kind, each with UTC nanoseconds first."""
 
     positions: list[tuple[int, float, float, float, float]]
@@ -89,7 +89,7 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
     return LogTrack(Track(samples), tuple(sorted(raw.triggers)), bool(raw.gimbals), tuple(notes))
 
 
-def _samples(raw: _Raw, fixed_pitch_deg: float) -> Iterator[Telemetry]:
+def _samples(raw: _LogRows, fixed_pitch_deg: float) -> Iterator[Telemetry]:
     positions = Track([_position(*row) for row in raw.positions])
     times = np.array([row[0] for row in raw.attitudes], dtype=np.int64)
     angles = np.unwrap(np.array([row[1:] for row in raw.attitudes]), axis=0)
@@ -117,7 +117,7 @@ def _samples(raw: _Raw, fixed_pitch_deg: float) -> Iterator[Telemetry]:
         yield replace(where, time_ns=time_ns, view=view, course_deg=math.degrees(yaw) % 360.0)
 
 
-def _gimbal(raw: _Raw, times: np.ndarray, time_ns: int) -> GimbalAngles | None:
+def _gimbal(raw: _LogRows, times: np.ndarray, time_ns: int) -> GimbalAngles | None:
     if not len(times):
         return None
     near = int(np.argmin(np.abs(times - time_ns)))
@@ -147,8 +147,8 @@ def vehicle_messages(path: Path) -> Iterator[Dated]:
         ) from error
 
 
-def _read(path: Path) -> _Raw:
-    raw, clock = _Raw([], [], [], []), BootClock()
+def _read(path: Path) -> _LogRows:
+    raw, clock = _LogRows([], [], [], []), BootClock()
     vehicle: int | None = None
     for received_ns, message in vehicle_messages(path):
         kind = message.get_type()
@@ -164,7 +164,7 @@ def _read(path: Path) -> _Raw:
     return raw
 
 
-def _take(raw: _Raw, kind: str, m: Any, time_ns: int) -> None:
+def _take(raw: _LogRows, kind: str, m: Any, time_ns: int) -> None:
     if kind == "GLOBAL_POSITION_INT" and (m.lat or m.lon):
         above_m = m.relative_alt * 1e-3
         raw.positions.append((time_ns, m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3, above_m))

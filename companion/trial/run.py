@@ -53,7 +53,7 @@ def run_trial(
         stack = MapStack(map_cache, config)
         opened.callback(stack.close)
         known, kind = priors_of(flight, stack.cache), map_kind(stack.cache)
-        search = _Search(stack.cache, config, opened)
+        search = _LazyRelocalizer(stack.cache, config, opened)
         first_loader = FrameLocalizer(
             build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
         )
@@ -83,7 +83,7 @@ def _map_notes(kind: MapKind, flight: RecordedFlight) -> tuple[str, ...]:
     return (f"map: {kind.line()}", *([advice] if advice else []))
 
 
-class _Search:
+class _LazyRelocalizer:
     """Opens the relocalizer when it is first needed: it computes the map's overview."""
 
     def __init__(self, cache: TileCache, config: LocalizerConfig, opened: ExitStack) -> None:

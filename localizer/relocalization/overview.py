@@ -242,7 +242,7 @@ def _squares(cache: TileCache, gsd_m: float) -> _Squares:
 
 
 @dataclass(frozen=True)
-class _Raw:
+class _SquareFeatures:
     """Features (n, n, C) float16 of a square, their weights (n, n), and the ground's heights."""
 
     features: NDArray[np.float16]
@@ -250,7 +250,9 @@ class _Raw:
     ground: Float32
 
 
-def _raw(plan: _Squares, corner: tuple[int, int], r: MapRenderer, e: FeatureExtractor) -> _Raw:
+def _raw(
+    plan: _Squares, corner: tuple[int, int], r: MapRenderer, e: FeatureExtractor
+) -> _SquareFeatures:
     m, n = _MARGIN_CELLS, _SQUARE_CELLS
     side = (n + 2 * m) * STRIDE
     view = render_top_view(r, plan.centre(corner), side, plan.gsd_m, plan.base_m)
@@ -259,7 +261,7 @@ def _raw(plan: _Squares, corner: tuple[int, int], r: MapRenderer, e: FeatureExtr
     known = np.isfinite(view.height[m * STRIDE : -m * STRIDE, m * STRIDE : -m * STRIDE])
     share = known.reshape(n, STRIDE, n, STRIDE).mean(axis=(1, 3))
     weight = level.confidence[inner, inner] * (share > _LEAST_SHARE)
-    return _Raw(
+    return _SquareFeatures(
         level.features[inner, inner].astype(np.float16),
         weight.astype(np.float32),
         _ground(view.height[m * STRIDE : -m * STRIDE, m * STRIDE : -m * STRIDE]),
@@ -284,7 +286,7 @@ def _compute(
     should_stop: Callable[[], bool],
 ) -> OverviewLevel | None:
     chosen = np.linspace(0, len(plan.corners) - 1, _SAMPLE_SQUARES).round().astype(int)
-    kept: dict[int, _Raw] = {}
+    kept: dict[int, _SquareFeatures] = {}
     for k in np.unique(chosen).tolist():
         if should_stop():
             return None
@@ -311,7 +313,7 @@ def _compute(
     return OverviewLevel(features, ground, projection, plan.west, plan.north, plan.gsd_m)
 
 
-def _principal(squares: Iterable[_Raw]) -> Projection:
+def _principal(squares: Iterable[_SquareFeatures]) -> Projection:
     """The leading components of the features, each counted with its weight squared."""
     total, mean, second = 0.0, None, None
     for raw in squares:

@@ -152,7 +152,7 @@ def search(
     level = level_for(tuple(c.level for c in correlators), seen.side_m * float(heights[0]))
     correlator = next(c for c in correlators if c.level is level)
     correlator.begin()
-    run = _Search(view, query, correlator, extractor, config, seen, heights)
+    run = _MapSearch(view, query, correlator, extractor, config, seen, heights)
     run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
     groups = shared_extractions(heights, config.extraction_ratio)
     jobs = [(float(a), g) for g in groups for a in headings(query, config)]
@@ -197,7 +197,7 @@ class BlockScores:
 
 
 @dataclass(frozen=True)
-class _Search:
+class _MapSearch:
     """suited: for each height the blocks that it is right for anywhere, and where (`suits`)."""
 
     view: SearchView

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from companion.config import CameraModel
 from companion.settings_file import SettingsError, read_settings, validated
 from localizer.geometry.camera import Camera
 from localizer.synth.config import Character
+from mavlink_bridge.config import StrictModel
 from sitl.errors import SimulationError
 
 VehicleChoice = Literal["auto", "ardupilot", "embedded"]
@@ -25,11 +26,7 @@ class ScenarioError(SimulationError):
     """A scenario file that cannot be read or does not hold."""
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class ScenarioLeg(_Model):
+class ScenarioLeg(StrictModel):
     """A waypoint: metres east and north of home, height above home, and the gimbal's pitch on the
     way there (-90 looks straight down).
     """
@@ -40,7 +37,7 @@ class ScenarioLeg(_Model):
     gimbal_pitch_deg: float = Field(-75.0, ge=-90, le=0)
 
 
-class ErrorSpec(_Model):
+class ErrorSpec(StrictModel):
     """How wrong the deployment is about the aircraft: standard deviations (`map_shift_m`: least and
     most) from which each flight draws. The defaults are what a careful calibration leaves.
     """
@@ -79,7 +76,7 @@ class ErrorSpec(_Model):
         return self
 
 
-class CameraSpec(_Model):
+class CameraSpec(StrictModel):
     """The world camera's video. H.264 of this chroma format takes even sizes only."""
 
     width: int = Field(640, ge=64, le=4096, multiple_of=2)
@@ -111,7 +108,7 @@ class CameraSpec(_Model):
         )  # fmt: skip
 
 
-class SatelliteMap(_Model):
+class SatelliteMap(StrictModel):
     """A mosaic instead of the survey: seen from `azimuth_deg` (clockwise from north) at an angle
     from nadir, over bare terrain.
     """
@@ -138,7 +135,7 @@ _LEGS = (
 )
 
 
-class Scenario(_Model):
+class Scenario(StrictModel):
     """One GNSS-denied flight, by default as wrong and rough as a real one (`ideal` is neither)."""
 
     takeoff_height_m: float = Field(120.0, gt=20, le=1000)

@@ -74,7 +74,7 @@ def exposures(eye: Eye, flown: DeskFlightRecord, cache: TileCache, seed: int) ->
 
 
 @dataclass(frozen=True)
-class Localized:
+class EstimateWithTruth:
     """One picture's outcome. estimate: None where nothing could be said."""
 
     estimate: PoseEstimate | None
@@ -84,7 +84,7 @@ class Localized:
 def write_record(
     pictures: Iterator[Exposed], config: CompanionConfig, tlog: Path, clocks: tuple[int, int],
     keep: bool = True,
-) -> list[Localized]:  # fmt: skip
+) -> list[EstimateWithTruth]:  # fmt: skip
     """Localize the pictures under a deployment, and keep them as its record.
 
     clocks: begin of the record on CLOCK_MONOTONIC, and UTC less it, ns. keep: pictures and all.
@@ -116,11 +116,11 @@ def write_record(
             try:
                 estimate = localizer.track(frame)
             except OutsideMapError:
-                localized.append(Localized(None, exposed.pose))
+                localized.append(EstimateWithTruth(None, exposed.pose))
                 continue
             if estimate.accepted:
                 pose.belief.note_fix(estimate.exposure_time_ns)
-            localized.append(Localized(estimate, exposed.pose))
+            localized.append(EstimateWithTruth(estimate, exposed.pose))
             if recorder is not None:
                 recorder.estimate(
                     replace(estimate, stage_ms=estimate.stage_ms | {"latency": 1e-6 * _LATENCY_NS})

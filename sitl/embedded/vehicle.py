@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.mavlink.commands import Commands
 from sitl.embedded.mavlink.server import MavlinkServer
-from sitl.embedded.mavlink.telemetry import DEFAULT_STREAMS, Telemetry
+from sitl.embedded.mavlink.telemetry import DEFAULT_STREAMS, TelemetryBuilder
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.dynamics import TICK_S
 from sitl.geodesy import Location
@@ -29,7 +29,7 @@ class EmbeddedVehicle:
         seed: int = 0,
     ) -> None:
         self.aircraft = Aircraft(home, heading_deg, parameters, server, seed)
-        self.telemetry = Telemetry(self.aircraft)
+        self.telemetry = TelemetryBuilder(self.aircraft)
         self.commands = Commands(self.aircraft, self.telemetry)
         self._server = server
         self._announced = (False, False)

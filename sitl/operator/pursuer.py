@@ -33,7 +33,7 @@ _HAND_PX = 1.5
 _CAR_TOP_M = 0.75
 
 
-class _Pictures:
+class _FrameLog:
     """The world camera's log as it grows: when each picture was truly taken, and from where."""
 
     def __init__(self, path: Path) -> None:
@@ -98,7 +98,7 @@ class Pursuer:
         try:
             if time.monotonic_ns() > begin_ns:
                 raise RuntimeError("the car had gone by before the aircraft was ready")
-            with closing(_Pictures(cabin.frames)) as pictures:
+            with closing(_FrameLog(cabin.frames)) as pictures:
                 if self._fly_along(cabin, station, chase, begin_ns - _STEER_NS):
                     return
                 pictures.newest()  # what there is so far is read before it counts

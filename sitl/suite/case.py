@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge import BridgeConfig
+from mavlink_bridge.config import StrictModel
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.checks import Check
 from sitl.suite.simulated_localizer import FixModel, RawMessage
@@ -26,11 +27,7 @@ from sitl.vehicles.launch import (
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class VehicleSpec(_Model):
+class VehicleSpec(StrictModel):
     """The vehicle's parameters: a named set and what differs from it.
 
     vision: EK3_SRC1 on external navigation, no receiver. gnss_then_vision: a receiver in source
@@ -40,7 +37,7 @@ class VehicleSpec(_Model):
     """
 
     sources: Literal["vision", "gnss_then_vision", "gps_input"]
-    parameters: dict[str, float] = {}
+    parameters: dict[str, float] = Field(default_factory=dict)
     origin_north_m: float | None = None
 
     @property
@@ -59,7 +56,7 @@ class VehicleSpec(_Model):
         return {**named, **SPEEDS, **off, **self.parameters}
 
 
-class Flight(_Model):
+class Flight(StrictModel):
     """Where it flies. side_m 0 hovers; seconds None ends when the square is closed.
 
     ground: never arms; `seconds` are spent on the ground.
@@ -77,7 +74,7 @@ class Flight(_Model):
         return self
 
 
-class CaseEvent(_Model):
+class CaseEvent(StrictModel):
     """Something that happens at_s seconds after the take-off height is reached.
 
     fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
@@ -87,10 +84,10 @@ class CaseEvent(_Model):
     """
 
     at_s: float = Field(ge=0)
-    fixes: dict[str, Any] = {}
+    fixes: dict[str, Any] = Field(default_factory=dict)
     reset: bool = False
-    vehicle: dict[str, float] = {}
-    ramp: dict[str, tuple[float, float]] = {}
+    vehicle: dict[str, float] = Field(default_factory=dict)
+    ramp: dict[str, tuple[float, float]] = Field(default_factory=dict)
     over_s: float = Field(0.0, ge=0, le=300)
     scattered: tuple[str, ...] = ()
     source_set: int | None = Field(None, ge=1, le=3)
@@ -125,7 +122,7 @@ class CaseEvent(_Model):
         return ", ".join(parts)
 
 
-class GroundSetup(_Model):
+class GroundSetup(StrictModel):
     """What is done before take-off. doctor: wrong parameters are found and mended by
     `companion doctor --fix`; reboot: the autopilot starts anew while it is being injected.
     """
@@ -134,7 +131,7 @@ class GroundSetup(_Model):
     reboot: bool = False
 
 
-class Case(_Model):
+class Case(StrictModel):
     """One scenario. Exactly one of bridge (our bridge's configuration, without the connection) and
     raw (a bare MAVLink sender) injects. monitor: watches what goes to our bridge.
 

@@ -18,7 +18,7 @@ FOREVER = math.inf
 
 
 @dataclass(frozen=True)
-class CheckResult:
+class ExpectationResult:
     """One expectation's outcome. better: the figure lies below the reference's band."""
 
     ok: bool
@@ -30,7 +30,7 @@ class _Expectation(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @abstractmethod
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """Hold the record against the expectation."""
 
 
@@ -51,15 +51,15 @@ class AsAccurateAs(_Span):
     max: float | None = None
     within_percent: float = Field(25.0, gt=0)
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if len(errors) < 100:
-            return CheckResult(False, f"only {len(errors)} EKF positions")
+            return ExpectationResult(False, f"only {len(errors)} EKF positions")
         median = float(np.median(errors))
         change = 100.0 * (median / self.median - 1.0)
         what = f"median {median:.2f} m, {change:+.0f} % of {self.median:.2f}"
-        return CheckResult(change <= self.within_percent, what, change < -self.within_percent)
+        return ExpectationResult(change <= self.within_percent, what, change < -self.within_percent)
 
 
 class MedianBelow(_Span):
@@ -68,13 +68,13 @@ class MedianBelow(_Span):
     check: Literal["median_below"]
     metres: float
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
-            return CheckResult(False, "no EKF positions")
+            return ExpectationResult(False, "no EKF positions")
         median = float(np.median(errors))
-        return CheckResult(median <= self.metres, f"median {median:.2f} of {self.metres:g} m")
+        return ExpectationResult(median <= self.metres, f"median {median:.2f} of {self.metres:g} m")
 
 
 class MaxError(_Span):
@@ -84,17 +84,17 @@ class MaxError(_Span):
     at_least: float = 0.0
     at_most: float = FOREVER
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
-            return CheckResult(False, "no EKF positions")
+            return ExpectationResult(False, "no EKF positions")
         largest = float(errors.max())
         what = f"max {largest:.2f} m, wanted {self.at_least:g} to {self.at_most:g}"
-        return CheckResult(self.at_least <= largest <= self.at_most, what)
+        return ExpectationResult(self.at_least <= largest <= self.at_most, what)
 
 
-class Jumps(_Expectation):
+class JumpExpectation(_Expectation):
     """The EKF's north error goes to north_m with the jump at at_s: it is there settled_s later and
     for 2 s more, and never beyond by more than overshoot_m.
     """
@@ -106,18 +106,18 @@ class Jumps(_Expectation):
     tolerance_m: float = 1.0
     overshoot_m: float = 2.0
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         begin = self.at_s + self.settled_s
         there = record.north(begin, begin + 2.0)
         whole = record.north(self.at_s, begin + 2.0)
         if len(there) < 10:
-            return CheckResult(False, "no EKF positions after the jump")
+            return ExpectationResult(False, "no EKF positions after the jump")
         median = float(np.median(there))
         beyond = float(np.max((whole - self.north_m) * math.copysign(1.0, self.north_m)))
         ok = abs(median - self.north_m) <= self.tolerance_m and beyond <= self.overshoot_m
         what = f"{median:.1f} m {self.settled_s:g} s after a jump of {self.north_m:g} m"
-        return CheckResult(ok, f"{what}, overshoot {beyond:.1f}")
+        return ExpectationResult(ok, f"{what}, overshoot {beyond:.1f}")
 
 
 class Lags(_Expectation):
@@ -131,7 +131,7 @@ class Lags(_Expectation):
     after_s: float
     before_s: float
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         taken = [
             t - self.at_s
@@ -140,8 +140,8 @@ class Lags(_Expectation):
         ]
         wanted = f"wanted {self.after_s:g} to {self.before_s:g} s"
         if not taken:
-            return CheckResult(math.isinf(self.before_s), "jump never taken")
-        return CheckResult(
+            return ExpectationResult(math.isinf(self.before_s), "jump never taken")
+        return ExpectationResult(
             self.after_s <= taken[0] <= self.before_s,
             f"jump taken after {taken[0]:.1f} s, {wanted}",
         )
@@ -154,7 +154,7 @@ class Says(_Span):
     contains: str
     absent: bool = False
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         times = [
             t.at_s
@@ -164,7 +164,7 @@ class Says(_Span):
             and self.from_s <= t.at_s <= self.to_s
         ]
         said = f"{times[0]:.1f} s" if times else "never"
-        return CheckResult(bool(times) != self.absent, f"vehicle: '{self.contains}' {said}")
+        return ExpectationResult(bool(times) != self.absent, f"vehicle: '{self.contains}' {said}")
 
 
 class Reports(_Span):
@@ -177,7 +177,7 @@ class Reports(_Span):
     values: dict[str, str] = {}
     absent: bool = False
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         times = [
             t.at_s for t in record.texts
@@ -186,7 +186,7 @@ class Reports(_Span):
             and self.from_s <= t.at_s <= self.to_s
         ]  # fmt: skip
         said = f"{times[0]:.1f} s" if times else "never"
-        return CheckResult(bool(times) != self.absent, f"bridge: {self.alert.words} {said}")
+        return ExpectationResult(bool(times) != self.absent, f"bridge: {self.alert.words} {said}")
 
 
 class Alerted(_Span):
@@ -196,7 +196,7 @@ class Alerted(_Span):
     limit_m: float = Field(gt=0)
     within_s: float = Field(ge=0)
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         beyond = [
             t
@@ -210,9 +210,9 @@ class Alerted(_Span):
         ]
         said = f"told at {told[0]:.1f} s" if told else "never told"
         if not beyond:
-            return CheckResult(True, f"never beyond {self.limit_m:g} m; {said}")
+            return ExpectationResult(True, f"never beyond {self.limit_m:g} m; {said}")
         ok = bool(told) and told[0] <= beyond[0] + self.within_s
-        return CheckResult(ok, f"beyond {self.limit_m:g} m at {beyond[0]:.1f} s, {said}")
+        return ExpectationResult(ok, f"beyond {self.limit_m:g} m at {beyond[0]:.1f} s, {said}")
 
 
 class Silent(_Span):
@@ -223,7 +223,7 @@ class Silent(_Span):
     check: Literal["no_warning"]
     words: tuple[str, ...] = ("EKF variance", "Failsafe", "rror", "ailed", "litch", "nhealthy")
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         heard = [
             t.text
@@ -232,7 +232,7 @@ class Silent(_Span):
             and self.from_s <= t.at_s <= self.to_s
             and any(word in t.text for word in self.words)
         ]
-        return CheckResult(not heard, "; ".join(heard[:3]) or "vehicle: no warning")
+        return ExpectationResult(not heard, "; ".join(heard[:3]) or "vehicle: no warning")
 
 
 class InMode(_Expectation):
@@ -242,12 +242,12 @@ class InMode(_Expectation):
     mode: str
     at_s: float | None = None
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         sample = record.at(FOREVER if self.at_s is None else self.at_s)
         mode = sample.mode if sample else "none"
         when = "at the end" if self.at_s is None else f"at {self.at_s:g} s"
-        return CheckResult(mode == self.mode, f"{mode} {when}")
+        return ExpectationResult(mode == self.mode, f"{mode} {when}")
 
 
 class MovedAtMost(_Span):
@@ -256,14 +256,14 @@ class MovedAtMost(_Span):
     check: Literal["moved"]
     at_most: float
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
-            return CheckResult(False, "no samples")
+            return ExpectationResult(False, "no samples")
         a = inside[0]
         far = max(math.hypot(s.north_m - a.north_m, s.east_m - a.east_m) for s in inside)
-        return CheckResult(far <= self.at_most, f"moved {far:.2f} of {self.at_most:g} m")
+        return ExpectationResult(far <= self.at_most, f"moved {far:.2f} of {self.at_most:g} m")
 
 
 class Injected(_Span):
@@ -277,11 +277,11 @@ class Injected(_Span):
     at_least: int = 0
     at_most: float = FOREVER
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
-            return CheckResult(False, "no samples")
+            return ExpectationResult(False, "no samples")
         # A counter that falls has started anew with the bridge; ours lives as long as the case.
         first, last = inside[0], inside[-1]
         sent, due_s = last.injected - first.injected, last.at_s - first.at_s
@@ -289,7 +289,9 @@ class Injected(_Span):
         share = min(lived_s / due_s, 1.0) if lived_s > 0 and due_s > 0 else 1.0
         ok = share * self.at_least <= sent <= self.at_most
         what = f"{sent} injected"
-        return CheckResult(ok, what if share > 0.99 else f"{what} at {share:.2f} of real time")
+        return ExpectationResult(
+            ok, what if share > 0.99 else f"{what} at {share:.2f} of real time"
+        )
 
 
 class SourceSet(_Expectation):
@@ -300,15 +302,15 @@ class SourceSet(_Expectation):
     from_s: float
     by_s: float
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         reached = [
             s.at_s for s in record.samples if s.at_s >= self.from_s and s.source_set == self.number
         ]
         if not reached:
-            return CheckResult(False, f"never on source set {self.number}")
+            return ExpectationResult(False, f"never on source set {self.number}")
         ok = self.from_s < reached[0] <= self.by_s
-        return CheckResult(ok, f"source set {self.number} at {reached[0]:.1f} s")
+        return ExpectationResult(ok, f"source set {self.number} at {reached[0]:.1f} s")
 
 
 class Refused(_Expectation):
@@ -317,12 +319,12 @@ class Refused(_Expectation):
     check: Literal["arming_refused"]
     any_of: tuple[str, ...]
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         if record.refusals is None:
-            return CheckResult(False, "arming was accepted")
+            return ExpectationResult(False, "arming was accepted")
         told = "; ".join(record.refusals) or "without a text"
-        return CheckResult(any(text in told for text in self.any_of), f"refused: {told}")
+        return ExpectationResult(any(text in told for text in self.any_of), f"refused: {told}")
 
 
 class Diagnosed(_Expectation):
@@ -331,23 +333,23 @@ class Diagnosed(_Expectation):
     check: Literal["doctor"]
     finds: tuple[str, ...]
 
-    def judge(self, record: CaseRecord) -> CheckResult:
+    def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
         d = record.doctor
         if d is None:
-            return CheckResult(False, "the doctor was not asked")
+            return ExpectationResult(False, "the doctor was not asked")
         ok = set(d.found) == set(self.finds) and d.exit_before == 2 and d.exit_after == 0
         what = f"found {', '.join(d.found)}; exit {d.exit_before} before, {d.exit_after} after"
         if d.left:
             what += f" ({', '.join(d.left)})"
-        return CheckResult(ok, what)
+        return ExpectationResult(ok, what)
 
 
 Check = (
     AsAccurateAs
     | MedianBelow
     | MaxError
-    | Jumps
+    | JumpExpectation
     | Lags
     | Says
     | Reports

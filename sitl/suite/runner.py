@@ -17,7 +17,7 @@ import numpy as np
 from mavlink_bridge.alerts.integrity import INTEGRITY
 from sitl.errors import SimulationError
 from sitl.suite.case import Case
-from sitl.suite.checks import AsAccurateAs, CheckResult
+from sitl.suite.checks import AsAccurateAs, ExpectationResult
 from sitl.suite.flight import fly
 from sitl.suite.record import Array, CaseRecord
 from sitl.vehicles.process import VehicleKind
@@ -37,7 +37,7 @@ class ReportRow:
     case: Case
     vehicle: VehicleKind
     record: CaseRecord | None
-    findings: tuple[CheckResult, ...]
+    findings: tuple[ExpectationResult, ...]
     error: str = ""
     wall_s: float = 0.0
 
@@ -90,7 +90,7 @@ def figures(errors: Array) -> Figures | None:
     return median, p95, largest
 
 
-def judge(case: Case, record: CaseRecord) -> tuple[CheckResult, ...]:
+def judge(case: Case, record: CaseRecord) -> tuple[ExpectationResult, ...]:
     """Every expectation of the case, held against the record."""
     return tuple(expectation.judge(record) for expectation in case.expect)
 

@@ -26,7 +26,7 @@ from localizer.map.importers.gltf_data import (
     normalised_bounds,
     vector,
 )
-from localizer.map.importers.materials import appearance, cut_out
+from localizer.map.importers.materials import cut_out, material_of
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.textures import (
     decode_alpha,
@@ -106,7 +106,7 @@ def gltf_bounds(
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
+class _GltfImage:
     """A texture. alpha: (h, w) uint8, None where all is opaque; wraps: beyond its edges."""
 
     image: Image
@@ -115,14 +115,14 @@ class _Picture:
     wraps: bool
 
 
-class _Pictures:
+class _GltfImages:
     """A document's textures, each image decoded once."""
 
     def __init__(self, data: GltfData, rules: ImportRules) -> None:
         self._data, self._json, self._rules = data, data.json, rules
         self._images: dict[int, tuple[Image, bytes | None, NDArray[np.uint8] | None]] = {}
 
-    def of(self, index: int) -> _Picture:
+    def of(self, index: int) -> _GltfImage:
         """The texture of a number; `MapSourceError` for one that cannot be read."""
         texture = item(self._json.get("textures", []), index, "texture")
         extensions = texture.get("extensions", {})
@@ -141,7 +141,7 @@ class _Pictures:
         if source not in self._images:
             data = self._data.picture(source)
             self._images[source] = (*decode_image(data, self._rules), decode_alpha(data))
-        return _Picture(*self._images[source], wraps)
+        return _GltfImage(*self._images[source], wraps)
 
 
 class _Document:
@@ -156,7 +156,7 @@ class _Document:
         self._rules = rules
         self._walked: set[int] = set()
         self._vertices = 0
-        self._pictures = _Pictures(self._data, rules)
+        self._pictures = _GltfImages(self._data, rules)
         unknown = sorted(set(self._json.get("extensionsRequired", [])) - _READABLE)
         if unknown:
             raise MapSourceError(f"needs the glTF extensions {', '.join(unknown)}, not supported")
@@ -310,7 +310,7 @@ class _Document:
         attributes: dict[str, NDArray[Any]],
         material: dict[str, Any],
     ) -> SourceMesh | None:
-        look = appearance(material)
+        look = material_of(material)
         if look.is_hidden:
             return None
         if look.texture is not None:

@@ -29,7 +29,7 @@ _CENTRE = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6.0  # baryce
 
 
 @dataclass(frozen=True, eq=False)
-class Appearance:
+class GltfMaterial:
     """A glTF material. factor: (3,) linear, of the picture or alone; texture: its textureInfo;
     opacity: times the picture's alpha; cutoff: below it nothing is there, None where all is opaque.
     """
@@ -45,7 +45,7 @@ class Appearance:
         return self.cutoff is not None and self.opacity < self.cutoff
 
 
-def appearance(material: dict[str, Any]) -> Appearance:
+def material_of(material: dict[str, Any]) -> GltfMaterial:
     """Of a glTF material.
 
     Specular-glossiness goes before the metallic fallback, where it has a picture or the other has
@@ -70,7 +70,7 @@ def appearance(material: dict[str, Any]) -> Appearance:
         texture, factor = None, emission
     mode = material.get("alphaMode", "OPAQUE")
     cutoff = {"MASK": float(material.get("alphaCutoff", 0.5)), "BLEND": 0.5}.get(mode)
-    return Appearance(factor, texture, opacity, cutoff)
+    return GltfMaterial(factor, texture, opacity, cutoff)
 
 
 def cut_out(

@@ -38,7 +38,7 @@ class Reply(Protocol):
 
 
 @dataclass(frozen=True)
-class MissionItem:
+class StoredMissionItem:
     """One item as MISSION_ITEM_INT carries it; degrees and metres."""
 
     command: int
@@ -65,8 +65,8 @@ class MissionStore:
     """The vehicle's mission. Item 0 is home, as in ArduPilot, and is never flown."""
 
     def __init__(self) -> None:
-        self.items: list[MissionItem] = []
-        self._incoming: list[MissionItem] = []
+        self.items: list[StoredMissionItem] = []
+        self._incoming: list[StoredMissionItem] = []
         self._expected = 0
         self._peer = (0, 0)
 
@@ -164,7 +164,7 @@ class MissionStore:
         )
 
 
-def _not_a_number(item: MissionItem) -> int | None:
+def _not_a_number(item: StoredMissionItem) -> int | None:
     """Index of the first NaN parameter; only the yaw of a place may be one, as in ArduPilot."""
     for index, value in enumerate(item.parameters):
         if isnan(value) and not (index == 3 and item.command in NAVIGATION):
@@ -172,10 +172,10 @@ def _not_a_number(item: MissionItem) -> int | None:
     return None
 
 
-def item_from(message: Any) -> MissionItem:
-    """A `MissionItem` of MISSION_ITEM_INT, COMMAND_INT (1e-7 degrees) or MISSION_ITEM (degrees)."""
+def item_from(message: Any) -> StoredMissionItem:
+    """Of MISSION_ITEM_INT, COMMAND_INT (1e-7 degrees) or MISSION_ITEM (degrees)."""
     scale = 1.0 if message.get_type() == "MISSION_ITEM" else 1e-7
-    return MissionItem(
+    return StoredMissionItem(
         message.command,
         message.frame,
         (message.param1, message.param2, message.param3, message.param4),

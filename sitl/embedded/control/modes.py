@@ -287,7 +287,7 @@ class FlightModes:
                 return
             self._do(item)
 
-    def _start_item(self, item: mis.MissionItem) -> None:
+    def _start_item(self, item: mis.StoredMissionItem) -> None:
         origin, here = self.estimator.origin, self.estimator.location
         if origin is None or here is None or self.home is None:
             return
@@ -330,7 +330,7 @@ class FlightModes:
             else:
                 self._advance_mission()
 
-    def _do(self, item: mis.MissionItem) -> None:
+    def _do(self, item: mis.StoredMissionItem) -> None:
         p = item.parameters
         if item.command == mis.CONDITION_YAW:
             self.condition_yaw(p[0], p[2], bool(p[3]))

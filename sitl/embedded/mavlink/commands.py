@@ -13,7 +13,7 @@ from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, Comman
 from sitl.embedded.mavlink.navigation_commands import NavigationCommands
 from sitl.embedded.mavlink.parameter_commands import ParameterCommands
 from sitl.embedded.mavlink.server import SerialPort
-from sitl.embedded.mavlink.telemetry import Telemetry
+from sitl.embedded.mavlink.telemetry import TelemetryBuilder
 from sitl.embedded.severity import INFO, WARNING
 
 _FORCE_ARM = 21196.0
@@ -23,7 +23,7 @@ _EKF_SOURCE_SET_OPTION = 90
 class Commands:
     """Dispatch of incoming messages and commands."""
 
-    def __init__(self, vehicle: Aircraft, telemetry: Telemetry) -> None:
+    def __init__(self, vehicle: Aircraft, telemetry: TelemetryBuilder) -> None:
         self._vehicle, self._telemetry = vehicle, telemetry
         self._rc8: int | None = None
         navigation, gimbal = NavigationCommands(vehicle), GimbalCommands(vehicle)

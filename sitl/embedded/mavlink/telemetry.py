@@ -26,7 +26,7 @@ _CAPABILITIES = 2 | 4 | 8 | 128 | 256 | 8192  # float params, int missions and c
 DEFAULT_STREAMS = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
 
 
-class Telemetry:
+class TelemetryBuilder:
     """Builds messages from the vehicle's present state.
 
     Above 200 lines: one short method for each of its messages, and their table.

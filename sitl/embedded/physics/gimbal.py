@@ -21,7 +21,7 @@ _SERVO = 1  # MNT1_TYPE
 _SLEW = radians(60.0)  # rad/s of the motors
 
 
-class GimbalTarget(Enum):
+class GimbalMode(Enum):
     """What the gimbal follows."""
 
     NEUTRAL = "neutral"
@@ -35,7 +35,7 @@ class Gimbal:
     """The first mount (instance 1)."""
 
     parameters: Parameters
-    mode: GimbalTarget = GimbalTarget.NEUTRAL
+    mode: GimbalMode = GimbalMode.NEUTRAL
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     yaw_rad: float = 0.0  # from the vehicle's nose
@@ -53,15 +53,15 @@ class Gimbal:
     @property
     def flags(self) -> int:
         """GIMBAL_DEVICE_FLAGS of GIMBAL_DEVICE_ATTITUDE_STATUS."""
-        locked = self.mode is GimbalTarget.LOCATION or (
-            self.mode in (GimbalTarget.ANGLE, GimbalTarget.RATE) and self.yaw_locked
+        locked = self.mode is GimbalMode.LOCATION or (
+            self.mode in (GimbalMode.ANGLE, GimbalMode.RATE) and self.yaw_locked
         )
         return (
             FLAG_ROLL_LOCK
             | FLAG_PITCH_LOCK
             | FLAG_YAW_IN_VEHICLE_FRAME
             | (FLAG_YAW_LOCK if locked else 0)
-            | (FLAG_NEUTRAL if self.mode is GimbalTarget.NEUTRAL else 0)
+            | (FLAG_NEUTRAL if self.mode is GimbalMode.NEUTRAL else 0)
         )
 
     @property
@@ -93,7 +93,7 @@ class Gimbal:
 
     def point(self, pitch_deg: float, yaw_deg: float, *, yaw_locked: bool) -> None:
         """MAV_CMD_DO_MOUNT_CONTROL, MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; NaN keeps an angle."""
-        self.mode = GimbalTarget.ANGLE
+        self.mode = GimbalMode.ANGLE
         self.yaw_locked = yaw_locked
         if not isnan(pitch_deg):
             self._wanted_pitch = radians(pitch_deg)
@@ -102,18 +102,18 @@ class Gimbal:
 
     def rotate(self, pitch_rate_deg: float, yaw_rate_deg: float, *, yaw_locked: bool) -> None:
         """Turn at a rate (degrees per second)."""
-        self.mode = GimbalTarget.RATE
+        self.mode = GimbalMode.RATE
         self.yaw_locked = yaw_locked
         self._rates = (radians(pitch_rate_deg), radians(yaw_rate_deg))
 
     def look_at(self, location: Location | None) -> None:
         """MAV_CMD_DO_SET_ROI_LOCATION; None is MAV_CMD_DO_SET_ROI_NONE."""
         self._roi = location
-        self.mode = GimbalTarget.NEUTRAL if location is None else GimbalTarget.LOCATION
+        self.mode = GimbalMode.NEUTRAL if location is None else GimbalMode.LOCATION
 
     def neutral(self) -> None:
         """Return to MNT1_NEUTRAL_*."""
-        self.mode = GimbalTarget.NEUTRAL
+        self.mode = GimbalMode.NEUTRAL
 
     def update(self, vehicle: Location | None, vehicle_yaw_rad: float, dt: float) -> None:
         """Move towards the target, within the limits and the slew rate."""
@@ -130,14 +130,14 @@ class Gimbal:
     def _target(
         self, vehicle: Location | None, vehicle_yaw_rad: float, dt: float
     ) -> tuple[float, float]:
-        if self.mode is GimbalTarget.RATE:
+        if self.mode is GimbalMode.RATE:
             self._wanted_pitch = self.pitch_rad + self._rates[0] * dt
             self._wanted_yaw = self.yaw_rad + self._rates[1] * dt
             return self._wanted_pitch, self._wanted_yaw
-        if self.mode is GimbalTarget.ANGLE:
+        if self.mode is GimbalMode.ANGLE:
             yaw = self._wanted_yaw - (vehicle_yaw_rad if self.yaw_locked else 0.0)
             return self._wanted_pitch, wrap_pi(yaw)
-        if self.mode is GimbalTarget.LOCATION and self._roi is not None and vehicle is not None:
+        if self.mode is GimbalMode.LOCATION and self._roi is not None and vehicle is not None:
             north, east, down = vehicle.ned_of(self._roi)
             return -atan2(down, hypot(north, east)), wrap_pi(atan2(east, north) - vehicle_yaw_rad)
         return radians(self.parameters["MNT1_NEUTRAL_Y"]), radians(

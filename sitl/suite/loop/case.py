@@ -6,10 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.config import StrictModel
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioError, ScenarioLeg
@@ -22,11 +23,7 @@ _CORNERS = ((0, 60), (60, 60), (60, -60), (-60, -60), (-60, 60), (0, 0))  # east
 _PITCH_DEG = -80.0
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class VideoFault(_Model):
+class VideoFault(StrictModel):
     """A fault of the picture for some seconds; see `PictureFault`."""
 
     kind: PictureFaultKind
@@ -39,14 +36,14 @@ class VideoFault(_Model):
         return PictureFault(self.kind, self.late_s)
 
 
-class Zoom(_Model):
+class Zoom(StrictModel):
     """The lens goes to a multiple of its shortest focal length, in so many seconds."""
 
     to: float = Field(ge=1.0, le=ZOOM_MOST)
     over_s: float = Field(2.0, ge=0, le=60)
 
 
-class Drag(_Model):
+class Drag(StrictModel):
     """A receiver's position that moves away from the true one, so fast, for so long; it stays."""
 
     north_m_s: float = Field(0.0, ge=-10, le=10)
@@ -54,7 +51,7 @@ class Drag(_Model):
     for_s: float = Field(gt=0, le=600)
 
 
-class Load(_Model):
+class Load(StrictModel):
     """Other work on the companion's computer: processes that compute, for so long, all of them and
     the companion on one processor.
     """
@@ -63,14 +60,14 @@ class Load(_Model):
     for_s: float = Field(gt=0, le=300)
 
 
-class OperatorHint(_Model):
+class OperatorHint(StrictModel):
     """The operator tells the companion where the vehicle is, off_north_m beside it."""
 
     radius_m: float = Field(gt=0, le=5000)
     off_north_m: float = Field(0.0, ge=-2000, le=2000)
 
 
-class LoopEvent(_Model):
+class LoopEvent(StrictModel):
     """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
 
     picture: a fault of the video. zoom: of the lens. kill: SIGKILL to the companion, started again
@@ -88,10 +85,10 @@ class LoopEvent(_Model):
     kill: bool = False
     hang: bool = False
     restart_after_s: float = Field(1.0, ge=0, le=60)
-    vehicle: dict[str, float] = {}
+    vehicle: dict[str, float] = Field(default_factory=dict)
 
 
-class Wrong(_Model):
+class Wrong(StrictModel):
     """What the deployment has wrong from the start.
 
     map_shift_m: east, north, up of where the map shows the ground. gimbal_deg: roll, pitch, yaw
@@ -109,7 +106,7 @@ class Wrong(_Model):
     terrain_off_m: float | None = Field(None, ge=-100, le=100)
 
 
-class Expectation(_Model):
+class Expectation(StrictModel):
     """What must hold between the start and the end of the recorded part.
 
     told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
@@ -134,7 +131,7 @@ class Expectation(_Model):
     repeats: int | None = Field(None, ge=1)
 
 
-class LoopCase(_Model):
+class LoopCase(StrictModel):
     """One flight. seconds: length of the recorded part. hover: stay; else the corners are flown in
     AUTO (metres east and north of home, at `height_m`). wind_m_s: from the west. deny: GNSS is
     switched off when it begins. cold: no companion runs until an event starts it. supervised: by
@@ -161,8 +158,8 @@ class LoopCase(_Model):
     cold: bool = False
     supervised: bool = False
     gated: bool = False
-    deployment: dict[str, Any] = {}
-    vehicle: dict[str, float] = {}
+    deployment: dict[str, Any] = Field(default_factory=dict)
+    vehicle: dict[str, float] = Field(default_factory=dict)
     wrong: Wrong = Wrong()
     zoom_points: tuple[tuple[float, float], ...] = ()
     timeline: tuple[LoopEvent, ...] = ()

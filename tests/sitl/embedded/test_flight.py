@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sitl.embedded.control import mission as mis
-from sitl.embedded.control.mission import MissionItem
+from sitl.embedded.control.mission import StoredMissionItem
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.ekf.aided_filter import Aiding
 from sitl.embedded.ekf.estimator import EkfFlags
@@ -201,7 +201,7 @@ def test_a_rotated_vision_frame_misleads_without_a_warning(bench, vision_only, h
 
 def item(command, north=0.0, east=0.0, height=0.0, *, home):
     place = home.offset(north, east, 0.0)
-    return MissionItem(
+    return StoredMissionItem(
         command, 3, (0.0, 0.0, 0.0, 0.0), place.latitude_deg, place.longitude_deg, height
     )
 
@@ -212,11 +212,11 @@ def test_flies_a_mission_with_speed_gimbal_and_return(bench, home):
     b.vehicle.mission.items = [
         item(mis.WAYPOINT, home=home),
         item(mis.TAKEOFF, height=40.0, home=home),
-        MissionItem(command=mis.CHANGE_SPEED, parameters=(1.0, 6.0, -1.0, 0.0), **bare),
+        StoredMissionItem(command=mis.CHANGE_SPEED, parameters=(1.0, 6.0, -1.0, 0.0), **bare),
         item(mis.WAYPOINT, 100, 0, 40.0, home=home),
-        MissionItem(command=mis.GIMBAL_PITCHYAW, parameters=(-70.0, 20.0, 0.0, 0.0), **bare),
+        StoredMissionItem(command=mis.GIMBAL_PITCHYAW, parameters=(-70.0, 20.0, 0.0, 0.0), **bare),
         item(mis.WAYPOINT, 100, 80, 60.0, home=home),
-        MissionItem(command=mis.RTL, parameters=(0.0, 0.0, 0.0, 0.0), **bare),
+        StoredMissionItem(command=mis.RTL, parameters=(0.0, 0.0, 0.0, 0.0), **bare),
     ]
     reached: list[Any] = []
     b.vehicle.modes.on_reached = reached.append
