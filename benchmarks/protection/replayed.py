@@ -126,8 +126,7 @@ def replay(
                 state, attitude = vehicle.state(), vehicle.attitude_at(due.fix.time_ns)
                 fix = due.with_heading(attitude, vehicle.gimbal_at(due.fix.time_ns))
                 admitted = monitor.admit(fix, state, attitude)
-                passes = admitted is not None and not admitted.position_withheld
-                if passes and admitted.protection_m is not None:
+                if admitted is not None and admitted.protection_m is not None:
                     levels.append(admitted.protection_m[0])
                     parts.append(_parts(fix, state, config))
                 due = next(waiting, None)
