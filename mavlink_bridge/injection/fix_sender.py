@@ -66,7 +66,7 @@ class FixSender:
         if injection is not None:
             self.vision = injection.estimate.position
             self._deliver(link, mode, injection, now_ns)
-        delta = self.injector.take_delta()
+        delta = self.injector.motion.take()
         if delta is not None and mode == "inject" and link.send(delta, self._component):
             self._counters["injected_deltas"] += 1
         reason = self.injector.reason

@@ -72,6 +72,28 @@ class _FixRate:
         return statistics.median(self._intervals_ns)
 
 
+class WithheldMotion:
+    """How the vehicle moves while its position is withheld, from fix to fix."""
+
+    def __init__(self) -> None:
+        self._before: VisionFix | None = None
+        self._message: Any | None = None
+
+    def note(self, fix: VisionFix, context: InjectionContext) -> None:
+        """A fix came of age whose position is withheld."""
+        before, self._before = self._before, fix
+        if before is None or not context.profile.position_delta:
+            return
+        then, now = context.attitude_at(before.time_ns), context.attitude_at(fix.time_ns)
+        if then is not None and now is not None and fix.time_ns - before.time_ns <= _DELTA_NS:
+            self._message = vision_position_delta((before, then), (fix, now))
+
+    def take(self) -> Any | None:
+        """The message that is due, once."""
+        message, self._message = self._message, None
+        return message
+
+
 class Injector:
     """Turns fixes into a steady stream of injections. One thread calls `submit` and `step`."""
 
@@ -92,8 +114,7 @@ class Injector:
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
         self._last_was_fill = False
-        self._withheld: VisionFix | None = None
-        self._delta: Any | None = None
+        self.motion = WithheldMotion()
         self._pace = _FixRate(config.overdue_intervals)
         self._sent_fix_ns = 0
         self.yaw_difference_rad: float | None = None
@@ -167,11 +188,6 @@ class Injector:
         self.counters["sent_fresh" if outcome.estimate.fresh else "sent_propagated"] += 1
         return outcome
 
-    def take_delta(self) -> Any | None:
-        """The message of how the vehicle moved while its position is withheld, once."""
-        delta, self._delta = self._delta, None
-        return delta
-
     def next_due_ns(self, now_ns: int) -> int:
         """When `step` must be called next."""
         due = [now_ns + self._period_ns]
@@ -197,7 +213,7 @@ class Injector:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
             if fix.position_withheld:
-                self._note_withheld(fix, context)
+                self.motion.note(fix, context)
                 continue
             last = self._propagator.fix
             self._pace.note(fix.time_ns, None if last is None else last.time_ns, now_ns)
@@ -205,14 +221,6 @@ class Injector:
             if self._fresh is not None:
                 self.counters["fixes_superseded"] += 1
             self._fresh = fix
-
-    def _note_withheld(self, fix: VisionFix, context: InjectionContext) -> None:
-        before, self._withheld = self._withheld, fix
-        if before is None or not context.profile.position_delta:
-            return
-        then, now = context.attitude_at(before.time_ns), context.attitude_at(fix.time_ns)
-        if then is not None and now is not None and fix.time_ns - before.time_ns <= _DELTA_NS:
-            self._delta = vision_position_delta((before, then), (fix, now))
 
     # --- what to send ----------------------------------------------------------------------------
 

@@ -558,7 +558,7 @@ def deltas(
             north = speed * (t - late) / SECOND
             it.submit(fix(t - late, north, yaw_rad=yaw, position_withheld=True), t)
         assert it.step(t, vehicle) is None
-        if (delta := it.take_delta()) is not None:
+        if (delta := it.motion.take()) is not None:
             sent.append((t, delta))
     return sent
 
