@@ -10,7 +10,11 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 InjectionMessage = Literal[
-    "vision_position_estimate", "odometry", "gps_input", "global_position_sensor"
+    "vision_position_estimate",
+    "odometry",
+    "gps_input",
+    "global_position_sensor",
+    "external_position_estimate",
 ]
 Mode = Literal["off", "shadow", "inject", "rc"]
 
@@ -285,6 +289,15 @@ class BridgeConfig(StrictModel):
         first, second = self.signing, self.ground_signing
         if first and second and first.state_path("fc") == second.state_path("ground"):
             raise ValueError("signing and ground_signing need a state_file each")
+        return self
+
+    @model_validator(mode="after")
+    def _message_has_a_source_set(self) -> BridgeConfig:
+        if self.switch.enabled and self.injection.message == "external_position_estimate":
+            raise ValueError(
+                "external_position_estimate is fused beside GNSS and has no source set: remove "
+                "switch.enabled"
+            )
         return self
 
     @model_validator(mode="after")

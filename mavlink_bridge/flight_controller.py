@@ -23,6 +23,7 @@ from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.injection.switching import SourceOrders
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Figures, VehicleState
+from mavlink_bridge.place_hint import PLACE_HINT
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander, accepted
@@ -103,10 +104,11 @@ class FlightControllerEnd:
 
     def on_gnss(self, now_ns: int) -> bool | None:
         """Whether GNSS makes the EKF's position; None where its source set is not known. A receiver
-        that tells what it is told by us (GPS_INPUT) is none.
+        that tells what it is told by us (GPS_INPUT) is none; nor is one beside which we are fused.
         """
         current = self.sources.current
-        if self._shared.config.injection.message == "gps_input" and (
+        unswitched = ("gps_input", "external_position_estimate")
+        if self._shared.config.injection.message in unswitched and (
             current is None or self.sender.fed(now_ns)
         ):
             return False
@@ -201,7 +203,7 @@ class FlightControllerEnd:
         elif kind in MISSION_IN:
             self.requests.mission.on_message(link, message, time_ns)
         elif kind == "COMMAND_ACK":
-            self._acknowledged(link, message)
+            self._acknowledged(link, message, time_ns)
         elif self._tracker.handle(message, time_ns):
             self._rebooted()
         elif kind == "STATUSTEXT":
@@ -212,7 +214,10 @@ class FlightControllerEnd:
         elif kind == "RC_CHANNELS" and self._shared.enable is not None:
             self._shared.enable.channels(self._tracker.snapshot(time_ns).rc_channels_us)
 
-    def _acknowledged(self, link: Link, message: Any) -> None:
+    def _acknowledged(self, link: Link, message: Any, now_ns: int) -> None:
+        if message.command == PLACE_HINT:
+            self.sender.acknowledged(link, message, now_ns)
+            return
         if not self._commander.is_ours(link, message):
             return
         if not accepted(message):
@@ -225,7 +230,7 @@ class FlightControllerEnd:
     def _rebooted(self) -> None:
         self.counters["reboots"] += 1
         self.origin.forget()
-        self.sender.injector.guard.reset()
+        self.sender.rebooted()
         self.sources.rebooted()
         self.requests.reset()
         self._teller.report(alert(AlertId.FC_REBOOTED))
@@ -287,7 +292,7 @@ class FlightControllerEnd:
             return now_ns + _IDLE_NS
         profile = select_profile(state.autopilot, state.version)
         self._warnings.firmware(state, profile)
-        sender.step(link, profile, mode, now_ns)
+        sender.step(link, state, mode, now_ns)
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + _IDLE_NS
             self._check(link, state, now_ns)

@@ -14,7 +14,7 @@ from companion.calibrate import unknowns as u
 from companion.calibrate.flight import Calibrated, calibrate
 from companion.calibrate.proposal import blind_spots, changed, changes
 from companion.config import CompanionConfig, load_config
-from companion.offline.replay import load_record
+from companion.offline.record import load_record
 from localizer.geometry.pose import Array, euler_from_matrix, so3_log
 from sitl.camera.gimbal_error import GimbalError
 from sitl.demo.assets import FlightAssets
@@ -47,8 +47,7 @@ def solve_draw(
     known: of its `TRUTH`. after: fly and localize once more, under three deployments.
     """
     seed = int(known["seed"])
-    record = load_record(folder / "record", 0.0)
-    found = calibrate(record, folder / "flight.tlog", record.config.map, _FRAMES)
+    found = calibrate(load_record(folder / "record", 0.0, folder / "flight.tlog"), _FRAMES)
     row = known | _found_numbers(found)
     if after:
         deployment = load_config(folder / "deployment.yaml")

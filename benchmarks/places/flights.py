@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.places.worlds import LIVE, OUTDATED, PLACES, GeneratedPlace, PlaceFolder
-from localizer.evaluation.sequences import Sequence, load_sequence
+from companion.recorded.sequence import load_sequence
+from localizer.evaluation.sequences import Sequence
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer

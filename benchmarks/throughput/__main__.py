@@ -26,8 +26,8 @@ from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.throughput.accuracy import paired
 from benchmarks.throughput.settings import OFFERED, map_of, one_setting
+from companion.recorded.sequence import load_sequence
 from localizer.config import LocalizerConfig
-from localizer.evaluation.sequences import load_sequence
 from localizer.tracking.opening import MapStack
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import record_scenario

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from benchmarks.throughput.engine import engine_run
 from benchmarks.throughput.stages import stage_times
+from companion.recorded.sequence import load_sequence
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
-from localizer.evaluation.sequences import Sequence, load_sequence
+from localizer.evaluation.sequences import Sequence
 from localizer.tracking.opening import MapStack
 
 _STAGE_FRAMES = 60

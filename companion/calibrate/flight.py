@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -18,13 +17,8 @@ from companion.config import CompanionConfig, FeedConfig
 from companion.errors import RecordError, StreamDecodeError
 from companion.geometry import Mount
 from companion.offline.autopilot import RecordedAutopilot
-from companion.offline.replay import (
-    FlightRecord,
-    RecordedEstimate,
-    image_path,
-)
-from companion.sources.base import fitted_camera
-from companion.sources.folder_source import read_image
+from companion.offline.record import FlightRecord
+from companion.recorded.flight import RecordedFrame
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
@@ -32,7 +26,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.tracking.opening import MapStack
 from localizer.tracking.pipeline import working_camera
-from localizer.types import Frame, Image
+from localizer.types import Frame
 from mavlink_bridge.injection.shadow import gnss_healthy
 
 _LEAST_FRAMES = 20
@@ -78,38 +72,34 @@ class Calibrated:
 
 @dataclass(frozen=True)
 class _ChosenFrame:
-    """One that was chosen, on the disk: two hundred of a 4K camera fill 5 GB. said: by the
+    """One that was chosen, on the disk: two hundred of a 4K camera fill 5 GB. window: by the
     autopilot; pose: where it was registered.
     """
 
-    recorded: RecordedEstimate
-    path: Path
+    recorded: RecordedFrame
+    time_ns: int
     window: AutopilotWindow
     pose: Pose
 
 
 def calibrate(
     record: FlightRecord,
-    tlog: Path,
-    map_cache: Path,
     frames: int = 200,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Calibrated:
-    """Numbers of the record's deployment by its own pictures, over a map.
+    """Numbers of the record's deployment by its own pictures, over its map.
 
     frames: at most so many pictures are read, spread over the flight. progress: told how many are
     read, and of how many (each twice). `RecordError` where the
     record does not suffice, with what it lacks.
     """
     config = record.config
-    stack = MapStack(map_cache, config.localizer)
+    stack = MapStack(config.map, config.localizer)
     try:
-        record.flown.require_frame(stack.cache)
+        record.tables.flown.require_frame(stack.cache)
         mount = mount_of(config)
-        pictures, bias_m = _chosen(record, tlog, stack, mount, frames)
-        camera = config.camera.model.camera()
-        width, height = _first_size(record, pictures)
-        camera = fitted_camera(width, height, camera, str(record.folder))
+        pictures, bias_m = _chosen(record, stack, mount, frames)
+        camera = _stream_camera(record, pictures)
         arm_m = np.array(config.camera.lever_arm_m)
         size = working_camera(camera, config.localizer.width)
         extractor = DetailExtractor(
@@ -161,14 +151,14 @@ def mount_of(config: CompanionConfig) -> Array:
 
 
 def _chosen(
-    record: FlightRecord, tlog: Path, stack: MapStack, mount: Array, most: int
+    record: FlightRecord, stack: MapStack, mount: Array, most: int
 ) -> tuple[list[_ChosenFrame], float]:
     """At most so many accepted estimates with their pictures, and the receiver's own error, m."""
     config, bridge = record.config, record.config.bridge
-    autopilot = RecordedAutopilot(bridge, tlog, record.start_ns, record.utc_minus_monotonic_ns)
+    autopilot = RecordedAutopilot(bridge, record.log, record.tables.start_ns)
     good = [
-        e for e in record.estimates
-        if e.accepted and e.is_tracking and image_path(record.folder, e).is_file()
+        (frame, e) for frame, e in zip(record.flight.frames, record.estimates, strict=True)
+        if e.accepted and e.is_tracking and frame.path.is_file()
     ]  # fmt: skip
     if len(good) < _LEAST_FRAMES:
         raise RecordError(
@@ -182,38 +172,38 @@ def _chosen(
     pictures: list[_ChosenFrame] = []
     accuracies_m: list[float | None] = []
     for index in picked:
-        estimate = good[index]
-        autopilot.advance(estimate.exposure_time_ns + _LATER_NS)
-        window = autopilot_window_at(autopilot, estimate.exposure_time_ns, frame, geoid_m, mount)
-        if window is None or not _unzoomed(config.camera, autopilot, estimate.exposure_time_ns):
+        picture, estimate = good[index]
+        time_ns = estimate.exposure_time_ns
+        autopilot.advance(time_ns + _LATER_NS)
+        window = autopilot_window_at(autopilot, time_ns, frame, geoid_m, mount)
+        if window is None or not _unzoomed(config.camera, autopilot, time_ns):
             continue
         state = autopilot.state()
-        if not trusted or not gnss_healthy(state, estimate.exposure_time_ns + _LATER_NS):
+        if not trusted or not gnss_healthy(state, time_ns + _LATER_NS):
             window = replace(window, place=np.full_like(window.place, np.nan))
         elif window.has_place:
             accuracies_m.append(state.gps_h_accuracy_m)
-        path = image_path(record.folder, estimate)
-        pictures.append(_ChosenFrame(estimate, path, window, estimate.world_from_camera))
+        pictures.append(_ChosenFrame(picture, time_ns, window, estimate.world_from_camera))
     if len(pictures) < _LEAST_FRAMES:
         raise RecordError(
-            f"{tlog}: attitude and gimbal are known at {len(pictures)} of {len(picked)} pictures; "
-            f"calibration needs {_LEAST_FRAMES}: is it this flight's log?"
+            f"{record.log.path}: attitude and gimbal are known at {len(pictures)} of {len(picked)} "
+            f"pictures; calibration needs {_LEAST_FRAMES}: is it this flight's log?"
         )
     return pictures, receiver_bias_m(accuracies_m)
 
 
-def _first_size(record: FlightRecord, pictures: list[_ChosenFrame]) -> tuple[int, int]:
-    """Width and height of the first picture that can be read."""
+def _stream_camera(record: FlightRecord, pictures: list[_ChosenFrame]) -> Camera:
+    """The deployment's at the size of the first picture that can be read."""
     for picture in pictures:
-        if (image := _read(picture)) is not None:
-            return image.shape[1], image.shape[0]
+        if (frame := _read(picture, record.flight.camera.camera)) is not None:
+            return frame.camera
     raise RecordError(f"{record.folder}: none of its pictures can be read")
 
 
-def _read(picture: _ChosenFrame) -> Image | None:
+def _read(picture: _ChosenFrame, camera: Camera) -> Frame | None:
     """None of one that was cut off, as by a loss of power."""
     try:
-        return read_image(picture.path)
+        return picture.recorded.load(camera, picture.time_ns)
     except StreamDecodeError:
         return None
 
@@ -245,16 +235,14 @@ def _sighted(
     kept, sighted = [], []
     for number, picture in enumerate(pictures):
         progress(number + 1)
-        if (image := _read(picture)) is None:
+        if (frame := _read(picture, camera)) is None:
             continue
-        stamp_ns = picture.recorded.exposure_time_ns
         rate, velocity = picture.window.motion(-late_s)
         sweep = Sweep.of(rate, velocity, camera.readout_ms) if camera.readout_ms > 0 else None
-        frame = Frame(image, stamp_ns, camera, 0)
         parts = reader.read(frame, picture.pose, sweep)
         if parts is not None:
             kept.append(picture)
-            sighted.append(CalibrationFrame(stamp_ns, picture.pose, parts, picture.window))
+            sighted.append(CalibrationFrame(picture.time_ns, picture.pose, parts, picture.window))
     if len(sighted) < _LEAST_FRAMES:
         raise RecordError(
             f"only {len(sighted)} of {len(pictures)} pictures can be laid on the map again: is it "

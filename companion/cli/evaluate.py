@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -18,6 +19,8 @@ from rich.table import Table
 
 from companion.errors import ConfigError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
+from companion.recorded.footage import FootageOptions, read_footage
+from companion.recorded.sequence import sequence_of
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, shown_count, tally
@@ -37,7 +40,6 @@ from localizer.evaluation.sequences import (
     csv_rows,
     error_arrays,
     evaluate,
-    load_sequence,
     worst_first,
 )
 from localizer.features.extractor import load_extractor
@@ -56,7 +58,12 @@ _PROBLEMS = 5  # texts that are printed
 
 
 def evaluate_command(
-    sequence: Annotated[Path, typer.Argument(help="folder: images/, poses.txt, camera.json")],
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            help="folder: images/, poses.txt, camera.json; or footage whose tags are the truth"
+        ),
+    ],
     map_cache: Annotated[Path, typer.Option("--map", help="tile cache")],
     report: Annotated[Path, typer.Option(help="folder of the report")] = Path("eval-report"),
     name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
@@ -112,12 +119,14 @@ def evaluate_command(
         show = progress.enter_context(counting)
         stack = MapStack(map_cache, config)
         try:
-            data = load_sequence(sequence, stack.cache.frame, name)
+            flight = read_footage(sequence, FootageOptions(report, sys.maxsize, name=name))
+            data = sequence_of(flight, stack.cache.frame, stack.cache.manifest.geoid_separation_m)
             data = data if limit is None else data.first(limit)
+            notes = list(flight.notes)
             if not data.is_timed and prior != "each":
-                Console(stderr=True).print(
-                    f"{sequence}: no timestamps.txt, 30 frames/s assumed", style="yellow"
-                )
+                notes.append(f"{sequence}: its times do not increase: 30 frames/s assumed")
+            for note in notes:
+                Console(stderr=True).print(escape(note), style="yellow")
             localizer = build_localizer(stack, data.camera, config, sensors.auxiliary(data))
             known = None
             if searched:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -38,25 +37,20 @@ def replay_command(
     if page is not None:
         show_record(record, map_cache, page)
         return
-    from companion.offline.replay import load_record, replay, summarize
+    from companion.offline.record import load_record
+    from companion.offline.replay import replay, summarize
     from localizer.map.cache.cache import TileCache
 
-    loaded = load_record(record)
-    log = tlog or loaded.config.bridge.tlog
-    if log is None:
-        raise RecordError(f"{record}: flown without bridge.tlog; give the log as --tlog")
-    if map_cache is not None:
-        config = loaded.config.model_copy(update={"map": map_cache})
-        loaded = replace(loaded, config=config)
+    loaded = load_record(record, tlog=tlog, map_cache=map_cache)
     with shown_count(Console(stderr=True), "localizing", begins=COMPILES) as show:
-        summary = summarize(replay(loaded, log, tally(show, len(loaded.estimates))))
+        summary = summarize(replay(loaded, tally(show, len(loaded.estimates))))
     table = Table(title=str(record))
     for column in ("", "median", "p95", "max"):
         table.add_column(column, justify="right" if column else "left")
     table.add_row("position differs, m", *_spread(summary.translation_m, 2))
     table.add_row("rotation differs, °", *_spread(summary.rotation_deg, 3))
     console = Console()
-    if doubt := loaded.flown.doubt(TileCache.open(loaded.config.map)):
+    if doubt := loaded.tables.flown.doubt(TileCache.open(loaded.config.map)):
         console.print(f"[yellow]warning:[/] {escape(doubt)}", highlight=False, soft_wrap=True)
     console.print(table)
     console.print(
@@ -80,8 +74,8 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
     from companion.console.records import Records
     from companion.console.replay_source import ReplaySource
     from companion.console.server import ConsoleSite
+    from companion.offline.record import read_record
     from companion.reporting.pictures import map_pictures
-    from companion.reporting.record import read_record
 
     tables = read_record(record)
     map_path = map_cache or tables.map_path

@@ -10,9 +10,9 @@ import numpy as np
 from companion.console.record_rows import ABSURD, estimate_of, last
 from companion.errors import StreamDecodeError
 from companion.live.protocol import Message
+from companion.offline.record import RecordTables, is_time_ns
 from companion.offline.tables import Columns, poses
 from companion.reporting.pictures import MapPictures
-from companion.reporting.record import RecordTables, is_time_ns
 from companion.sources.folder_source import read_image
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, quaternion_from_matrix

@@ -15,9 +15,9 @@ from companion.console.kept_pictures import KeptPictures
 from companion.console.record_rows import ABSURD, estimate_of, last, target_of
 from companion.console.source import Newest, sample_of
 from companion.live.protocol import Message
+from companion.offline.record import RecordTables
 from companion.reporting.autopilot import AutopilotTracks, TimedTrack, read_autopilot
 from companion.reporting.pictures import MapPictures
-from companion.reporting.record import RecordTables
 
 _STEP_S = 0.5
 _PLOTTED = 600  # seconds before a place of the time bar that plots and tracks begin with

@@ -196,7 +196,7 @@ def _flat(angles: Iterable[Angles]) -> Iterable[float]:
 
 def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     """The accepted estimates of a flight's record (its folder, or its ``estimates.csv``)."""
-    from companion.offline.replay import read_estimates
+    from companion.offline.record import read_estimates
 
     file = path / "estimates.csv" if path.is_dir() else path
     return tuple(

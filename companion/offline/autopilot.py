@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
+from companion.recorded.flight import LogBeside
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.tlog import read_tlog
@@ -16,9 +15,7 @@ from mavlink_bridge.vehicle.tracker import VehicleTracker
 class RecordedAutopilot:
     """What the vehicle had said by a time, from the recorded messages."""
 
-    def __init__(
-        self, bridge: BridgeConfig, tlog: Path, start_ns: int, utc_minus_monotonic_ns: int
-    ) -> None:
+    def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
         c = bridge.camera
         mount = quat.from_euler(*np.radians([c.mount_roll_deg, c.mount_pitch_deg, c.mount_yaw_deg]))
         self._now_ns = start_ns
@@ -28,7 +25,7 @@ class RecordedAutopilot:
             bridge.camera.mount == "fixed",
             (bridge.camera.gimbal_component, bridge.camera.gimbal_device),
         )
-        dated = ((utc - utc_minus_monotonic_ns, m) for utc, m in read_tlog(tlog))
+        dated = ((utc - log.ahead_ns, m) for utc, m in read_tlog(log.path))
         # A .tlog is appended to: earlier flights may stand before this one.
         self._messages = (item for item in dated if item[0] >= start_ns)
         self._next = next(self._messages, None)

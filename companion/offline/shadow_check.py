@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,6 @@ from companion.recorded.autopilot_log import vehicle_messages
 from companion.recorded.flight import RecordedFlight
 from companion.recorded.log_messages import Dated, autopilot, origin_message
 from companion.sources import VideoFileSource
-from companion.sources.base import fitted_camera
-from companion.sources.folder_source import read_image
 from localizer.errors import MapLoadingError, OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.tracking.opening import MapStack
@@ -209,13 +207,9 @@ def _video(path: Path, camera: Camera) -> Iterator[Frame]:
 
 def _photos(flight: RecordedFlight, camera: Camera) -> Iterator[Frame]:
     for sequence, one in enumerate(flight.frames):
-        try:
-            image = read_image(one.path)
-            fitted = fitted_camera(image.shape[1], image.shape[0], camera, one.name)
-        except (StreamDecodeError, StreamSizeError):
-            continue
         if one.time_ns is not None:
-            yield Frame(image, one.time_ns, fitted, sequence)
+            with suppress(StreamDecodeError, StreamSizeError):
+                yield one.load(camera, one.time_ns, sequence)
 
 
 @dataclass

@@ -15,8 +15,12 @@ from typing import Literal
 import numpy as np
 
 from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.sources.base import fitted_camera
+from companion.sources.folder_source import read_image
+from companion.sources.zoom import longer
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler, so3_exp, so3_log
+from localizer.types import Frame
 
 Kind = Literal["photos", "video", "sequence"]
 
@@ -113,6 +117,14 @@ class RecordedFrame:
     def with_telemetry(self, telemetry: Telemetry) -> RecordedFrame:
         """The same image with other telemetry."""
         return replace(self, telemetry=telemetry)
+
+    def load(self, camera: Camera, time_ns: int, sequence: int = 0) -> Frame:
+        """The image as the localizer takes it, the camera at its size and zoom. StreamDecodeError
+        or StreamSizeError for an image that cannot be used.
+        """
+        image = read_image(self.path)
+        camera = fitted_camera(image.shape[1], image.shape[0], camera, self.name)
+        return Frame(image, time_ns, longer(camera, self.telemetry.zoom), sequence)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from companion.recorded.photo_tags import (
     read_photo_tags,
 )
 from companion.recorded.places_file import PLACES_SUFFIXES, is_places_file, read_places
+from companion.recorded.sequence import is_sequence, read_sequence
 from companion.recorded.subtitles import Subtitles, read_subtitles
 from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
 from companion.sources.base import fitted_camera
@@ -39,6 +41,7 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.plain_files import files_of
 
+_T = TypeVar("_T")
 Progress = Callable[[int, int], None]
 _VIDEO_FOCAL_PERCENT = 5.0  # a video's crop of the sensor is not told
 _KLV_FOCAL_PERCENT = 3.0
@@ -52,7 +55,7 @@ _LEAST_STEP_NS, _PAIR_NS = 500_000_000, 1_000_000_000  # between frames of a vid
 class FootageOptions:
     """What the user says beside the footage. frames: at most so many are read; places, log: files
     of telemetry; fov_deg: horizontal; fixed_pitch_deg: of a camera on the airframe, for a log
-    without a gimbal; work: folder for the frames of a video.
+    without a gimbal; work: folder for the frames of a video; name: of a sequence in PiLoT's set.
     """
 
     work: Path
@@ -62,6 +65,7 @@ class FootageOptions:
     camera: Path | None = None
     fov_deg: float | None = None
     fixed_pitch_deg: float = -90.0
+    name: str | None = None
 
 
 def read_footage(
@@ -82,11 +86,21 @@ def read_footage(
     if path.is_file():
         raise FootageError(f"{path}: neither a photo ({_list(PHOTO_SUFFIXES)}) nor a video "
                            f"({_list(VIDEO_SUFFIXES)})")  # fmt: skip
+    if options.places is None and options.log is None and is_sequence(path):
+        return _read_sequence(path, options)
     return _read_folder(path, options, progress)
 
 
 def _list(suffixes: frozenset[str]) -> str:
     return ", ".join(sorted(suffixes))
+
+
+def _read_sequence(path: Path, options: FootageOptions) -> RecordedFlight:
+    flight = read_sequence(path, options.name)
+    camera, told = flight.camera, flight.camera.camera
+    if options.camera is not None or options.fov_deg is not None:
+        camera = _given_camera(path, told.width, told.height, options) or camera
+    return replace(flight, camera=camera, frames=tuple(_spread(flight.frames, options.frames)))
 
 
 def _read_folder(path: Path, options: FootageOptions, progress: Progress) -> RecordedFlight:
@@ -168,7 +182,7 @@ def _flight(
     return RecordedFlight(path.name, kind, tuple(frames), camera, tuple(notes), log)
 
 
-def _spread(items: Sequence[Path], most: int) -> list[Path]:
+def _spread(items: Sequence[_T], most: int) -> list[_T]:
     picked = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
     return [items[int(k)] for k in picked]
 
@@ -337,6 +351,8 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
     log = options.log or _beside(path, LOG_SUFFIXES)
     times = _times(duration_ns, options.frames, in_pairs=log is not None)
     extracted = extract_frames(path, options.work / "frames", times, progress)
+    if facts.assumed:
+        notes.append(facts.assumed)
     if facts.rotation_deg % 360:
         notes.append(
             f"the video is marked as rotated by {facts.rotation_deg} degrees; its frames are used "

@@ -16,8 +16,10 @@ from localizer.pictures import write_rgb
 from localizer.types import Image
 
 VIDEO_SUFFIXES = frozenset(
-    {".mp4", ".mov", ".m4v", ".mkv", ".avi", ".ts", ".m2ts", ".mpg", ".mpeg", ".webm"}
-)
+    {".mp4", ".mov", ".m4v", ".mkv", ".avi", ".ts", ".m2ts", ".mpg", ".mpeg", ".webm",
+     ".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg"}
+)  # fmt: skip
+_RATE_HZ = 30.0  # of a file that has no times, and no rate in its headers
 _LARGEST_PX = 1920  # of an image's width: registration works on less
 _QUALITY_SUFFIX = ".jpg"
 
@@ -34,8 +36,9 @@ class ExtractedFrame:
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """What a video file says. width, height: of its frames; duration_s: 0 where it is not said;
-    has_dji_track: whether it holds DJI's own telemetry (protobuf, a layout for each model).
+    """What a video file says. width, height: of its frames; has_dji_track: whether it holds DJI's
+    own telemetry (protobuf, a layout for each model); assumed: about its times, empty if it has
+    some.
     """
 
     width: int
@@ -43,6 +46,7 @@ class VideoFacts:
     duration_s: float
     rotation_deg: int
     has_dji_track: bool
+    assumed: str
 
 
 def video_facts(path: Path) -> VideoFacts:
@@ -50,16 +54,38 @@ def video_facts(path: Path) -> VideoFacts:
     try:
         with av.open(str(path)) as container:
             stream = video_stream(container, str(path))
-            duration = container.duration / av.time_base if container.duration else 0.0
             frame = next(container.decode(stream), None)
             if frame is None:
                 raise FootageError(f"{path}: no frame in it can be decoded")
             rotation = round(getattr(frame, "rotation", 0) or 0)
             names = [str(s.metadata.get("handler_name", "")) for s in container.streams.data]
             has_track = any(re.search(r"(DJI|CAM)\W?meta", name, re.IGNORECASE) for name in names)
-            return VideoFacts(frame.width, frame.height, float(duration), rotation, has_track)
+            assumed = "" if frame.pts is not None else _assumed(path, stream)
+            said = container.duration
+            duration_s = said / av.time_base if said else _length_s(path)
+            return VideoFacts(frame.width, frame.height, duration_s, rotation, has_track, assumed)
     except av.error.FFmpegError as error:
         raise FootageError(f"{path}: not a video, or damaged: {error}") from error
+
+
+def _assumed(path: Path, stream: av.VideoStream) -> str:
+    stated = stream.codec_context.framerate
+    by = "as its headers say" if stated else "which is assumed"
+    return (
+        f"the video has no times in it: {float(stated or _RATE_HZ):g} frames a second, {by}; if it "
+        f"was filmed at another rate: ffmpeg -r RATE -i {path.name} -c copy {path.stem}.mp4"
+    )
+
+
+def _length_s(path: Path) -> float:
+    """Of a file that does not say it, by its packets."""
+    with av.open(str(path)) as container:
+        stream = video_stream(container, str(path))
+        stamps = [packet.pts for packet in container.demux(stream) if packet.size]
+        known = [pts for pts in stamps if pts is not None]
+        if known and stream.time_base is not None:
+            return float((max(known) - min(known)) * stream.time_base)
+        return len(stamps) / float(stream.codec_context.framerate or _RATE_HZ)
 
 
 def extract_frames(
@@ -93,7 +119,7 @@ def _pictures(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
         with av.open(str(path)) as container:
             stream = video_stream(container, str(path))
             stream.thread_type = "AUTO"
-            rate = float(stream.average_rate or 30.0)
+            rate = float(stream.codec_context.framerate or _RATE_HZ)
             for packet in container.demux(stream):
                 try:
                     pictures = packet.decode()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from companion.errors import RecordError
+from companion.offline.record import RecordTables, read_record
 from companion.offline.tables import Columns, poses, read_columns
 from companion.reporting import figures
 from companion.reporting.content import (
@@ -30,8 +31,6 @@ from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import (
     KEPT_FRAMES,
     VISION,
-    RecordTables,
-    read_record,
     worst_frames,
 )
 from companion.reporting.record import uncertainty_plots as uncertainty

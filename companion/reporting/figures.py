@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from companion.offline.record import STAGES
 from companion.offline.tables import Columns
 from companion.reporting.content import (
     NOTHING,
@@ -19,7 +20,6 @@ from companion.reporting.content import (
 )
 from mavlink_bridge.alerts.ids import AlertId
 
-STAGES = ("reference", "extract", "register", "latency")
 _GAP_S = 1.0  # without an estimate: the state before is not carried on over it
 _HARMLESS = (AlertId.INJECTION_FORCED.value, AlertId.GNSS_LOST.value, AlertId.ENDING.value)
 _WELL = f"{NOTHING}: tracking from the first fix to the end, and no warning"

@@ -16,8 +16,8 @@ from companion.errors import RecordError, StreamOpenError
 from companion.klv.local_set import encode
 from companion.klv.metadata import KlvContext, picture_fields
 from companion.klv.transport import TransportWriter
+from companion.offline.record import RecordTables, read_record
 from companion.offline.tables import Columns, poses
-from companion.reporting.record import RecordTables, read_record
 from companion.sources.base import fitted_camera, has_times, video_stream
 from companion.sources.misp import parse_message
 from localizer.geometry.camera import Camera

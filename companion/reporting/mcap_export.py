@@ -16,8 +16,8 @@ import numpy as np
 
 from companion.errors import ConfigError, RecordError, ReportError
 from companion.flight.recorder import MCAP_NAME
+from companion.offline.record import RecordTables, is_time_ns, read_record
 from companion.offline.tables import Columns
-from companion.reporting.record import RecordTables, is_time_ns, read_record
 from localizer.errors import LocalizerError
 from localizer.map.cache.cache import TileCache
 from localizer.plain_files import plain_bytes

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from companion.config import CameraModel
-from companion.errors import RecordError
-from companion.flight.recorder import MANIFEST_NAME
-from companion.offline.flown_map import FlownMap
-from companion.offline.tables import Columns, poses, read_columns
+from companion.offline.record import RecordTables, is_time_ns, mapping, read_record
+from companion.offline.tables import Columns, poses
 from companion.reporting import figures
 from companion.reporting.autopilot import AutopilotTracks, read_autopilot
 from companion.reporting.content import (
@@ -31,157 +24,13 @@ from companion.reporting.content import (
 )
 from companion.reporting.pictures import ShownFrame, map_pictures, silent
 from companion.terminal.steps import Say
-from localizer.errors import CameraError, GeoreferenceError
-from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
-from localizer.plain_files import plain_text
 
 _OVERLAYS = 8
 KEPT_FRAMES = "the frames that the record kept (record.snapshot_interval_s), not of all"
-_LARGEST = 1e9
-_DIGITS = 18
-_LATEST_NS = 1 << 62  # the year 2116: sums of two still fit 64 bits
-_NEEDED = {
-    "estimates.csv": (
-        "exposure_time_ns", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz", "sigma_east_m",
-        "sigma_north_m", "quality", "state", "status", "accepted",
-        *(f"{name}_ms" for name in figures.STAGES),
-    ),
-    "targets.csv": (
-        "exposure_time_ns", "target_id", "latitude_deg", "longitude_deg", "height_m", "east_m",
-        "north_m", "sigma_horizontal_m", "elsewhere",
-    ),
-    "events.csv": ("time_ns", "level", "text"),
-}  # fmt: skip
-_PLACE, _POINT = ("latitude_deg", "longitude_deg", "height_m"), ("east_m", "north_m", "up_m")
 _LATEST_MS = 250.0  # the oldest measurement that ArduPilot fuses
 VISION = "#ff8c1a"
 AUTOPILOT = "#1fd1ff"
 GNSS = "#ffffff"
-
-
-@dataclass(frozen=True)
-class RecordTables:
-    """A record's folder, read. health: the last health.json, {} without one; notes: what lacks.
-
-    Of the settings only what a report needs is read, so that a record of an older or newer version,
-    with keys that this one does not know, can still be shown.
-    """
-
-    folder: Path
-    estimates: Columns
-    targets: Columns
-    events: Columns
-    manifest: Mapping[str, Any]
-    health: Mapping[str, Any]
-    notes: tuple[str, ...]
-
-    @property
-    def start_ns(self) -> int:
-        """Of the record, CLOCK_MONOTONIC."""
-        return self._time_ns("monotonic_ns") or int(
-            next(iter(self.estimates.get("exposure_time_ns", ())), 0)
-        )
-
-    @property
-    def utc_ns(self) -> int:
-        """Of the start; 0 where the record does not say."""
-        return self._time_ns("utc_ns")
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The deployment that was flown; {} where the record does not say."""
-        return _mapping(self.manifest.get("config"))
-
-    @property
-    def versions(self) -> dict[str, Any]:
-        """Of the software; {} where the record does not say."""
-        return _mapping(self.manifest.get("versions"))
-
-    @property
-    def map_path(self) -> Path | None:
-        """Of the map that was flown on; None where the record does not say."""
-        named = self._setting("map")
-        return Path(named) if isinstance(named, str) else None
-
-    @property
-    def flown(self) -> FlownMap:
-        """What the record knows of that map."""
-        told = self.manifest.get("map_sha256")
-        sha256 = told if isinstance(told, str) else None
-        columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]
-        numbers = [np.nan if c is None or not len(c) else float(c[0]) for c in columns]
-        if not np.isfinite(numbers).all():
-            return FlownMap(self.folder, sha256)
-        try:
-            return FlownMap(self.folder, sha256, Geodetic(*numbers[:3]), np.array(numbers[3:]))
-        except GeoreferenceError:
-            return FlownMap(self.folder, sha256)
-
-    @property
-    def camera(self) -> Camera | None:
-        """As it was calibrated; None where the record does not say."""
-        try:
-            return CameraModel.model_validate(self._setting("camera", "model")).camera()
-        except (ValidationError, CameraError):
-            return None
-
-    @property
-    def tlog(self) -> Path | None:
-        """The flight's MAVLink log, if one was kept: where the settings say, or, of a record that
-        was brought elsewhere, in it or beside it.
-        """
-        named = self._setting("bridge", "tlog")
-        if not isinstance(named, str):
-            return None
-        name = Path(named).name
-        places = (Path(named), self.folder / name, self.folder.parent / name)
-        return next((path for path in places if path.is_file()), places[0])
-
-    @property
-    def delay_ms(self) -> float | None:
-        """The age at which a fix was sent."""
-        return self._number("bridge", "injection", "delay_ms")
-
-    @property
-    def alert_limit_m(self) -> float | None:
-        """The protection level beyond which nothing was injected."""
-        return self._number("bridge", "injection", "alert_limit_m")
-
-    def _number(self, *keys: str) -> float | None:
-        value = self._setting(*keys)
-        known = isinstance(value, int | float) and abs(value) < _LARGEST  # false for NaN, too
-        return float(value) if known else None
-
-    def _time_ns(self, key: str) -> int:
-        value = self.manifest.get(key)
-        return value if isinstance(value, int) and 0 <= value < _LATEST_NS else 0
-
-    def _setting(self, *keys: str) -> Any:
-        value: Any = self.manifest.get("config")
-        for key in keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        return value
-
-
-def read_record(folder: Path) -> RecordTables:
-    """Read what `companion run` left; `RecordError` for a folder that is no record."""
-    try:
-        estimates = _table(folder / "estimates.csv", ("state", "status"))
-        targets = _table(folder / "targets.csv", ("target_id", "visibility"))
-        events = _table(folder / "events.csv", ("level", "text", "alert"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordError(
-            f"{folder}: not a flight's record: {error}; give the folder that "
-            "`companion run` recorded (record.folder), or a demo's companion/"
-        ) from error
-    notes = []
-    manifest, health = _document(folder / MANIFEST_NAME), _document(folder / "health.json")
-    if not manifest:
-        notes.append(f"{MANIFEST_NAME} cannot be read: no settings, no map")
-    if not estimates:
-        notes.append("the record holds no estimate: nothing was localized in that flight")
-    return RecordTables(folder, estimates, targets, events, manifest, health, tuple(notes))
 
 
 def record_report(folder: Path, say: Say = silent) -> Report:
@@ -364,12 +213,12 @@ def _shadow(told: Any) -> dict[str, Any]:
     """Of health.json; 0.1 wrote a line that begins with "go" or "no-go"."""
     if isinstance(told, str) and told:
         return {"ready": told.startswith("go"), "text": told}
-    return _mapping(told)
+    return mapping(told)
 
 
 def _untold_targets(counts: Any) -> list[CriterionResult]:
     """Clicks and detections that were not told; nothing where all were, or nobody counted."""
-    named = {k: v for k, v in _mapping(counts).items() if isinstance(v, int) and v > 0}
+    named = {k: v for k, v in mapping(counts).items() if isinstance(v, int) and v > 0}
     if not named:
         return []
     text = ", ".join(f"{number} {name}" for name, number in named.items())
@@ -387,29 +236,3 @@ def _how_it_ended(tables: RecordTables) -> str:
     if tables.health.get("level") == "ended":
         return f"{tables.folder}: {tables.health.get('text', '')}"
     return f"{tables.folder}: the end was not written"
-
-
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(plain_text(path))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}
-
-
-def _table(path: Path, text: tuple[str, ...]) -> Columns:
-    """A table that holds what a report needs, or nothing."""
-    columns = read_columns(path, text)
-    missing = [name for name in _NEEDED[path.name] if name not in columns]
-    if columns and missing:
-        raise RecordError(f"{path}: not a table of a record: no column {missing[0]}")
-    return columns
-
-
-def _mapping(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def is_time_ns(text: str) -> bool:
-    """Whether a snapshot's name is the time of its exposure."""
-    return text.isascii() and text.isdigit() and len(text) <= _DIGITS

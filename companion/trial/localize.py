@@ -10,8 +10,6 @@ import numpy as np
 
 from companion.errors import StreamDecodeError, StreamSizeError
 from companion.recorded.flight import RecordedFrame
-from companion.sources.base import fitted_camera
-from companion.sources.folder_source import read_image
 from companion.trial.priors import FramePrior
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
@@ -54,14 +52,9 @@ class FrameLocalizer:
 
     def load(self, recorded: RecordedFrame) -> Frame:
         """The image with the camera's model, zoom included. Stream errors for an unusable one."""
-        image = read_image(recorded.path)
-        camera = fitted_camera(image.shape[1], image.shape[0], self._camera, recorded.name)
-        zoom = recorded.telemetry.zoom
-        if zoom != 1.0:
-            camera = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
         self._loaded += 1
         # One sequence number, which seeds the hypotheses: the order of photos changes nothing.
-        return Frame(image, self._loaded * _STEP_NS, camera, 0)
+        return recorded.load(self._camera, self._loaded * _STEP_NS)
 
     def from_prior(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
         """By its own telemetry; what that lacks (heading, height) is searched about its place."""

@@ -1,12 +1,7 @@
-"""Localizing recorded sequences: the paper's protocol (Sec. 4.1) from a perturbed prior.
-
-Two folder layouts are read: ours (``images/``, ``poses.txt``, ``camera.json``) and PiLoT's data
-set (``images/NAME/``, ``poses/NAME.txt``, with ``camera.json`` or ``cameras/NAME.json``).
-"""
+"""Localizing recorded sequences: the paper's protocol (Sec. 4.1) from a perturbed prior."""
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -21,19 +16,13 @@ from localizer.evaluation.metrics import LocalizationMetrics, localization_metri
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.pictures import read_rgb
-from localizer.plain_files import files_of, plain_text
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior
 
 PriorMode = Literal["first", "each"]
 # (frame, its truth, its index) -> the prior to begin from, None where no place is found.
 FindPlace = Callable[[Frame, Pose, int], PosePrior | None]
-
-# Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
-_FRAME_INTERVAL_NS = 33_333_333
-_TIMESTAMPS = "timestamps.txt"
 
 CSV_COLUMNS = (
     "name", "latitude_deg", "longitude_deg", "height_m", "translation_error_m",
@@ -122,60 +111,6 @@ def _random_vector(rng: np.random.Generator, limit: float) -> Array:
     direction = rng.standard_normal(3)
     vector: Array = direction / np.linalg.norm(direction) * rng.uniform(0.0, limit)
     return vector
-
-
-def load_sequence(path: Path, frame: LocalFrame, name: str | None = None) -> Sequence:
-    """Read a sequence folder of either layout; `name` chooses one of several in PiLoT's."""
-    if not path.is_dir():
-        raise SequenceError(f"{path}: no such folder")
-    images, poses, camera = _layout(path, name)
-    rows = read_poses(poses)
-    paths = tuple(images / row.name for row in rows)
-    missing = [p.name for p in paths if not p.is_file()]
-    if missing:
-        raise SequenceError(
-            f"{images}: {len(missing)} of {len(paths)} images named in {poses.name} are missing, "
-            f"first {missing[0]}"
-        )
-    truth = tuple(world_from_camera(row, frame) for row in rows)
-    times = _times(images / _TIMESTAMPS, paths)
-    assumed = tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
-    return Sequence(paths, times or assumed, truth, Camera.from_json(camera), times is not None)
-
-
-def _times(file: Path, paths: tuple[Path, ...]) -> tuple[int, ...] | None:
-    """Exposure times from ``timestamps.txt`` (name and ns per line); None without the file."""
-    if not file.is_file():
-        return None
-    try:
-        stamps = {
-            name: int(time_ns)
-            for name, time_ns in (x.split() for x in plain_text(file).splitlines() if x.strip())
-        }
-        times = tuple(stamps[path.name] for path in paths)
-    except (OSError, ValueError, KeyError) as error:
-        raise SequenceError(f"{file}: not 'name nanoseconds' for every image: {error}") from error
-    if any(b <= a for a, b in itertools.pairwise(times)):
-        raise SequenceError(f"{file}: exposure times must increase")
-    return times
-
-
-def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:
-    """(image folder, pose file, camera file) of a sequence folder."""
-    if (path / "poses.txt").is_file():
-        return path / "images", path / "poses.txt", path / "camera.json"
-    poses = path / "poses"
-    names = [p.stem for p in files_of(poses, (".txt",))] if poses.is_dir() else []
-    if not names:
-        raise SequenceError(f"{path}: holds neither poses.txt nor poses/NAME.txt")
-    if name is None and len(names) > 1:
-        raise SequenceError(f"{path}: holds {len(names)} sequences, name one: {', '.join(names)}")
-    chosen = name or names[0]
-    if chosen not in names:
-        raise SequenceError(f"{path}: no sequence {chosen!r}, there are: {', '.join(names)}")
-    own = path / "cameras" / f"{chosen}.json"
-    camera = own if own.is_file() else path / "camera.json"
-    return path / "images" / chosen, path / "poses" / f"{chosen}.txt", camera
 
 
 def evaluate(

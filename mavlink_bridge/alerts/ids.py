@@ -67,6 +67,7 @@ class AlertId(str, enum.Enum):
     NO_FIX_YET = "no_fix_yet"
     NO_FRESH_FIX = "no_fresh_fix"
     LINK_FULL = "link_full"
+    COMMAND_NOT_TAKEN = "command_not_taken"
     EKF_NO_ORIGIN = "ekf_no_origin"
     EKF_ORIGIN_FAR = "ekf_origin_far"
     NO_ATTITUDE = "no_attitude"

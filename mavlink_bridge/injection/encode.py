@@ -24,6 +24,7 @@ _IGNORE_VELOCITY = (
     | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
     | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
 )
+_WRAPS_S = 36_000.0  # of a time in a float, as the command's definition proposes
 GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
 # What a receiver would claim of such an error. ArduPilot refuses to arm with hdop ignored, above
 # GPS_HDOP_GOOD (1.4: a protection level of 3.5 m) or below 6 satellites.
@@ -237,4 +238,30 @@ def global_position_sensor(e: EncodedEstimate, altitude_amsl_m: float, now_ns: i
         altitude_amsl_m,
         p.horizontal_sigma_m,
         p.vertical_sigma_m,
+    )
+
+
+def external_position_estimate(
+    e: EncodedEstimate, system_id: int, now_ns: int, since_ns: int
+) -> Any:
+    """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) to an autopilot, as COMMAND_INT (75).
+
+    It says when it is sent, seconds since since_ns, and how long before that the exposure was. It
+    has no height: ArduPilot refuses another frame and another altitude than NaN.
+    """
+    p = e.position
+    return mavlink.MAVLink_command_int_message(
+        system_id,
+        mavlink.MAV_COMP_ID_AUTOPILOT1,
+        mavlink.MAV_FRAME_GLOBAL,
+        mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
+        0,
+        0,
+        (now_ns - since_ns) * 1e-9 % _WRAPS_S,
+        max(0, now_ns - p.time_ns) * 1e-9,
+        p.horizontal_sigma_m,
+        NAN,
+        round(p.latitude_deg * 1e7),
+        round(p.longitude_deg * 1e7),
+        NAN,
     )

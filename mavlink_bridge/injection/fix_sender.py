@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
@@ -13,17 +16,75 @@ from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
-from mavlink_bridge.vehicle.profile import FirmwareProfile
+from mavlink_bridge.vehicle.profile import select_profile
 
 _QUEUE = 64
 _NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
 _BRIEF = (AlertId.NO_FRESH_FIX, AlertId.LINK_FULL)
 _GOOD_NS = 1_000_000_000
 _FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
+_ASK_NS = 1_000_000_000
+_ANSWERED_NS = 2_000_000_000
+
+
+class PositionCommand:
+    """Whether the autopilot fuses MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
+
+    It says so by accepting the command while GNSS aids its EKF. ArduPilot 4.7 refuses it then and
+    accepts it after the loss of GNSS, as a reset: streamed so, the vehicle landed after 8 s all the
+    same. Who refused is not asked again until a reboot.
+    """
+
+    def __init__(self) -> None:
+        self.answer = "not asked, no GNSS"
+        self._fuses: bool | None = None
+        self._asked_ns = self._accepted_ns = 0
+        self._held_ns = self._held_since_ns = 0  # fixes that were not sent
+
+    def take(self, result: int, now_ns: int) -> None:
+        """The MAV_RESULT of one that was sent."""
+        name = mavlink.enums["MAV_RESULT"][result].name if result in _RESULTS else str(result)
+        self.answer = name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
+        is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
+        if self._fuses is None:
+            self._fuses = is_accepted
+        if is_accepted:
+            self._accepted_ns = now_ns
+
+    def flows(self, now_ns: int) -> bool:
+        """Whether commands are accepted: each fix is sent."""
+        return bool(self._fuses) and now_ns - self._accepted_ns < _ANSWERED_NS
+
+    def asks(self, state: VehicleState, now_ns: int) -> bool:
+        """Whether to send a fix although they are not, to hear what the autopilot says now."""
+        if now_ns - self._held_ns > _ASK_NS:
+            self._held_since_ns = now_ns
+        self._held_ns = now_ns
+        if self._fuses is None:
+            aided = bool(state.ekf_flags & mavlink.EKF_POS_HORIZ_ABS)
+            may_ask = aided and gnss_healthy(state, now_ns)
+        else:
+            may_ask = self._fuses
+        if not may_ask or now_ns - self._asked_ns < _ASK_NS:
+            return False
+        self._asked_ns = now_ns
+        if self._fuses is None:
+            self.answer = "not answered"
+        return True
+
+    def is_held(self, now_ns: int) -> bool:
+        """Whether fixes were not sent for so long that an answer would have come."""
+        is_recent = now_ns - self._held_ns < _ASK_NS
+        return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
+
+
+_RESULTS = frozenset(mavlink.enums["MAV_RESULT"])
 
 
 class FixSender:
@@ -43,6 +104,8 @@ class FixSender:
         self.fixes = FixQueue(_QUEUE)
         self.injector = Injector(shared.config.injection, shared.geoid_separation_m, shared.utc)
         self.vision: PropagatedFix | None = None
+        commands = shared.config.injection.message == "external_position_estimate"
+        self._command = PositionCommand() if commands else None
         self._component = shared.config.localizer_component
         self._attitude_at = shared.tracker.attitude_at
         self._origin = origin
@@ -59,24 +122,40 @@ class FixSender:
         for fix in self.fixes.take():
             self.injector.submit(fix, now_ns)
 
-    def step(self, link: Link, profile: FirmwareProfile, mode: Mode, now_ns: int) -> None:
+    def acknowledged(self, link: Link, ack: Any, now_ns: int) -> None:
+        """A COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE; a ground station sends that command, too."""
+        ours = ack.target_system in (0, link.system_id)
+        if self._command is not None and ours and ack.target_component in (0, self._component):
+            self._command.take(ack.result, now_ns)
+
+    def rebooted(self) -> None:
+        """The autopilot starts over."""
+        self.injector.guard.reset()
+        self._command = None if self._command is None else PositionCommand()
+
+    def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
         """Send what is due, as the mode allows, and tell why not. mode: not ``off``."""
-        context = InjectionContext(self._origin.origin, profile, self._attitude_at)
+        profile = select_profile(state.autopilot, state.version)
+        context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)
         injection = self.injector.step(now_ns, context)
         if injection is not None:
             self.vision = injection.estimate.position
-            self._deliver(link, mode, injection, now_ns)
+            self._deliver(link, state, mode, injection, now_ns)
         delta = self.injector.motion.take()
         if delta is not None and mode == "inject" and link.send(delta, self._component):
             self._counters["injected_deltas"] += 1
         reason = self.injector.reason
+        command = self._command if mode == "inject" else None
+        if reason is None and command is not None and not command.flows(now_ns):
+            reason = alert(AlertId.COMMAND_NOT_TAKEN, answer=command.answer)
         if reason is None and not self._taken:
             reason = alert(AlertId.LINK_FULL)
         self._reason = reason
         # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
         recent = now_ns - self._delivered_ns < _NEWS_AFTER_NS
         of = None if reason is None else reason.id
-        if of is not AlertId.NO_FIX_YET and not (recent and of in _BRIEF):
+        waits = of is AlertId.COMMAND_NOT_TAKEN and command and not command.is_held(now_ns)
+        if of is not AlertId.NO_FIX_YET and not (recent and of in _BRIEF) and not waits:
             relief = alert(AlertId.INJECTING) if mode == "inject" else None
             self._teller.tell_settled("inject", reason, relief, now_ns)
 
@@ -107,8 +186,18 @@ class FixSender:
         """Lengths of everything that waits here."""
         return {"fixes": len(self.fixes), "due": self.injector.waiting}
 
-    def _deliver(self, link: Link, mode: Mode, injection: EncodedMessage, now_ns: int) -> None:
+    def _deliver(
+        self, link: Link, state: VehicleState, mode: Mode, injection: EncodedMessage, now_ns: int
+    ) -> None:
         self._outcome.made(injection.estimate)
+        if self._command is not None and mode == "inject":
+            if not injection.estimate.fresh:
+                return  # it has its age with it: nothing is propagated
+            if not self._command.flows(now_ns):
+                if self._command.asks(state, now_ns):
+                    self._counters["position_commands"] += 1
+                    link.send(injection.message, self._component)
+                return
         # What a port that is full does not take, the EKF does not have: no source to switch to.
         self._taken = mode != "inject" or link.send(injection.message, self._component)
         if not self._taken:

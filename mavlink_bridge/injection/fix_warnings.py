@@ -53,7 +53,8 @@ class FixWarnings:
         latency, least = known.median_ms, known.least_ms
         if latency is None or least is None or not known.is_known:
             return None
-        limit_ms = self._config.delay_ms
+        says_age = self._config.message == "external_position_estimate"
+        limit_ms = profile.max_delay_ms if says_age else self._config.delay_ms
         # Where the firmware goes by the least lag, its positions lag by what that is late.
         lag = least if profile.least_lag else latency
         late = alert(AlertId.FIXES_LATE, age_ms=lag, limit_ms=limit_ms)

@@ -15,6 +15,7 @@ from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.encode import (
     Angles,
     EncodedEstimate,
+    external_position_estimate,
     global_position_sensor,
     gps_input,
     odometry,
@@ -51,6 +52,7 @@ class InjectionContext:
     origin: Origin | None
     profile: FirmwareProfile
     attitude_at: Callable[[int], Attitude | None]
+    system_id: int = 1
 
 
 def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> Angles:
@@ -78,6 +80,7 @@ class MessageMaker:
         self._config = config
         self._geoid_m = geoid_separation_m
         self._utc = utc
+        self._begun_ns: int | None = None
 
     def make(
         self, e: EncodedEstimate, now_ns: int, context: InjectionContext
@@ -85,11 +88,9 @@ class MessageMaker:
         """The configured message of an estimate."""
         kind: InjectionMessage = self._config.message
         altitude = e.position.height_m - self._geoid_m
-        if kind == "gps_input":
-            week_ms = self._utc.gps_week_ms(e.position.time_ns)
-            return EncodedMessage(gps_input(e, altitude, week_ms, self._config), e)
-        if kind == "global_position_sensor":
-            return EncodedMessage(global_position_sensor(e, altitude, now_ns), e)
+        message = self._global(kind, e, altitude, now_ns, context.system_id)
+        if message is not None:
+            return EncodedMessage(message, e)
         if context.origin is None:
             return HeldOutput(alert(AlertId.EKF_NO_ORIGIN), "withheld_no_origin")
         ned = ned_from_origin(
@@ -110,6 +111,25 @@ class MessageMaker:
         if not self._config.send_attitude:
             e = replace(e, attitude=(None, None, None))
         return EncodedMessage(vision_position_estimate(e, ned, formula), e)
+
+    def _global(
+        self,
+        kind: InjectionMessage,
+        e: EncodedEstimate,
+        altitude_amsl_m: float,
+        now_ns: int,
+        system_id: int,
+    ) -> Any:
+        """The message where it has a latitude and a longitude; None for local ones."""
+        if kind == "gps_input":
+            week_ms = self._utc.gps_week_ms(e.position.time_ns)
+            return gps_input(e, altitude_amsl_m, week_ms, self._config)
+        if kind == "global_position_sensor":
+            return global_position_sensor(e, altitude_amsl_m, now_ns)
+        if kind == "external_position_estimate":
+            self._begun_ns = self._begun_ns or now_ns
+            return external_position_estimate(e, system_id, now_ns, self._begun_ns)
+        return None
 
     def _odometry(
         self,

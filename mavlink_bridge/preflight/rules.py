@@ -72,6 +72,8 @@ def find_source_set(config: BridgeConfig, read: Read) -> int:
     """The EK3 source set that takes the injection: the one that does already, or should."""
     if config.switch.enabled:
         return config.switch.vision_set
+    if config.injection.message == "external_position_estimate":
+        return config.switch.gnss_set
     wanted = 3.0 if config.injection.message == "gps_input" else 6.0
     for number in _SOURCE_SETS:
         if read(f"EK3_SRC{number}_POSXY") == wanted:
@@ -89,6 +91,8 @@ def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[ParameterRule
             ("EK3_ENABLE",), (1.0,), "only EKF3 has external navigation sources", reboot=True
         ),
     ]
+    if config.injection.message == "external_position_estimate":
+        return common  # it has no source set
     if config.injection.message == "gps_input":
         return common + _gps_input_rules(config, source_set)
     return common + _vision_rules(config, source_set)
@@ -245,7 +249,7 @@ def missing_feature(config: BridgeConfig, read: Read, *, px4: bool) -> tuple[str
         parameters, option = _AGP_CONTROLS, "CONFIG_EKF2_AUX_GLOBAL_POSITION=y (PX4 1.15 or later)"
     elif px4:
         parameters, option = ("EKF2_EV_CTRL",), "CONFIG_EKF2_EXTERNAL_VISION=y (PX4 1.14 or later)"
-    elif message == "gps_input":
+    elif message in ("gps_input", "external_position_estimate"):
         return None
     elif read("EK3_SRC1_POSXY") is None:
         parameters, option = ("EK3_SRC1_POSXY",), "HAL_NAVEKF3_AVAILABLE (ArduPilot 4.1 or later)"

@@ -47,6 +47,7 @@ _ARDUPILOT_MESSAGES: tuple[InjectionMessage, ...] = (
     "vision_position_estimate",
     "odometry",
     "gps_input",
+    "external_position_estimate",
 )
 
 ARDUPILOT = FirmwareProfile(

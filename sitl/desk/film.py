@@ -14,6 +14,7 @@ from companion.conversions import CameraExtrinsics
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME, Recorder, write_manifest
 from companion.offline.autopilot import RecordedAutopilot
+from companion.recorded.flight import LogBeside
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
@@ -92,7 +93,9 @@ def write_record(
     if config.record is None:
         raise ValueError("a desk flight's deployment names its record")
     start_ns, offset_ns = clocks
-    autopilot = RecordedAutopilot(config.bridge, tlog, start_ns, offset_ns)
+    autopilot = RecordedAutopilot(
+        config.bridge, LogBeside(tlog, offset_ns, has_gimbal=True), start_ns
+    )
     stack = MapStack(config.map, config.localizer)
     recorder = Recorder(config.record, stack.cache.frame) if keep else None
     told = config.camera.model.camera()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from companion.errors import ConfigError, RecordError
+from companion.errors import ConfigError
 from companion.terminal.steps import shown_count
 
 app = typer.Typer(no_args_is_help=True)
@@ -41,20 +40,14 @@ def flight_command(
         require_flown_with,
         write_changed,
     )
-    from companion.offline.replay import load_record
+    from companion.offline.record import load_record
     from localizer.map.cache.cache import TileCache
 
     if write and config is None:
         raise ConfigError("--write needs --config: which deployment file is to be changed?")
-    loaded = load_record(record, kept_share=0.0)
-    log = tlog or loaded.config.bridge.tlog
-    if log is None:
-        raise RecordError(f"{record}: flown without bridge.tlog; give the log as --tlog")
-    if map_cache is not None:
-        changed = loaded.config.model_copy(update={"map": map_cache})
-        loaded = replace(loaded, config=changed)
+    loaded = load_record(record, 0.0, tlog, map_cache)
     with shown_count(Console(stderr=True), "pictures") as count:
-        found = calibrate(loaded, log, loaded.config.map, frames, count)
+        found = calibrate(loaded, frames, count)
     wanted = changes(loaded.config, found)
     console = Console()
     console.print(_numbers(found))
@@ -62,7 +55,7 @@ def flight_command(
     console.print("What this flight cannot tell:" if blind else "This flight tells all of it.")
     for line in blind:
         console.print(f"  {escape(line)}", soft_wrap=True, highlight=False)
-    doubt = loaded.flown.doubt(TileCache.open(loaded.config.map))
+    doubt = loaded.tables.flown.doubt(TileCache.open(loaded.config.map))
     for note in (*found.notes, *filter(None, (doubt,))):
         console.print(escape(note), style="yellow", soft_wrap=True)
     console.print(

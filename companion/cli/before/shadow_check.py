@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.steps import COMPILES, shown_count
 
 if TYPE_CHECKING:
@@ -35,15 +36,9 @@ def shadow_check_command(
     config: Annotated[
         Path | None, typer.Option(help="deployment file; else made from the footage")
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="camera.json; else the footage's own tags")
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
-    ] = None,
-    mount_pitch: Annotated[
-        float, typer.Option(min=-180, max=180, help="of a camera on the airframe; -90 looks down")
-    ] = -90.0,
+    camera: FootageCamera = None,
+    fov: FieldOfView = None,
+    mount_pitch: MountPitch = -90.0,
     rate_hz: Annotated[float, typer.Option(min=0.1, max=60, help="images a second, at most")] = 5.0,
     report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
 ) -> None:

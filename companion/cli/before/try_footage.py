@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, shown_count, shown_steps
 from companion.writing import made_folder
@@ -31,15 +32,9 @@ def try_command(
     log: Annotated[
         Path | None, typer.Option(help="ArduPilot .bin or .tlog of the flight; else found beside")
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="camera.json; else the footage's own tags")
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
-    ] = None,
-    mount_pitch: Annotated[
-        float, typer.Option(min=-180, max=180, help="of a camera on the airframe; -90 looks down")
-    ] = -90.0,
+    camera: FootageCamera = None,
+    fov: FieldOfView = None,
+    mount_pitch: MountPitch = -90.0,
     frames: Annotated[int, typer.Option(min=1, max=2000, help="that are used, at most")] = 100,
     searches: Annotated[
         int, typer.Option(min=0, max=2000, help="frames that are searched without their place")

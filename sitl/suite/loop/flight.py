@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.offline.replay import read_estimates
+from companion.offline.record import read_estimates
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.camera.gimbal_error import GimbalError

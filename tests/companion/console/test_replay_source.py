@@ -15,8 +15,8 @@ from companion.console.pictures import page_message
 from companion.console.replay_source import ReplaySource
 from companion.errors import ConfigError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
+from companion.offline.record import read_record
 from companion.reporting.pictures import map_pictures
-from companion.reporting.record import read_record
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import TlogRecorder
 

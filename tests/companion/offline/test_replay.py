@@ -20,9 +20,9 @@ from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.offline.autopilot import RecordedAutopilot
-from companion.offline.replay import load_record, replay, summarize
+from companion.offline.record import load_record, read_record
+from companion.offline.replay import replay, summarize
 from companion.reporting.pictures import map_pictures
-from companion.reporting.record import read_record
 from companion.sources.zoom import ZoomTable
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
@@ -163,7 +163,7 @@ def _rows(record):
 def test_a_recorded_flight_localizes_again_as_it_did(record):
     loaded = load_record(record)
     assert sum(e.accepted for e in loaded.estimates) >= FRAMES_AT_LEAST
-    summary = summarize(replay(loaded, loaded.config.bridge.tlog))
+    summary = summarize(replay(loaded))
     assert summary.frames == len(loaded.estimates)
     assert summary.agrees(tolerance_m=0.5), summary
     assert np.median(summary.translation_m) < 0.2
@@ -192,14 +192,14 @@ def test_a_map_that_was_built_again_about_another_origin_is_refused(record):
     """All places of the record lay beside it by the same way, and nobody was told."""
     loaded = load_record(record)
     flown = TileCache.open(loaded.config.map)
-    loaded.flown.require_frame(flown)
-    assert not loaded.flown.doubt(flown)
+    loaded.tables.flown.require_frame(flown)
+    assert not loaded.tables.flown.doubt(flown)
     origin = replace(
         flown.manifest.origin, longitude_deg=flown.manifest.origin.longitude_deg + 1e-4
     )
     again = TileCache(flown.path, flown.manifest.model_copy(update={"origin": origin}), flown.index)
     with pytest.raises(RecordError, match=r"another origin .* 8 m away: was it built again"):
-        loaded.flown.require_frame(again)
+        loaded.tables.flown.require_frame(again)
 
 
 def test_a_map_that_was_built_again_about_the_same_origin_is_doubted(record, tmp_path):
@@ -214,9 +214,9 @@ def test_a_map_that_was_built_again_about_the_same_origin_is_doubted(record, tmp
         flown.manifest.model_copy(update={"gsd_m": 9.0}).model_dump_json()
     )
     built = TileCache.open(again)
-    loaded.flown.require_frame(built)
-    assert "not the map that was flown over: was it built again" in loaded.flown.doubt(built)
-    assert not replace(loaded, map_sha256=None).flown.doubt(built)  # an older record
+    loaded.tables.flown.require_frame(built)
+    assert "not the map that was flown over: was it built again" in loaded.tables.flown.doubt(built)
+    assert not replace(loaded.tables.flown, sha256=None).doubt(built)  # an older record
     tables = read_record(record)
     with map_pictures(again, flown=tables.flown) as pictures:
         assert any("built again" in note for note in pictures.notes)
@@ -251,10 +251,10 @@ def test_the_manifest_dates_the_tlog_and_says_what_flew(record):
     assert manifest["config"]["localizer"]["width"] == 256
     assert {"python", "numpy"} <= set(manifest["versions"])
     loaded = load_record(record)
-    times = [utc - loaded.utc_minus_monotonic_ns for utc, _ in read_tlog(
+    times = [utc - loaded.log.ahead_ns for utc, _ in read_tlog(
         loaded.config.bridge.tlog)]  # fmt: skip
     exposures = [e.exposure_time_ns for e in loaded.estimates]
-    assert loaded.start_ns <= min(exposures)
+    assert loaded.tables.start_ns <= min(exposures)
     assert min(times) < min(exposures) < max(exposures) < max(times) + 10**9
     assert times == sorted(times)
 
@@ -279,7 +279,7 @@ def test_a_row_that_a_loss_of_power_cut_short_is_left_out(record, tmp_path):
 
 @pytest.mark.parametrize(
     ("column", "value"),
-    [("latency_ms", "inf"), ("focal_px", "-1"), ("focal_px", "nan"), ("qw", "nan"),
+    [("latency_ms", "inf"), ("focal_px", "-1"), ("focal_px", "inf"), ("qw", "nan"),
      ("east_m", "x"), ("sequence", ""), ("exposure_time_ns", 400 * "9"),
      ("exposure_time_ns", "-1")],
 )  # fmt: skip
@@ -290,7 +290,7 @@ def test_a_row_that_is_no_estimate_is_named(record, tmp_path, column, value):
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows([*rows, rows[0] | {column: value}])
-    with pytest.raises(RecordError, match="not a flight's record"):
+    with pytest.raises(RecordError, match="not a table of a record"):
         load_record(folder)
 
 
@@ -314,7 +314,7 @@ def test_each_frame_is_replayed_with_the_focal_length_that_it_had(record, tmp_pa
 
     monkeypatch.setattr("companion.offline.replay.build_localizer", lambda *_: Localizer())
     loaded = load_record(folder)
-    replay(loaded, loaded.config.bridge.tlog)
+    replay(loaded)
     assert seen == pytest.approx(flown, rel=1e-4)
 
 
@@ -342,7 +342,7 @@ def test_an_older_record_of_a_camera_that_zooms_is_replayed_by_its_log_or_told(
         caplog.clear()
         camera = loaded.config.camera.model_copy(update={"zoom": zoom})
         config = loaded.config.model_copy(update={"camera": camera})
-        frames = replay(replace(loaded, config=config, estimates=old), config.bridge.tlog)
+        frames = replay(replace(loaded, config=config, estimates=old))
         return [f.recorded for f in frames]
 
     monkeypatch.setattr("companion.offline.replay.build_localizer", lambda *_: Localizer())
@@ -362,7 +362,7 @@ def test_damaged_images_are_no_agreement(record, tmp_path):
         image.touch()
     loaded = load_record(folder)
     with pytest.raises(RecordError, match=r"only 0 of \d+ images in snapshots can be read"):
-        replay(loaded, loaded.config.bridge.tlog)
+        replay(loaded)
 
 
 def test_a_damaged_tlog_is_told(tmp_path):

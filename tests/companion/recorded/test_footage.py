@@ -1,5 +1,7 @@
 """Folders, photos and videos as people bring them."""
 
+import json
+import shutil
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +12,10 @@ import pytest
 from companion.errors import FootageError
 from companion.klv import local_set as tag
 from companion.recorded.footage import FootageOptions, read_footage
+from companion.recorded.sequence import load_sequence, sequence_of
+from localizer.errors import SequenceError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.posefile import pose_row, write_poses
 from tests.companion.recorded.logs import UTC_S, swaying, write_tlog
 from tests.companion.recorded.photos import dji, write_photo
 
@@ -186,6 +192,20 @@ def test_a_video_without_telemetry_or_with_anothers_is_named(tmp_path):
         read_footage(tmp_path / "b.mp4", FootageOptions(tmp_path / "w", fov_deg=70.0))
 
 
+def test_a_raw_video_is_read_at_the_rate_in_its_headers(tmp_path):
+    """It holds no times and no length; FFmpeg guesses 25 a second."""
+    with av.open(str(tmp_path / "a.h264"), "w") as out:
+        stream = out.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for shade in range(40):
+            image = np.full((120, 160, 3), 5 * shade, np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        out.mux(stream.encode(None))
+    flight = read_footage(tmp_path / "a.h264", FootageOptions(tmp_path / "w", fov_deg=70.0))
+    assert [f.time_ns for f in flight.frames] == [500_000_000 * k for k in range(8)]
+    assert any("no times in it: 10 frames a second, as its headers say" in n for n in flight.notes)
+
+
 def test_djis_own_track_in_a_video_is_named(tmp_path):
     video = tmp_path / "DJI_0002.MP4"
     with av.open(str(video), "w") as out:
@@ -200,6 +220,30 @@ def test_djis_own_track_in_a_video_is_named(tmp_path):
     video.write_bytes(made.replace(b"TimeCodeHandler", b"DJI meta".ljust(15, b"\0")))
     flight = read_footage(video, FootageOptions(tmp_path / "w", fov_deg=70.0))
     assert any("telemetry inside DJI's video is not read: give its .SRT" in n for n in flight.notes)
+
+
+def test_a_sequence_is_footage_and_photos_with_tags_are_a_sequence(tmp_path):
+    """One form: what `eval` measures, `try` can try, and the other way round."""
+    folder = _survey(tmp_path / "p", AbsoluteAltitude="+560.0")
+    frame = LocalFrame(Geodetic(47.3, 8.5, 0.0))
+    taken = sequence_of(read_footage(folder, FootageOptions(tmp_path / "w")), frame, 50.0)
+    assert taken.truth[0].translation == pytest.approx([0.0, 0.0, 610.0], abs=1e-6)
+    assert taken.is_timed
+    made = tmp_path / "sequence"
+    shutil.copytree(folder, made / "images")
+    poses = zip(taken.images, taken.truth, strict=True)
+    write_poses(made / "poses.txt", [pose_row(p.name, pose, frame) for p, pose in poses])
+    (made / "camera.json").write_text(json.dumps(taken.camera.to_dict()))
+    stamps = "".join(f"{p.name} {k + 7}\n" for k, p in enumerate(taken.images))
+    (made / "images" / "timestamps.txt").write_text(stamps)
+    flight = read_footage(made, FootageOptions(tmp_path / "w", frames=2, fov_deg=50.0))
+    assert [f.time_ns for f in flight.frames] == [7, 10]
+    assert flight.camera.camera.horizontal_fov_deg == pytest.approx(50.0)
+    for one, other in zip(taken.truth, load_sequence(made, frame).truth, strict=True):
+        assert one.distance_to(other) == pytest.approx((0.0, 0.0), abs=1e-3)
+    above_takeoff = read_footage(_survey(tmp_path / "q"), FootageOptions(tmp_path / "w"))
+    with pytest.raises(SequenceError, match="4 of 4 frames have no true pose"):
+        sequence_of(above_takeoff, frame, 50.0)
 
 
 def test_the_sample_of_the_tutorial_is_complete(tmp_path):

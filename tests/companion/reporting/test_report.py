@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import RecordError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
+from companion.offline.record import read_record
 from companion.reporting.content import (
     INNER,
     MIDDLE,
@@ -26,7 +27,7 @@ from companion.reporting.content import (
 )
 from companion.reporting.figures import first_fault, target_table
 from companion.reporting.layout import render
-from companion.reporting.record import read_record, record_report, worst_frames
+from companion.reporting.record import record_report, worst_frames
 from companion.reporting.report import report_of, write_page
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.alerts.ids import AlertId

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from companion.recorded.sequence import load_sequence
 from localizer.config import LocalizerConfig
 from localizer.errors import OdometryError
-from localizer.evaluation.sequences import Sequence, load_sequence
+from localizer.evaluation.sequences import Sequence
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose

@@ -1,0 +1,316 @@
+"""A flight's record read: its tables, and its localized pictures as a `RecordedFlight`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from companion.config import CameraModel, CompanionConfig, parse_config
+from companion.errors import ConfigError, RecordError
+from companion.flight.recorder import MANIFEST_NAME
+from companion.offline.flown_map import FlownMap
+from companion.offline.tables import Columns, poses, read_columns
+from companion.recorded.cameras import camera_given
+from companion.recorded.flight import (
+    LogBeside,
+    RecordedFlight,
+    RecordedFrame,
+    Telemetry,
+)
+from companion.trajectory import snapshot_name
+from localizer.errors import CameraError, GeoreferenceError
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic
+from localizer.geometry.pose import Pose
+from localizer.plain_files import plain_text
+
+STAGES = ("reference", "extract", "register", "latency")
+_LARGEST = 1e9
+_DIGITS = 18
+_LATEST_NS = 1 << 62  # the year 2116: sums of two still fit 64 bits
+_LONGEST_PX = 1e6
+MIN_IMAGES = 0.9  # share of the localized frames
+_ROW = ("sequence", "latency_ms", "accepted", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz")
+_NEEDED = {
+    "estimates.csv": (
+        "exposure_time_ns", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz", "sigma_east_m",
+        "sigma_north_m", "quality", "state", "status", "accepted",
+        *(f"{name}_ms" for name in STAGES),
+    ),
+    "targets.csv": (
+        "exposure_time_ns", "target_id", "latitude_deg", "longitude_deg", "height_m", "east_m",
+        "north_m", "sigma_horizontal_m", "elsewhere",
+    ),
+    "events.csv": ("time_ns", "level", "text"),
+}  # fmt: skip
+_PLACE, _POINT = ("latitude_deg", "longitude_deg", "height_m"), ("east_m", "north_m", "up_m")
+
+
+@dataclass(frozen=True)
+class RecordTables:
+    """A record's folder, read. health: the last health.json, {} without one; notes: what lacks.
+
+    Of the settings only what a report needs is read, so that a record of an older or newer version,
+    with keys that this one does not know, can still be shown.
+    """
+
+    folder: Path
+    estimates: Columns
+    targets: Columns
+    events: Columns
+    manifest: Mapping[str, Any]
+    health: Mapping[str, Any]
+    notes: tuple[str, ...]
+
+    @property
+    def start_ns(self) -> int:
+        """Of the record, CLOCK_MONOTONIC."""
+        return self._time_ns("monotonic_ns") or int(
+            next(iter(self.estimates.get("exposure_time_ns", ())), 0)
+        )
+
+    @property
+    def utc_ns(self) -> int:
+        """Of the start; 0 where the record does not say."""
+        return self._time_ns("utc_ns")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The deployment that was flown; {} where the record does not say."""
+        return mapping(self.manifest.get("config"))
+
+    @property
+    def versions(self) -> dict[str, Any]:
+        """Of the software; {} where the record does not say."""
+        return mapping(self.manifest.get("versions"))
+
+    @property
+    def map_path(self) -> Path | None:
+        """Of the map that was flown on; None where the record does not say."""
+        named = self._setting("map")
+        return Path(named) if isinstance(named, str) else None
+
+    @property
+    def flown(self) -> FlownMap:
+        """What the record knows of that map."""
+        named = self.manifest.get("map_sha256")
+        sha256 = named if isinstance(named, str) else None
+        columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]
+        told = [c for c in columns if c is not None]
+        rows = np.column_stack(told) if len(told) == len(columns) else np.zeros((0, 6))
+        for row in rows[np.isfinite(rows).all(axis=1)][:1]:
+            try:
+                return FlownMap(self.folder, sha256, Geodetic(*row[:3]), row[3:])
+            except GeoreferenceError:
+                break
+        return FlownMap(self.folder, sha256)
+
+    @property
+    def camera(self) -> Camera | None:
+        """As it was calibrated; None where the record does not say."""
+        try:
+            return CameraModel.model_validate(self._setting("camera", "model")).camera()
+        except (ValidationError, CameraError):
+            return None
+
+    @property
+    def tlog(self) -> Path | None:
+        """The flight's MAVLink log, if one was kept: where the settings say, or, of a record that
+        was brought elsewhere, in it or beside it.
+        """
+        named = self._setting("bridge", "tlog")
+        if not isinstance(named, str):
+            return None
+        name = Path(named).name
+        places = (Path(named), self.folder / name, self.folder.parent / name)
+        return next((path for path in places if path.is_file()), places[0])
+
+    @property
+    def delay_ms(self) -> float | None:
+        """The age at which a fix was sent."""
+        return self._number("bridge", "injection", "delay_ms")
+
+    @property
+    def alert_limit_m(self) -> float | None:
+        """The protection level beyond which nothing was injected."""
+        return self._number("bridge", "injection", "alert_limit_m")
+
+    def _number(self, *keys: str) -> float | None:
+        value = self._setting(*keys)
+        known = isinstance(value, int | float) and abs(value) < _LARGEST  # false for NaN, too
+        return float(value) if known else None
+
+    def _time_ns(self, key: str) -> int:
+        value = self.manifest.get(key)
+        return value if isinstance(value, int) and 0 <= value < _LATEST_NS else 0
+
+    def _setting(self, *keys: str) -> Any:
+        value: Any = self.manifest.get("config")
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        return value
+
+
+@dataclass(frozen=True)
+class RecordedEstimate:
+    """One row of ``estimates.csv``. known_ns: when it was published, CLOCK_MONOTONIC; focal_px: of
+    its frame, None in records from before it was written.
+    """
+
+    exposure_time_ns: int
+    sequence: int
+    known_ns: int
+    world_from_camera: Pose
+    accepted: bool
+    is_tracking: bool = True
+    focal_px: float | None = None
+
+
+@dataclass(frozen=True)
+class FlightRecord:
+    """A record that can be localized again. flight: its localized pictures, one for each of
+    `estimates`, on CLOCK_MONOTONIC, and its log;
+    a picture may be missing on the disk.
+    """
+
+    tables: RecordTables
+    config: CompanionConfig
+    flight: RecordedFlight
+    log: LogBeside
+    estimates: tuple[RecordedEstimate, ...]
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies."""
+        return self.tables.folder
+
+
+def read_record(folder: Path) -> RecordTables:
+    """Read what `companion run` left; `RecordError` for a folder that is no record."""
+    try:
+        estimates = _table(folder / "estimates.csv", ("state", "status"))
+        targets = _table(folder / "targets.csv", ("target_id", "visibility"))
+        events = _table(folder / "events.csv", ("level", "text", "alert"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordError(
+            f"{folder}: not a flight's record: {error}; give the folder that "
+            "`companion run` recorded (record.folder), or a demo's companion/"
+        ) from error
+    notes = [
+        f"{name} is missing" for name in ("targets.csv", "events.csv")
+        if not (folder / name).exists()
+    ]  # fmt: skip
+    manifest, health = _document(folder / MANIFEST_NAME), _document(folder / "health.json")
+    if not manifest:
+        notes.append(f"{MANIFEST_NAME} cannot be read: no settings, no map")
+    if not estimates:
+        notes.append("the record holds no estimate: nothing was localized in that flight")
+    return RecordTables(folder, estimates, targets, events, manifest, health, tuple(notes))
+
+
+def load_record(
+    folder: Path,
+    kept_share: float = MIN_IMAGES,
+    tlog: Path | None = None,
+    map_cache: Path | None = None,
+) -> FlightRecord:
+    """A record that `companion run` left. `RecordError` says what it lacks.
+
+    kept_share: of the localized frames that must have their picture; tlog, map_cache: instead of
+    the record's own.
+    """
+    tables = read_record(folder)
+    try:
+        config = parse_config(tables.settings, str(folder / MANIFEST_NAME))
+    except ConfigError as error:
+        raise RecordError(f"{folder}: not a flight's record: {error}") from error
+    estimates = tuple(_estimates(tables.estimates, folder / "estimates.csv"))
+    if not estimates:
+        raise RecordError(f"{folder}: holds no estimate; nothing was localized in that flight")
+    files = [folder / "snapshots" / snapshot_name(e.exposure_time_ns) for e in estimates]
+    missing = sum(not file.is_file() for file in files)
+    if missing > (1 - kept_share) * len(estimates):
+        raise RecordError(
+            f"{folder}: {missing} of {len(estimates)} localized frames have no image in snapshots: "
+            "fly with record.snapshot_interval_s 0.001 to keep every frame"
+        )
+    tlog = tlog or tables.tlog
+    if tlog is None:
+        raise RecordError(f"{folder}: flown without bridge.tlog; give the log as --tlog")
+    frames = tuple(
+        RecordedFrame(file.name, file, e.exposure_time_ns, Telemetry(e.exposure_time_ns))
+        for file, e in zip(files, estimates, strict=True)
+    )
+    has_gimbal = config.bridge.camera.mount != "fixed"
+    log = LogBeside(tlog, tables.utc_ns - tables.start_ns, has_gimbal)
+    camera = camera_given(config.camera.model.camera(), MANIFEST_NAME)
+    flight = RecordedFlight(folder.name, "video", frames, camera, tables.notes, log)
+    if map_cache is not None:
+        config = config.model_copy(update={"map": map_cache})
+    return FlightRecord(tables, config, flight, log, estimates)
+
+
+def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
+    """The rows of a record's ``estimates.csv``. `RecordError` says why it is none."""
+    try:
+        return tuple(_estimates(read_columns(path, ("state", "status")), path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordError(f"{path}: not a record's estimates: {error}") from error
+
+
+def _estimates(columns: Columns, path: Path) -> Iterator[RecordedEstimate]:
+    """Of rows that hold a pose each; the last two columns are not in all records."""
+    if not columns:
+        return
+    lacking = [name for name in _ROW if name not in columns]
+    if lacking:
+        raise RecordError(f"{path}: not a table of a record: no column {lacking[0]}")
+    rows = np.column_stack([columns[name] for name in _ROW])
+    stamps = np.asarray(columns["exposure_time_ns"])
+    focal = np.asarray(columns.get("focal_px", np.full(len(rows), np.nan)))
+    wrong = ~np.isfinite(rows).all(axis=1) | ~rows[:, -4:].any(axis=1) | (stamps < 0)
+    wrong |= (focal < 1.0) | (focal > _LONGEST_PX)
+    if wrong.any():
+        raise RecordError(f"{path}: not a table of a record: the row at {stamps[wrong][0]} is none")
+    states = columns.get("state", np.full(len(rows), "tracking"))
+    told = zip(stamps, rows, poses(columns), focal, states, strict=True)
+    for stamp, row, pose, focal_px, state in told:
+        yield RecordedEstimate(
+            int(stamp), int(row[0]), int(stamp) + round(1e6 * float(row[1])), pose, row[2] == 1.0,
+            state == "tracking", None if np.isnan(focal_px) else float(focal_px),
+        )  # fmt: skip
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(plain_text(path))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _table(path: Path, text: tuple[str, ...]) -> Columns:
+    """A table that holds what a report needs, or nothing. Only estimates must be there."""
+    if path.name != "estimates.csv" and not path.exists():
+        return {}
+    columns = read_columns(path, text)
+    missing = [name for name in _NEEDED[path.name] if name not in columns]
+    if columns and missing:
+        raise RecordError(f"{path}: not a table of a record: no column {missing[0]}")
+    return columns
+
+
+def mapping(value: Any) -> dict[str, Any]:
+    """The value, where it is one; else {}."""
+    return value if isinstance(value, dict) else {}
+
+
+def is_time_ns(text: str) -> bool:
+    """Whether a snapshot's name is the time of its exposure."""
+    return text.isascii() and text.isdigit() and len(text) <= _DIGITS
