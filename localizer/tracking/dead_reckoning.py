@@ -75,6 +75,7 @@ _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.
 
 # The frames share a large error: taken for noise, it would have them followed late in a turn.
 _FOLLOWED_M = 2.0
+_TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
 
 class DeadReckoning:
@@ -93,6 +94,7 @@ class DeadReckoning:
         self._odometry = VisualOdometry(camera, registration, config, terrain)
         self._longest_sigma_m = config.longest_sigma_m
         self._off_map_sigma_m = config.off_map_sigma_m
+        self._in_view_ns: int | None = None
 
     @property
     def is_ready(self) -> bool:
@@ -142,12 +144,15 @@ class DeadReckoning:
             return PropagatedPose(PropagationResult.BROKEN)
         if not estimate.usable:
             return PropagatedPose(PropagationResult.GAP)
-        P = estimate.covariance
+        P, now_ns = estimate.covariance, frame.exposure_time_ns
         sigma_m, longest_m = float(np.sqrt(P.diagonal()[:3].max())), self._longest_sigma_m
-        if sigma_m > (longest_m if anchors is not None else self._off_map_sigma_m):
+        self._in_view_ns = None if anchors is None else self._in_view_ns or now_ns
+        is_tried = self._in_view_ns is not None and now_ns - self._in_view_ns > _TRIED_NS
+        if sigma_m > (longest_m if is_tried else self._off_map_sigma_m):
             self._odometry.forget()
             return PropagatedPose(PropagationResult.BROKEN)
-        share = min(_FOLLOWED_M / sigma_m, 1.0) if sigma_m > longest_m else 1.0
+        follows = anchors is None and sigma_m > longest_m
+        share = min(_FOLLOWED_M / sigma_m, 1.0) if follows else 1.0
         less = np.diag([share] * 3 + [1.0] * 3)
         return PropagatedPose(
             PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality,
