@@ -73,8 +73,9 @@ _NOTHING = PropagatedPose(PropagationResult.NONE)
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
 
-# The frames share a large error: taken for noise, it would have them followed late in a turn.
-_FOLLOWED_M = 2.0
+# Off the map. The frames share a large error: taken for noise, it had them followed metres late in a
+# turn, until the picture and its keyframe did not overlap (ArduPilot).
+_FOLLOWED_M = 0.5
 _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
 
@@ -151,8 +152,7 @@ class DeadReckoning:
         if sigma_m > (longest_m if is_tried else self._off_map_sigma_m):
             self._odometry.forget()
             return PropagatedPose(PropagationResult.BROKEN)
-        follows = anchors is None and sigma_m > longest_m
-        share = min(_FOLLOWED_M / sigma_m, 1.0) if follows else 1.0
+        share = min(_FOLLOWED_M / sigma_m, 1.0) if anchors is None else 1.0
         less = np.diag([share] * 3 + [1.0] * 3)
         return PropagatedPose(
             PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality,

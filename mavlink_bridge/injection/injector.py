@@ -79,10 +79,11 @@ class WithheldMotion:
         self._before: VisionFix | None = None
         self._message: Any | None = None
 
-    def note(self, fix: VisionFix, context: InjectionContext) -> None:
+    def note(self, fix: VisionFix, now_ns: int, context: InjectionContext) -> None:
         """A fix came of age whose position is withheld."""
         before, self._before = self._before, fix
-        if before is None or not context.profile.position_delta:
+        late = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
+        if before is None or late or not context.profile.position_delta:
             return
         then, now = context.attitude_at(before.time_ns), context.attitude_at(fix.time_ns)
         if then is not None and now is not None and fix.time_ns - before.time_ns <= _DELTA_NS:
@@ -213,7 +214,7 @@ class Injector:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
             if fix.position_withheld:
-                self.motion.note(fix, context)
+                self.motion.note(fix, now_ns, context)
                 continue
             last = self._propagator.fix
             self._pace.note(fix.time_ns, None if last is None else last.time_ns, now_ns)

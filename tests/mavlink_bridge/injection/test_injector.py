@@ -548,10 +548,10 @@ def test_global_position_sensor_carries_both_altitudes() -> None:
 
 
 def deltas(
-    *, speed: float, fix_hz: float = 10.0, yaw: float = 0.0, **where: Any
+    *, speed: float, fix_hz: float = 10.0, yaw: float = 0.0, late: int = 40 * MS, **where: Any
 ) -> list[tuple[int, Any]]:
     """What is sent instead of positions that are withheld, on the way north."""
-    it, sent, late = injector(rate_hz=10, delay_ms=100), [], 40 * MS
+    it, sent = injector(rate_hz=10, delay_ms=100), []
     period, vehicle = int(SECOND / fix_hz), context(**{"yaw": yaw, **where})
     for t in range(SECOND, 4 * SECOND, MS):
         if (t - late) % period == 0:
@@ -578,8 +578,11 @@ def test_of_a_withheld_position_only_its_change_is_sent_in_body_axes() -> None:
 
 
 def test_no_change_of_position_is_sent_that_the_autopilot_would_believe_too_much() -> None:
-    """Too fast for the largest error that it can be told; too long apart; a wrong heading; PX4."""
+    """Too fast for the largest error that it can be told; too long apart; late; a wrong heading;
+    PX4.
+    """
     assert deltas(speed=25.0) == []
     assert deltas(speed=10.0, fix_hz=1.0) == []
+    assert deltas(speed=10.0, late=300 * MS) == []
     assert deltas(speed=10.0, profile=PX4) == []
     assert deltas(speed=10.0, yaw_error_deg=lambda _: 40.0) == []
