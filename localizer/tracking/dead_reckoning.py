@@ -73,8 +73,8 @@ _NOTHING = PropagatedPose(PropagationResult.NONE)
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
 
-# Off the map. The frames share a large error: taken for noise, it had them followed metres late in a
-# turn, until the picture and its keyframe did not overlap (ArduPilot).
+# Off the map the frames share a large error. Taken for noise, it had them followed metres late in a
+# turn, until nothing registered (ArduPilot).
 _FOLLOWED_M = 0.5
 _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
