@@ -132,6 +132,10 @@ class Estimator:
     @property
     def position_valid(self) -> bool:
         """Whether a relative or absolute horizontal position is claimed."""
+        return self._is_absolute or self.sources.holds_relative
+
+    @property
+    def _is_absolute(self) -> bool:
         return self.sources.aiding is Aiding.ABSOLUTE and not self._gated.position_timeout
 
     @property
@@ -155,12 +159,9 @@ class Estimator:
         if unaided or not (self._gated.velocity_timeout and self._gated.position_timeout):
             flags |= EkfFlags.VELOCITY_HORIZ
         if self.position_valid:
-            flags |= (
-                EkfFlags.POS_HORIZ_REL
-                | EkfFlags.POS_HORIZ_ABS
-                | EkfFlags.PRED_POS_HORIZ_REL
-                | EkfFlags.PRED_POS_HORIZ_ABS
-            )
+            flags |= EkfFlags.POS_HORIZ_REL | EkfFlags.PRED_POS_HORIZ_REL
+        if self._is_absolute:
+            flags |= EkfFlags.POS_HORIZ_ABS | EkfFlags.PRED_POS_HORIZ_ABS
         if unaided:
             flags |= EkfFlags.CONST_POS_MODE
         if self.gps_glitching:
