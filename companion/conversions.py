@@ -16,18 +16,14 @@ import numpy as np
 
 from companion.geometry import (
     GIMBAL_FROM_CAMERA,
-    body_from_camera,
     ned_from_world,
-    vehicle_from_camera_pose,
     world_from_camera,
 )
 from companion.targets.detections import CLICKED
-from localizer.errors import GeoreferenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
 from localizer.geometry.pose import (
     Array,
-    euler_from_matrix,
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
@@ -44,7 +40,6 @@ from mavlink_bridge.messages import (
 
 # An autopilot position older than this does not start tracking.
 _MAX_POSITION_AGE_NS = 2_000_000_000
-_FARTHEST_M = 1e7  # from the map's origin; beyond it something said what is no number
 
 
 @dataclass(frozen=True)
@@ -62,53 +57,47 @@ def vision_fix(
     extrinsics: CameraExtrinsics,
     attitude: Attitude | None,
     gimbal: GimbalAttitude | None,
-    *,
-    reset: bool,
+    reset_count: int,
 ) -> VisionFix:
     """The vehicle's position and attitude as the camera's estimate implies them.
 
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
-    Without them the vehicle's attitude is unknown, and the place that is told is the camera's: the
+    Without them the vehicle's attitude is unknown, and the camera's position is reported: the
     lever arm's length is added to its covariance.
     """
-    frame = extrinsics.frame
-    camera = frame.position(estimate.world_from_camera.translation)
-    to_ned = ned_from_world(frame, camera)
-    roll = pitch = yaw = None
-    body = estimate.world_from_camera.translation
-    covariance = to_ned @ estimate.covariance[:3, :3] @ to_ned.T
+    frame, arm, pose = extrinsics.frame, extrinsics.lever_arm_m, estimate.world_from_camera
+    world_from_body: Array | None = None
+    body, arm_variance = pose.translation, float(arm @ arm)
     if attitude is not None and gimbal is not None:
-        body, ned_from_body = vehicle_from_camera_pose(
-            estimate.world_from_camera,
-            camera_on_body(attitude, gimbal),
-            extrinsics.lever_arm_m,
-            to_ned,
-        )
-        roll, pitch, yaw = euler_from_matrix(ned_from_body)
-    else:
-        arm = extrinsics.lever_arm_m
-        covariance = covariance + np.eye(3) * float(arm @ arm)
+        world_from_body = pose.rotation @ camera_on_body(attitude, gimbal).T
+        body, arm_variance = body - world_from_body @ arm, 0.0
     position = frame.position(body)
+    to_ned = ned_from_world(frame, position)
+    covariance = to_ned @ estimate.covariance[:3, :3] @ to_ned.T + np.eye(3) * arm_variance
     return VisionFix(
         time_ns=estimate.exposure_time_ns,
         latitude_deg=position.latitude_deg,
         longitude_deg=position.longitude_deg,
         height_m=position.height_m,
-        roll_rad=roll,
-        pitch_rad=pitch,
-        yaw_rad=yaw,
+        quaternion=None if world_from_body is None else _quaternion(to_ned @ world_from_body),
         position_covariance_ned=covariance,
         attitude_sigma_rad=float(np.sqrt(estimate.covariance.diagonal()[3:].max())),
-        reset=reset,
+        reset_count=reset_count,
         quality=round(100 * min(max(estimate.quality, 0.0), 1.0)),
         by_odometry=estimate.state is TrackingState.BRIDGING,
     )
 
 
+def _quaternion(rotation: Array) -> tuple[float, float, float, float]:
+    w, x, y, z = (float(one) for one in quaternion_from_matrix(rotation))
+    return w, x, y, z
+
+
 def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
     """Rotation (3, 3) of the camera on the body, from the autopilot's two attitudes."""
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
-    return body_from_camera(matrix_from_quaternion(attitude.quaternion), ned_from_camera)
+    rotation: Array = matrix_from_quaternion(attitude.quaternion).T @ ned_from_camera
+    return rotation
 
 
 def camera_rotation(gimbal: GimbalAttitude) -> Array:
@@ -140,14 +129,8 @@ def vehicle_prior(
     place = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
     if place[0] is None or place[1] is None or place[2] is None:
         return None
-    numbers = (*place, *attitude.quaternion, *gimbal.quaternion, *(state.local_velocity_ned or ()))
-    if not np.abs(numbers).max() < _FARTHEST_M:  # NaN is below nothing
-        return None
     frame = extrinsics.frame
-    try:
-        position = Geodetic(place[0], place[1], place[2] + extrinsics.geoid_separation_m)
-    except GeoreferenceError:
-        return None
+    position = Geodetic(place[0], place[1], place[2] + extrinsics.geoid_separation_m)
     body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
     to_ned = ned_from_world(frame, position)
     velocity: Array | None = None
@@ -158,8 +141,6 @@ def vehicle_prior(
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     arm = extrinsics.lever_arm_m
     camera = world_from_camera(body, ned_from_body, ned_from_camera, arm, to_ned)
-    if not np.abs(camera.translation).max() < _FARTHEST_M:
-        return None
     covariance = np.diag(np.repeat(np.square(sigma), 3))
     return PosePrior(camera, covariance, time_ns, velocity)
 
@@ -203,7 +184,6 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
     pose, camera = estimate.world_from_camera, estimate.camera
     position = frame.position(pose.translation)
     ned_from_camera = ned_from_world(frame, position) @ pose.rotation
-    w, x, y, z = quaternion_from_matrix(ned_from_camera @ GIMBAL_FROM_CAMERA.T)
     eye, direction = ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0))
     distance = float(cast(eye, direction[None, :]).distances[0])
     seen = frame.position(eye + distance * direction) if math.isfinite(distance) else None
@@ -212,7 +192,7 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
         position.latitude_deg,
         position.longitude_deg,
         position.height_m,
-        (float(w), float(x), float(y), float(z)),
+        _quaternion(ned_from_camera @ GIMBAL_FROM_CAMERA.T),
         None if seen is None else seen.latitude_deg,
         None if seen is None else seen.longitude_deg,
         None if seen is None else seen.height_m,

@@ -95,12 +95,6 @@ def camera_attitude(ned_from_body: Array, gimbal: GimbalAngles, mount: Mount) ->
     return gimbal_attitude(ned_from_body, gimbal) @ mount.rotation @ GIMBAL_FROM_CAMERA
 
 
-def body_from_camera(ned_from_body: Array, ned_from_camera: Array) -> Array:
-    """Rotation (3, 3) of the camera on the body, from their two attitudes."""
-    rotation: Array = ned_from_body.T @ ned_from_camera
-    return rotation
-
-
 def world_from_camera(
     position: ArrayLike,
     ned_from_body: Array,
@@ -115,18 +109,3 @@ def world_from_camera(
     arm = ned_from_world.T @ ned_from_body @ np.asarray(lever_arm_m, dtype=np.float64)
     centre = np.asarray(position, dtype=np.float64) + arm
     return Pose(ned_from_world.T @ ned_from_camera, centre)
-
-
-def vehicle_from_camera_pose(
-    camera: Pose,
-    body_from_camera: Array,
-    lever_arm_m: ArrayLike,
-    ned_from_world: Array = NED_FROM_ENU,
-) -> tuple[Array, Array]:
-    """Inverse of `world_from_camera`: (position (3,) in world metres, NED from body (3, 3)).
-
-    camera: world_from_camera. body_from_camera: how the camera was turned on the body then.
-    """
-    ned_from_body = ned_from_world @ camera.rotation @ body_from_camera.T
-    arm = ned_from_world.T @ ned_from_body @ np.asarray(lever_arm_m, dtype=np.float64)
-    return camera.translation - arm, ned_from_body

@@ -57,7 +57,7 @@ class NewestFile:
         self._wake.set()
 
     def stop(self, patience_s: float = 2.0) -> None:
-        """Write the last text and end; a disk that stands still is left behind."""
+        """Write the last text and end; a disk that does not respond is left behind."""
         self._stopping = True
         self._wake.set()
         self._thread.join(patience_s)

@@ -11,6 +11,7 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.components import COMMANDS_IN, Components
@@ -92,9 +93,11 @@ class Bridge:
         teller = StatusNotifier(self.report_alert)
         self._recorder = None
         if config.tlog is not None:
-            self._recorder = TlogRecorder(
-                config.tlog, lambda why: teller.report(alert(AlertId.TLOG_INCOMPLETE, why=why))
-            )
+
+            def incomplete(why: str) -> None:
+                teller.report(alert(AlertId.TLOG_INCOMPLETE, why=Name(why)))
+
+            self._recorder = TlogRecorder(config.tlog, incomplete)
         self._tracker = VehicleTracker(
             config.system_id,
             _mount(config),
@@ -198,7 +201,7 @@ class Bridge:
 
     def submit(self, fix: VisionFix) -> None:
         """Hand over a fix; never blocks."""
-        self._fc.sender.fixes.put(fix)
+        self._fc.sender.put(fix)
         self._fc_link.wake()
 
     def report(self, target: TargetReport) -> None:

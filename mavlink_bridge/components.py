@@ -1,4 +1,4 @@
-"""Our components on a link: heartbeats, commands to them, and what the camera tells."""
+"""Our components on a link: heartbeats, commands to them, and the camera's messages."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import SenderRefusal
 from mavlink_bridge.camera.component import TRACKING, CameraComponent
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.injection.injection_enable import COMMANDS
@@ -51,8 +52,8 @@ def _is_order(command: int) -> bool:
 class Components:
     """The bridge's components as one link sees them; its owner thread calls.
 
-    They speak up once a second, answer commands and tell of targets and camera poses. Only `show`
-    may be called from other threads.
+    They send a heartbeat once a second, answer commands and report targets and camera poses.
+    Only `show` may be called from other threads.
     """
 
     def __init__(self, shared: Shared, *, ground: bool) -> None:
@@ -76,7 +77,7 @@ class Components:
         self._hints_told: dict[AlertId, int] = {}  # when
 
     def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
-        """Queue what the ground is to be told; the oldest go first when it is full."""
+        """Queue a message for the ground; the oldest are dropped when the queue is full."""
         self._outbound.append(item)
 
     def waiting(self) -> dict[str, int]:
@@ -145,8 +146,8 @@ class Components:
         return self._is_trusted and message.get_srcSystem() in self._config.ground_systems
 
     def _refuse(self, link: Link, message: Any) -> None:
-        """Deny an order to one of our components, and tell of its sender once; after the first few
-        of all others in one line.
+        """Deny an order to one of our components and report its sender once; all senders after the
+        first few share one alert.
         """
         ours = (self._config.localizer_component, self._config.camera_component)
         if message.target_system not in (0, link.system_id) or message.target_component not in ours:
@@ -159,7 +160,7 @@ class Components:
         link.send(ack, message.target_component)
         if system not in self._refused and len(self._refused) < _MOST_REFUSED:
             self._refused.add(system)
-            why = "not allowed" if self._is_trusted else "not signed"
+            why = SenderRefusal.NOT_ALLOWED if self._is_trusted else SenderRefusal.NOT_SIGNED
             is_last = len(self._refused) == _MOST_REFUSED
             refused = AlertId.SENDERS_REFUSED if is_last else AlertId.SENDER_REFUSED
             self._shared.report(alert(refused, system=system, why=why))

@@ -64,7 +64,7 @@ def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
 
 
 class FlightControllerEnd:
-    """Runs in the flight-controller link's thread; only `sender.fixes` is filled from outside.
+    """Runs in the flight-controller link's thread; only `sender.put` is called from others.
 
     Above 200 lines: it hands each message and each turn of the clock to one of a dozen parts.
     """
@@ -173,7 +173,7 @@ class FlightControllerEnd:
         result["clock_rate"] = clock.rate
         result["clock_steps"] = clock.steps
         result["ignored_messages"] = self._tracker.ignored
-        result["fixes_not_taken"] = self.sender.fixes.dropped
+        result["fixes_not_taken"] = self.sender.dropped
         return result
 
     def waiting(self) -> dict[str, int]:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_bridge.alerts.words import GnssDisagreement
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _WINDOW_NS = 6_000_000_000
 _ACCEPTED_NS = 5_000_000_000  # that the reports must span
@@ -20,8 +22,6 @@ _REFUSED_NS = 2_000_000_000
 _REPORTS = 5  # of a stream of 1 Hz, too
 _GAP_NS = 1_500_000_000
 _SIGMAS = 3.0
-_SIGMA_M = 2.5  # where the receiver does not say
-_SIGMA_FLOOR_M, _SIGMA_CAP_M = 1.0, 2.5
 _CLAIM_M = 5.0  # EKF3 does not use a receiver that claims to be worse, either
 _LAG_S = 0.15  # of a report when it comes
 _LAG_ERROR_S = 0.15
@@ -33,10 +33,10 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GnssRefusal:
-    """Why a receiver is not believed. why: the unit of size, and what it measures."""
+    """Why a receiver is not believed. size: in the unit that `why` names."""
 
     size: float
-    why: str
+    why: GnssDisagreement
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,10 @@ class GnssReturnCheck:
 
     def _fault(self) -> GnssRefusal | None:
         reports = self._reports
-        claims = [_SIGMA_M if r.claimed_m is None else r.claimed_m for r in reports]
+        claims = [VEHICLE_SENSORS.gnss_sigma_m(r.claimed_m, math.inf) for r in reports]
         if max(claims) > _CLAIM_M:
-            return GnssRefusal(max(claims), "m claimed")
-        accuracy = min(max(float(np.mean(claims)), _SIGMA_FLOOR_M), _SIGMA_CAP_M)
+            return GnssRefusal(max(claims), GnssDisagreement.CLAIMED)
+        accuracy = min(float(np.mean(claims)), VEHICLE_SENSORS.gnss_m)
         sigma = math.hypot(accuracy, float(np.mean([r.sigma_m for r in reports])))
         speed = float(np.mean([r.speed_mps for r in reports]))
         off = np.array([r.off_m for r in reports])
@@ -143,13 +143,14 @@ class GnssReturnCheck:
         drift, drift_sigma, scatter, now = _motion(times, off)
         apart = max(float(np.hypot(*off.mean(axis=0))), now)  # what drifts away goes on
         if apart > _SIGMAS * sigma + speed * _LAG_ERROR_S:
-            return GnssRefusal(apart, "m off vision")
+            return GnssRefusal(apart, GnssDisagreement.OFF_VISION)
         if scatter > _SCATTER_M + sigma / 2:
-            return GnssRefusal(scatter, "m noise")
+            return GnssRefusal(scatter, GnssDisagreement.NOISE)
         slip, slip_sigma, *_ = _motion(times, np.array([r.slipped_m for r in reports]))
-        for rate, rate_sigma, what in ((drift, drift_sigma, "vision"), (slip, slip_sigma, "IMU")):
-            if rate > _DRIFT_MPS + _SIGMAS * rate_sigma:
-                return GnssRefusal(rate, f"m/s off {what}")
+        if drift > _DRIFT_MPS + _SIGMAS * drift_sigma:
+            return GnssRefusal(drift, GnssDisagreement.DRIFTS_FROM_VISION)
+        if slip > _DRIFT_MPS + _SIGMAS * slip_sigma:
+            return GnssRefusal(slip, GnssDisagreement.DRIFTS_FROM_IMU)
         return None
 
 

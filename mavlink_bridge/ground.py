@@ -6,6 +6,7 @@ from typing import Any
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.shared import Shared
@@ -42,7 +43,7 @@ class GroundEnd:
         link.system_id = config.system_id or state.system_id or 0
         self._shared.watch.check(state)
         if link.stranger:
-            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=link.stranger))
+            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger)))
         if link.system_id:
             self.components.heartbeat(link, now_ns)
             if config.camera.announce:

@@ -14,12 +14,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_bridge import quaternion as quat
 from mavlink_bridge.errors import FixError
+from mavlink_bridge.quaternion import Quaternion
 
 Array = NDArray[np.float64]
 _FASTEST_MPS = 1000.0
 _LEAST_KNOWN_M = 1e5  # of a sigma or an accuracy: beyond it nothing is known, and floats overflow
-_LARGEST_ANGLE_RAD = 10.0
+_UNIT = 2e-3  # by which a quaternion's square may be off
 _LARGEST_SIGMA = 1e3  # of an angle or a speed
 
 
@@ -57,6 +59,13 @@ def _check_velocity(what: str, velocity_ned: tuple[float, float, float] | None) 
         )
 
 
+def _check_rotation(what: str, q: Quaternion) -> None:
+    if not (len(q) == 4 and abs(sum(one * one for one in q) - 1.0) <= _UNIT):
+        raise FixError(
+            f"{what}: {q} is no rotation; give a unit quaternion (w, x, y, z), None where unknown"
+        )
+
+
 def _check_accuracies(what: str, accuracies: tuple[float | None, ...]) -> None:
     if not all(a is None or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
         raise FixError(
@@ -86,17 +95,15 @@ class VisionFix:
     longitude_deg: float
     height_m: float
     """Of the body's origin, not of the camera, above the ellipsoid."""
-    roll_rad: float | None = None
-    """Body to NED, as the two that follow."""
-    pitch_rad: float | None = None
-    yaw_rad: float | None = None
-    """From true north; without it the yaw guard does not check the fix."""
+    quaternion: Quaternion | None = None
+    """Body to NED, from true north; without it the yaw guard does not check the fix."""
     position_covariance_ned: Array = field(default_factory=lambda: np.eye(3))
     """(3, 3), m^2."""
     attitude_sigma_rad: float = 0.02
     """1 sigma of each angle."""
-    reset: bool = False
-    """This fix carries a jump of the localizer's own estimate."""
+    reset_count: int = 0
+    """How often the localizer's own estimate has jumped so far. It never falls. Whoever takes fixes
+    in compares it with the one before: a fix that is dropped takes no jump with it."""
     quality: int = 100
     """0..100, for ODOMETRY."""
     velocity_ned: tuple[float, float, float] | None = None
@@ -123,12 +130,8 @@ class VisionFix:
         if not 0 <= self.quality <= 100:
             raise FixError(f"vision fix: quality must be 0..100, got {self.quality}")
         _check_velocity("vision fix", self.velocity_ned)
-        angles = (self.roll_rad, self.pitch_rad, self.yaw_rad)
-        if not all(angle is None or abs(angle) <= _LARGEST_ANGLE_RAD for angle in angles):
-            raise FixError(
-                f"vision fix: attitude {angles} is not finite, or beyond {_LARGEST_ANGLE_RAD:g} "
-                "rad; give radians, None where unknown"
-            )
+        if self.quaternion is not None:
+            _check_rotation("vision fix", self.quaternion)
         if self.protection_m is not None and not all(p >= 0.0 for p in self.protection_m):
             raise FixError(
                 f"vision fix: protection levels must not be negative, got {self.protection_m}"
@@ -139,6 +142,11 @@ class VisionFix:
                 f"vision fix: attitude and velocity sigma must be 0 to {_LARGEST_SIGMA:g}, got "
                 f"{sigmas}"
             )
+
+    @property
+    def yaw_rad(self) -> float | None:
+        """Heading from true north; None where the attitude is unknown."""
+        return None if self.quaternion is None else quat.to_euler(self.quaternion)[2]
 
 
 @dataclass(frozen=True)
@@ -219,8 +227,7 @@ class CameraView:
         image = (self.image_latitude_deg, self.image_longitude_deg, self.image_height_m)
         _check_position("camera view's picture", *(value or 0.0 for value in image))
         _check_accuracies("camera view", (self.h_accuracy_m, self.v_accuracy_m))
-        if not all(abs(q) <= 1.001 for q in self.quaternion_ned):
-            raise FixError(f"camera view: {self.quaternion_ned} is no rotation")
+        _check_rotation("camera view", self.quaternion_ned)
 
 
 @dataclass(frozen=True)

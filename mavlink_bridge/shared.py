@@ -27,7 +27,7 @@ def clicked_numbers() -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Shared:
-    """What the bridge lends to its ends. report: tell the operator.
+    """What the bridge shares with its links' handlers. report: sends an alert to the operator.
 
     gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
     """

@@ -56,10 +56,10 @@ class OperatorStatus:
         self, level: HealthLevel, alerts: Sequence[Alert], *, tell: bool, now_ns: int | None = None
     ) -> None:
         """What is true now, worst first; to be called again and again. Alerts that are new are
-        sent, if any are told at all.
+        sent, if any are reported at all.
 
-        A condition that comes and goes is sent once in 10 s, and its end once it has lasted: an
-        overloaded computer is well and ill every other second. now_ns: CLOCK_MONOTONIC.
+        A condition that comes and goes is sent once in 10 s, and its end once that has lasted: an
+        overload may begin and end every other second. now_ns: CLOCK_MONOTONIC.
         """
         now_ns = self._clock() if now_ns is None else now_ns
         keys = tuple(alert.key for alert in alerts)

@@ -1,4 +1,4 @@
-"""What the operator is told: a problem when it begins or changes, and its end."""
+"""Reports a problem to the operator when it begins or changes, and when it ends."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ _RELAPSE_NS = 8_000_000_000
 
 
 class Hysteresis:
-    """Good news that may not last: told after a while without trouble, later with each relapse.
+    """Decides when a problem is over: after some time without it, and later after each relapse.
 
-    An overloaded computer is well and ill by turns, every second. Each relapse soon after
-    doubles the wait, and what recurs meanwhile counts as the same trouble: it was told.
+    On an overloaded computer problems come and go every second. A relapse soon after the end
+    doubles the wait. What recurs during the wait is the same problem, which was reported.
     """
 
     def __init__(self, wait_s: float = 1.5, longest_s: float = 60.0) -> None:
@@ -23,7 +23,7 @@ class Hysteresis:
         self._over_ns: int | None = None
 
     def is_over(self, now_ns: int, *, bad: bool) -> bool:
-        """Take in whether there is trouble now; whether there is and was none for long enough."""
+        """Take in whether the problem exists now. True if it has been absent for long enough."""
         if bad:
             if self._over_ns is not None:
                 relapsed = now_ns - self._over_ns < _RELAPSE_NS + 2 * self._wait_ns
@@ -41,28 +41,28 @@ class Hysteresis:
 
 
 class StatusNotifier:
-    """Remembers by topic what the operator was told, so that nothing is told twice."""
+    """Remembers the last alert of each topic, so that nothing is reported twice."""
 
     def __init__(
         self, report: Callable[[Alert], None], known: Mapping[str, Alert | None] | None = None
     ) -> None:
         self.report = report
-        """Tell the operator, whatever was told before."""
+        """Report an alert, whatever was reported before."""
         self._reported: dict[str, Alert | None] = dict(known or {})
         self._settling: dict[str, Hysteresis] = {}
         self._since_relief: dict[str, set[AlertKey]] = {}
 
     def reported(self, topic: str) -> Alert | None:
-        """What was told last of a topic; None before."""
+        """The last alert of a topic; None before the first."""
         return self._reported.get(topic)
 
     def forget(self, topic: str) -> None:
-        """The next alert of a topic is told whatever it is."""
+        """Report the next alert of a topic even if it equals the last."""
         self._reported.pop(topic, None)
 
     def tell(self, topic: str, problem: Alert | None, relief: Alert | None = None) -> None:
-        """A problem when it begins or changes in more than numbers, and its end, the relief. A
-        topic that begins without a problem is not told.
+        """Report a problem when it begins or changes in more than numbers, and `relief` when it
+        ends. No relief is reported before the first problem.
         """
         news, last = problem or relief, self.reported(topic)
         if (news and news.key) == (last and last.key):
@@ -81,8 +81,8 @@ class StatusNotifier:
         *,
         wait_s: float = 1.5,
     ) -> None:
-        """As `tell`, for what comes and goes: each problem once until the relief, and that only
-        once it has lasted, `wait_s` the first time.
+        """As `tell`, for problems that come and go: each problem once, then the relief after a time
+        without problems (`wait_s` at first, see `Hysteresis`).
         """
         settling = self._settling.setdefault(topic, Hysteresis(wait_s))
         over = settling.is_over(now_ns, bad=problem is not None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Output
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -16,7 +17,7 @@ _HELD_NS = 10_000_000_000
 
 
 class VehicleEvents:
-    """Looks ten times a second; one thread. Each change is told once, and only when it lasts."""
+    """Called ten times a second by one thread. Reports each change that lasts, once."""
 
     def __init__(self, teller: StatusNotifier) -> None:
         self._teller = teller
@@ -41,7 +42,7 @@ class VehicleEvents:
     def held(self, reason: Alert | None, now_ns: int) -> None:
         """Why fixes that come are not sent, from the interlock; None when they are or none come.
 
-        A score needs some seconds: what goes by itself is no news.
+        The shadow check needs some seconds, so a reason that passes soon is not reported.
         """
         if reason is None:
             self._held_ns = None
@@ -67,5 +68,5 @@ class VehicleEvents:
             self._teller.report(alert(AlertId.GNSS_LOST, output=_output(injecting)))
 
 
-def _output(injecting: bool) -> str:
-    return "injecting" if injecting else "nothing is injected"
+def _output(injecting: bool) -> Output:
+    return Output.INJECTING if injecting else Output.NOTHING

@@ -3,7 +3,8 @@
 Most tests run first, two at a time; then, likewise, those that fly a simulated vehicle without
 pictures: each is content with a core that nobody else uses. What streams pictures in real time or
 drives a browser runs after them, one at a time, with the machine to itself. Each part prints its
-own summary; a failure of one does not keep the next from running. `pytest` alone runs all as one.
+own summary with its slowest tests; a failure of one does not keep the next from running. `pytest`
+alone runs all as one.
 
 mypy runs beside the first part, in what its waiting tests leave of the processors, and is told
 after it: most of a minute for which no test waits.
@@ -102,7 +103,8 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(part: str, arguments: Sequence[str], environment: Mapping[str, str]) -> int:
-    command = [sys.executable, "-m", "pytest", f"--part={part}", *HANGS_END, *arguments]
+    options = (f"--part={part}", "--durations=25", *HANGS_END)
+    command = [sys.executable, "-m", "pytest", *options, *arguments]
     return subprocess.run(command, env=environment, check=False).returncode
 
 

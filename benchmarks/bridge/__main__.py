@@ -82,7 +82,7 @@ def measure(load: float, seconds: float) -> dict[str, float]:
         while time.monotonic() - begun < seconds:
             now = time.monotonic_ns()
             submitted[now // 1000] = now
-            bridge.submit(VisionFix(now, *HOME, 548.0, 0.0, 0.0, 0.0))
+            bridge.submit(VisionFix(now, *HOME, 548.0, (1.0, 0.0, 0.0, 0.0)))
             fixes += 1
             time.sleep(max(0.0, begun + fixes / FIX_HZ - time.monotonic()))
         used = time.process_time() - cpu

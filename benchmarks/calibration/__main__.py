@@ -6,7 +6,7 @@
 
 Each draw is an aircraft whose deployment is wrong (focal length to 3 %, boresight to 3 deg an axis,
 stamps to 150 ms, map to 3 m; principal point, distortion, lever arm and readout as the honest world
-has them), flown for three minutes in shadow on a simulated clock (`sitl.desk`) over another visit
+has them), flown for three minutes in shadow on a simulated clock (`desk`) over another visit
 than the map's. Its record is calibrated; then another flight of 50 s is localized with the old, the
 found and the true deployment. A run goes on where the last one ended. Seeds from 100 on were looked
 at while the method was made; those of the report, from 200 on, were not.

@@ -10,6 +10,15 @@ from typing import Any
 import numpy as np
 import yaml
 
+from benchmarks.calibration.desk.film import (
+    EstimateWithTruth,
+    Exposed,
+    Eye,
+    exposures,
+    write_record,
+)
+from benchmarks.calibration.desk.flight import Corner, DeskAircraft, DeskFlight, DeskFlightRecord
+from benchmarks.calibration.desk.port import RecordedPort
 from companion.config import CompanionConfig, load_config
 from companion.geometry import Mount
 from localizer.geometry.camera import Camera
@@ -22,9 +31,6 @@ from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
 from sitl.demo.flight import home_of
 from sitl.demo.scenario import CameraSpec
-from sitl.desk.film import EstimateWithTruth, Exposed, Eye, exposures, write_record
-from sitl.desk.flight import Corner, DeskAircraft, DeskFlight, DeskFlightRecord
-from sitl.desk.port import RecordedPort
 
 SECONDS, RATE_HZ = 180.0, 1.5
 _LOW_M = 35.0

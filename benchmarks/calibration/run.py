@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.calibration.desk.film import EstimateWithTruth
 from benchmarks.calibration.draws import Draw, Sortie, drawn, fly, true_camera, true_mount
 from companion.calibrate import unknowns as u
 from companion.calibrate.flight import Calibrated, calibrate
@@ -19,7 +20,6 @@ from localizer.geometry.pose import Array, euler_from_matrix, so3_log
 from sitl.camera.gimbal_error import GimbalError
 from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import CameraSpec
-from sitl.desk.film import EstimateWithTruth
 
 TRUTH = "truth.json"
 _FRAMES = 200  # as the command's default

@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks.protection.fit import exact_interval
 from mavlink_bridge.alerts.alert import OutputAction
 from mavlink_bridge.alerts.catalogue import CATALOGUE
+from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR
 from mavlink_bridge.alerts.reading import alert_of
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
@@ -22,6 +23,7 @@ from sitl.suite.loop.case import LoopCase, load_loop_cases
 
 _SENT = ("VISION_POSITION_ESTIMATE", "ODOMETRY", "GPS_INPUT")
 _GAP_NS = 1_000_000_000  # between true poses, beyond which the truth is not known
+_MONITORED = frozenset(spec.id for spec in (*INTEGRITY, *MONITOR))
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,8 @@ def _told(folder: Path) -> dict[str, int]:
     """How often each finding of the monitor was said, by the companion's events."""
     rows = [row for path in sorted(folder.glob("companion*/events.csv")) for row in _rows(path)]
     read = (alert_of(row["text"]) for row in rows)
-    return dict(Counter(one[0].value for one in read if one is not None and one[1]))
+    found = (one[0] for one in read if one is not None and one[1])
+    return dict(Counter(of.value for of in found if of in _MONITORED))
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from companion.conversions import camera_on_body
-from companion.flight.injection import JumpPolicy
+from companion.flight.injection import JumpCounter
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.protection import budget
 from localizer.geometry.geo import NED_FROM_ENU
-from localizer.geometry.pose import euler_from_matrix, matrix_from_quaternion
+from localizer.geometry.pose import matrix_from_quaternion, quaternion_from_matrix
 from localizer.types import TrackingState
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
@@ -71,7 +71,8 @@ class _Arrival:
         if self.ned_from_camera is None or attitude is None or gimbal is None:
             return self.fix
         ned_from_body = self.ned_from_camera @ camera_on_body(attitude, gimbal).T
-        return replace(self.fix, yaw_rad=euler_from_matrix(ned_from_body)[2])
+        w, x, y, z = (float(one) for one in quaternion_from_matrix(ned_from_body))
+        return replace(self.fix, quaternion=(w, x, y, z))
 
 
 class _Recorded:
@@ -195,15 +196,17 @@ def _row(flight: Replayed) -> tuple[str, ...]:
 
 
 def _without(arrivals: list[_Arrival], lost_s: float) -> list[_Arrival]:
-    """Those that come where one is lost again and again; the first after it announces a jump."""
+    """Those that come where one is lost again and again; after each time the estimate jumped."""
     kept: list[_Arrival] = []
+    losses = 0
     began_ns = arrivals[0].fix.time_ns
     for one in arrivals:
         at_s = (one.fix.time_ns - began_ns) * 1e-9 % (_LOST_EVERY_S + lost_s)
         if at_s < _LOST_EVERY_S:
             gap_s = (one.fix.time_ns - kept[-1].fix.time_ns) * 1e-9 if kept else 0.0
-            is_found = 0.0 < lost_s <= gap_s
-            kept.append(replace(one, fix=replace(one.fix, reset=one.fix.reset or is_found)))
+            losses += 0.0 < lost_s <= gap_s
+            count = one.fix.reset_count + losses
+            kept.append(replace(one, fix=replace(one.fix, reset_count=count)))
     return kept
 
 
@@ -211,16 +214,15 @@ def _fixes(folder: Path) -> tuple[list[_Arrival], int]:
     """The fixes as they came; and CLOCK_MONOTONIC less UTC, ns."""
     records = sorted(p.parent for p in folder.glob("companion*/estimates.csv"))
     made = json.loads((records[0] / "record.json").read_text(encoding="utf-8")) if records else {}
-    policy, fixes = JumpPolicy(), []
+    jumps, fixes = JumpCounter(), []
     for record in records:
         for row in _rows(record / "estimates.csv"):
-            policy.note(TrackingState(row["state"]))
+            jumps.note(TrackingState(row["state"]))
             if row["accepted"] == "1" and row.get("hpl_m"):
                 time_ns = int(row["exposure_time_ns"])
                 came_ns = time_ns + round(float(row["latency_ms"]) * 1e6)
-                fix = _fix(row, time_ns, reset=policy.is_due)
+                fix = _fix(row, time_ns, jumps.count)
                 fixes.append(_Arrival(came_ns, fix, _ned_from_camera(row)))
-                policy.carried()
     fixes.sort(key=lambda one: one.came_ns)
     return fixes, int(made.get("monotonic_ns", 0)) - int(made.get("utc_ns", 0))
 
@@ -234,7 +236,7 @@ def _ned_from_camera(row: dict[str, str]) -> np.ndarray | None:
     return rotation
 
 
-def _fix(row: dict[str, str], time_ns: int, *, reset: bool) -> VisionFix:
+def _fix(row: dict[str, str], time_ns: int, reset_count: int) -> VisionFix:
     sigmas = [float(row[f"sigma_{axis}_m"]) for axis in ("north", "east", "up")]
     covariance = np.diag(np.square(sigmas))
     return VisionFix(
@@ -244,7 +246,7 @@ def _fix(row: dict[str, str], time_ns: int, *, reset: bool) -> VisionFix:
         float(row["height_m"]),
         position_covariance_ned=covariance,
         attitude_sigma_rad=float(row.get("sigma_rotation_rad") or 0.02),
-        reset=reset,
+        reset_count=reset_count,
     )
 
 

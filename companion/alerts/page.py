@@ -11,13 +11,16 @@ from pathlib import Path
 
 from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
 from mavlink_bridge.alerts.catalogue import CATALOGUE, body, cleared
+from mavlink_bridge.alerts.words import MapOffsetUse
 
 _HEAD = f"""# Alerts
 
 Made from the catalogue by `python -m companion.alerts.page`; do not edit. Every text begins with
 `{PREFIX.strip()}`. The identifier stands in `events.csv` and `health.json`. *Output held*: nothing
 is sent. *Exclude and reset*: also, the next fix increments `reset_counter`. *Inhibit*: injection
-and the switch to vision do not start; injection that is running continues.
+and the switch to vision do not start; injection that is running continues. *Event*: it happens once
+and does not end. A text in brackets is sent when the alert is cleared; after other alerts, the next
+status follows (`localization tracking`, `injecting`, `the EKF follows`, `fixes are in time again`).
 
 | identifier | text | raised when | cleared when | severity, action |
 |---|---|---|---|---|
@@ -46,7 +49,9 @@ def page() -> str:
 
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
-    ended = f"{spec.cleared} (`{body(cleared(spec.id))}`)" if spec.cleared else "not reported"
+    ended = spec.cleared or "event"
+    if spec.reports_end:
+        ended += f" (`{body(cleared(spec.id))}`)"
     inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
     action = ", ".join(
         [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]
@@ -57,7 +62,11 @@ def _row(spec: AlertSpec) -> str:
 
 def _value(field: str, spec: AlertSpec) -> str:
     name = field.strip("{}").partition(":")[0]
-    return "N" if spec.units[name] or name == "ratio" else name.upper()
+    kind = spec.kinds[name]
+    if kind is MapOffsetUse:
+        return f"[{MapOffsetUse.APPLIED}]"
+    is_number = (isinstance(kind, str) and kind not in ("", "name")) or name == "ratio"
+    return "N" if is_number else name.upper()
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ from companion.calibrate.wander import AttitudeWander, Wander
 from localizer.geometry.pose import Array
 
 _ROUNDS, _STEPS = 4, 5  # of noise, and of the poses and numbers under it
-# Variance of the pictures' parts counts so often against the autopilot's: neighbours err alike.
+# Weight of the variance of a picture's parts: their errors are correlated.
 _ALIKE = 6.0
 _CAUCHY = 2.5  # sigmas
 _WHITE = {"attitudes": np.radians(0.03), "places": 0.03}  # of what has no memory: rad, m
@@ -108,7 +108,7 @@ def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise
 
 
 def _as_told(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> _Noise:
-    """Of the covariance that is told: places stray further than they do from picture to picture."""
+    """Of the reported covariance: positions stray further than from picture to picture."""
     placed = evidence.placed
     if not placed.any():
         return noise

@@ -1,4 +1,4 @@
-"""How far neighbouring pictures err alike, and what that does to the sigmas.
+"""How strongly the errors of neighbouring pictures are correlated, and the effect on the sigmas.
 
 Pictures of the same ground show the same roofs and trees: where the map errs there, all of them
 err, and a second picture tells little that the first did not, be it the next one or of another

@@ -15,13 +15,15 @@ from companion.calibration_watch.observation import (
     CalibrationObservation,
 )
 from localizer.geometry.pose import so3_log
+from localizer.sensors.error_model import SENSORS
+from mavlink_bridge.alerts.words import CalibrationError
 
 Array = NDArray[np.float64]
-AXES = ("yaw", "pitch", "roll")
+AXES = (CalibrationError.YAW, CalibrationError.PITCH, CalibrationError.ROLL)
 _LATE = 3  # index of the delay; before it the angles, rad
 _SIGMAS = np.array([*np.radians([10.0, 5.0, 5.0]), 0.3])
 _WALKS = np.array([*np.radians([0.15, 0.05, 0.05]), 0.006])  # per root second
-_NOISE_RAD = np.radians([1.0, 0.6, 0.6])  # compass, gimbal and vision, from one to the next
+_NOISE_RAD = np.radians([SENSORS.heading_step_deg, SENSORS.tilt_step_deg, SENSORS.tilt_step_deg])
 _ANEW = 4  # outliers in a row, after which what was learned is void
 _TURNS_RADPS = 0.1
 _LEVEL_TURN = 0.2  # below this horizontal part of the axis "forward" is the picture's top

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CalibrationLimits:
-    """A finding beyond a limit is told, and injection does not begin; four sigmas must agree."""
+    """A figure beyond its limit by four sigmas raises an alert and inhibits injection."""
 
     enabled: bool = True
     focal_share: float = 0.025  # focal length error

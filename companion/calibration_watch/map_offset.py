@@ -16,27 +16,27 @@ from typing import Literal, Protocol
 import numpy as np
 
 from localizer.geometry.pose import Array
-from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Compass, MapOffsetUse
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _BLOCK_NS = 10_000_000_000  # differences within it are one: GNSS errors last for seconds
 _LEAST_IN_BLOCK = 20
 _BLOCKS = 30  # five minutes
 _LEAST_BLOCKS = 6
 _BIAS_FLOOR_M = 0.5  # per axis: of the receiver, for minutes, however good it says it is
-_UNTOLD_ACCURACY_M = SENSORS.gnss_m  # of a receiver that does not say
 _SIGNIFICANT = 11.83  # chi-square of two degrees of freedom, 99.73 %
 _WAITS_NS, _WAITING = 700_000_000, 64  # until the EKF's report of the exposure is there
 _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's matter
-_AGAIN_M = 2.0  # by which another estimate is told anew
+_AGAIN_M = 2.0  # by which another estimate is reported again
 _OUTLIER = 3.0  # robust sigmas of a block's median
 _SLEW_M_S = 0.2  # of what is applied: far below what the EKF or the monitor take for a motion
-_WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+_WINDS = tuple(Compass)
 
 Policy = Literal["tell", "apply"]
 
@@ -69,8 +69,8 @@ class MapOffset:
     significant: bool
 
     @property
-    def direction(self) -> str:
-        """Of the map from GNSS, e.g. "east"."""
+    def direction(self) -> Compass:
+        """Of the map from GNSS."""
         north, east = self.ne_m
         return _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]
 
@@ -165,7 +165,7 @@ class MapOffsetEstimator:
             return
         self._blocks.append(np.median(block, axis=0))
         if len(self._blocks) >= _LEAST_BLOCKS:
-            accuracy = self._vehicle.state().gps_h_accuracy_m or _UNTOLD_ACCURACY_M
+            accuracy = self._vehicle.state().gps_h_accuracy_m or VEHICLE_SENSORS.gnss_m
             bias_m = max(_BIAS_FLOOR_M, accuracy)  # receivers are optimistic: not over root two
             self._note(estimate(np.array(self._blocks), bias_m))
 
@@ -178,7 +178,7 @@ class MapOffsetEstimator:
         if told is not None and math.dist(told, shift.ne_m) < _AGAIN_M:
             return
         self._told = shift.ne_m
-        applied = ", applied" if self._policy == "apply" else ""
+        applied = MapOffsetUse.APPLIED if self._policy == "apply" else MapOffsetUse.REPORTED
         self._vehicle.report_alert(
             alert(AlertId.MAP_OFFSET, metres=math.hypot(*shift.ne_m), direction=shift.direction,
                   applied=applied)

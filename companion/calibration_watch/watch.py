@@ -6,7 +6,6 @@ import copy
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,9 @@ from companion.calibration_watch.observation import (
 )
 from companion.calibration_watch.position_filter import PositionFilter
 from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.inertial import InertialDisplacement, InertialTrack, VehicleTelemetry
 from localizer.geometry.pose import matrix_from_quaternion, so3_log
+from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
@@ -37,53 +38,6 @@ _SPEAKS_AGAINST = 1.5  # sigmas between two accounts of one lateness, of which o
 _KEEPS_NS, _KEPT = 1_000_000_000, 20  # what was known at earlier times
 
 
-class InertialState(Protocol):
-    """The IMU's free integral at a time; velocity, position: (2,), north and east, m/s, m."""
-
-    @property
-    def time_ns(self) -> int:
-        """On CLOCK_MONOTONIC."""
-
-    @property
-    def velocity(self) -> Array:
-        """m/s."""
-
-    @property
-    def position(self) -> Array:
-        """m."""
-
-
-class InertialPath(Protocol):
-    """The IMU, integrated on its own. restarts counts the gaps."""
-
-    @property
-    def restarts(self) -> int:
-        """How often it began anew."""
-
-    @property
-    def newest_ns(self) -> int:
-        """Until when it reaches."""
-
-    def at(self, time_ns: int) -> InertialState | None:
-        """The integral at a time."""
-
-
-class CalibrationTelemetry(Protocol):
-    """What is asked of the vehicle; the bridge is one."""
-
-    def state(self) -> VehicleState:
-        """What it says about itself."""
-        ...
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time."""
-        ...
-
-    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
-        ...
-
-
 @dataclass(frozen=True)
 class CalibrationFigures:
     """What is known by now. focal: share by which it is long; late_s: of the stamps, the surer of
@@ -93,7 +47,7 @@ class CalibrationFigures:
     focal: CalibrationEstimate
     late_s: CalibrationEstimate
     boresight_deg: CalibrationEstimate
-    axis: str
+    axis: CalibrationError
 
 
 @dataclass(frozen=True)
@@ -112,7 +66,7 @@ class CalibrationWatch:
         self._limits = limits
         self._position, self._attitude = PositionFilter(), AttitudeFilter()
         self._waiting: deque[CalibrationObservation] = deque(maxlen=_QUEUE)
-        self._last: InertialState | None = None
+        self._last: InertialDisplacement | None = None
         self._last_ns = 0
         self._restarts = 0
         self._anchor: tuple[float, float] | None = None
@@ -146,7 +100,7 @@ class CalibrationWatch:
         """From a time on the stamps may be others: what was known of them before says nothing."""
         self._doubted_ns = since_ns
 
-    def step(self, now_ns: int, vehicle: CalibrationTelemetry, track: InertialPath) -> None:
+    def step(self, now_ns: int, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
         """Take in what has come; a few times a second."""
         if not self._limits.enabled:
             return
@@ -200,8 +154,8 @@ class CalibrationWatch:
         self,
         seen: CalibrationObservation,
         state: VehicleState,
-        vehicle: CalibrationTelemetry,
-        track: InertialPath,
+        vehicle: VehicleTelemetry,
+        track: InertialTrack,
     ) -> None:
         gap_s = (seen.time_ns - self._last_ns) * 1e-9
         self._last_ns = seen.time_ns
@@ -235,7 +189,7 @@ class CalibrationWatch:
         self._position.take(place, seen, known, climb)
 
     def _evidence(
-        self, seen: CalibrationObservation, state: VehicleState, vehicle: CalibrationTelemetry
+        self, seen: CalibrationObservation, state: VehicleState, vehicle: VehicleTelemetry
     ) -> AutopilotObservation:
         t = seen.time_ns
         reported = [vehicle.gimbal_at(t + dt) for dt in (0, -_RATE_NS, _RATE_NS)]

@@ -75,7 +75,7 @@ def archive(record: RecordFolder) -> Iterator[bytes]:
 
 def _content(file: BinaryIO, size: int) -> Iterator[bytes]:
     """So many bytes of a file, then zeros up to a whole block; zeros, too, for what it lost since
-    its size was told. What was added since is left out.
+    its size was reported. What was added since is left out.
     """
     left = size
     while left > 0:

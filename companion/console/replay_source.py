@@ -21,7 +21,7 @@ from companion.reporting.pictures import MapPictures
 
 _STEP_S = 0.5
 _PLOTTED = 600  # seconds before a place of the time bar that plots and tracks begin with
-_RATE_S, _LATENCY_S = 3.0, 10.0  # over which rate and latency are told
+_RATE_S, _LATENCY_S = 3.0, 10.0  # over which rate and latency are reported
 _HEARD_NS = 2_000_000_000  # a place of autopilot or receiver holds so long
 
 

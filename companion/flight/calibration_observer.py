@@ -7,46 +7,41 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.calibration_watch.observation import CalibrationObservation
-from companion.conversions import CameraExtrinsics, vision_fix
+from companion.conversions import CameraExtrinsics
 from companion.geometry import ned_from_world
 from localizer.types import Float32, PoseEstimate, ReferenceBundle, TrackingState
-from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.messages import VisionFix
 
 _INTERVAL_NS = 250_000_000
 _EVERY = 8  # pixel of the depth
 
 
 class CalibrationObserver:
-    """Runs on the localization thread, four times a second: 0.3 ms each."""
+    """Runs on the localization thread, four times a second."""
 
     def __init__(
-        self,
-        bridge: Bridge,
-        extrinsics: CameraExtrinsics,
-        take: Callable[[CalibrationObservation], None],
+        self, extrinsics: CameraExtrinsics, take: Callable[[CalibrationObservation], None]
     ) -> None:
-        self._bridge, self._extrinsics, self._take = bridge, extrinsics, take
+        self._extrinsics, self._take = extrinsics, take
         self._next_ns = 0
 
-    def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
+    def add_fix(self, estimate: PoseEstimate, bundle: ReferenceBundle, fix: VisionFix) -> None:
         """Hand on what the map confirmed. Never blocks."""
         time_ns = estimate.exposure_time_ns
-        tracks = estimate.accepted and estimate.state is TrackingState.TRACKING
-        if not tracks or time_ns < self._next_ns:
+        if estimate.state is not TrackingState.TRACKING or time_ns < self._next_ns:
             return
         self._next_ns = time_ns + _INTERVAL_NS
         depth_m = middle_depth_m(bundle.view.depth)
         if depth_m is not None:
-            self._take(self._sighting(estimate, depth_m))
+            self._take(self._sighting(estimate, fix, depth_m))
 
-    def _sighting(self, estimate: PoseEstimate, depth_m: float) -> CalibrationObservation:
-        time_ns, frame = estimate.exposure_time_ns, self._extrinsics.frame
-        attitude, gimbal = self._bridge.attitude_at(time_ns), self._bridge.gimbal_at(time_ns)
-        fix = vision_fix(estimate, self._extrinsics, attitude, gimbal, reset=False)
-        pose = estimate.world_from_camera
+    def _sighting(
+        self, estimate: PoseEstimate, fix: VisionFix, depth_m: float
+    ) -> CalibrationObservation:
+        pose, frame = estimate.world_from_camera, self._extrinsics.frame
         P = fix.position_covariance_ned
         return CalibrationObservation(
-            time_ns,
+            fix.time_ns,
             (fix.latitude_deg, fix.longitude_deg, fix.height_m),
             float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])),
             ned_from_world(frame, frame.position(pose.translation)) @ pose.rotation,

@@ -33,6 +33,7 @@ from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.view_reporter import ViewReporter
 from companion.ground.vital_signs import VitalSigns
+from companion.inertial import InertialTrack
 from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
@@ -65,6 +66,7 @@ from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, severity, text
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.injection.restart_memory import RestartMemory
@@ -154,7 +156,7 @@ def _source(making: BuildContext) -> FrameSource:
         events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
 
     def on_stranger(host: str) -> None:
-        bridge.report_alert(alert(AlertId.VIDEO_SENDER_IGNORED, host=host))
+        bridge.report_alert(alert(AlertId.VIDEO_SENDER_IGNORED, host=Name(host)))
 
     model = camera.model.camera()
     wanted: tuple[PacketTap | None, ...] = (making.get(KlvRelay), making.get(FrameTimes))
@@ -262,7 +264,7 @@ def _detector(making: BuildContext) -> BoxDetector:
 
 
 def _target_counts(making: BuildContext) -> Callable[[], dict[str, int]]:
-    """What was asked of the targets and could not be told, for the health and the report."""
+    """What was asked of the targets and could not be reported, for the health and the report."""
     targets, times = making.later(TargetReporter), making.get(FrameTimes)
     has_detector = making.config.targets.detector is not None
     detector = making.later(BoxDetector) if has_detector else None
@@ -367,14 +369,12 @@ def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
     protection = config.integrity_monitor.protection.of_camera(calibrated=calibrated)
     watched = config.integrity_monitor.model_copy(update={"protection": protection})
     integrity_monitor = IntegrityMonitor(
-        watched, limits, making[Bridge], _forbid_memory(config), making.clock
+        watched, limits, making[Bridge], _forbid_memory(config), making.clock, making[InertialTrack]
     )
     making[FixInjection].add_judge(lambda _, fix: integrity_monitor.judge(fix))
     making.channels.frames.subscribe(lambda f: integrity_monitor.see(f.exposure_time_ns, f.image))
-    sightings = CalibrationObserver(
-        making[Bridge], making[CameraExtrinsics], integrity_monitor.add_observation
-    )
-    making.channels.estimates.subscribe(sightings.add_estimate)
+    observer = CalibrationObserver(making[CameraExtrinsics], integrity_monitor.add_observation)
+    making[FixInjection].add_observer(observer.add_fix)
     return integrity_monitor
 
 
@@ -446,7 +446,7 @@ def _search(making: BuildContext) -> PlaceSearch:
     cache, channels, reach = (
         making[MapStack].cache,
         making.channels,
-        ReachableRegion(making[Bridge]),
+        ReachableRegion(making[Bridge], making[InertialTrack]),
     )
     channels.estimates.subscribe(reach.add_estimate)
     channels.frames.subscribe(lambda _frame: reach.follow())
@@ -485,11 +485,12 @@ COMPONENTS: tuple[Component[Any], ...] = (
         start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
         hand_over=Bridge.hand_over,
     ),
+    Component("IMU", InertialTrack, lambda _: InertialTrack()),
     Component("injection", FixInjection, _injection, depends=(Bridge, CameraExtrinsics)),
     Component("map shift", MapOffsetEstimator, _map_shift, depends=(Bridge, FixInjection)),
     Component(
         "integrity monitor", IntegrityMonitor, _integrity_monitor,
-        depends=(Bridge, CameraExtrinsics, FixInjection),
+        depends=(Bridge, CameraExtrinsics, FixInjection, InertialTrack),
         start=IntegrityMonitor.start, stop=IntegrityMonitor.stop, close=IntegrityMonitor.close,
         hand_over=IntegrityMonitor.hand_over,
         wanted=lambda config: config.integrity_monitor.enabled,
@@ -556,7 +557,7 @@ COMPONENTS: tuple[Component[Any], ...] = (
         wanted=lambda config: config.bridge.named_values,
     ),
     Component(
-        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose, Bridge),
+        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose, Bridge, InertialTrack),
         start=PlaceSearch.start, stop=PlaceSearch.stop, close=PlaceSearch.close,
     ),
     Component(

@@ -131,7 +131,7 @@ class Assembly:
                 part.hand_over(self._made[part.kind])
 
     def forget(self) -> None:
-        """What was made is closed: it is made anew."""
+        """What was made is closed: it is made again."""
         self._made.clear()
 
     def start(self, up: ExitStack) -> None:

@@ -239,7 +239,7 @@ class HealthMonitor:
         answer.
 
         Not whether the map is being searched: that begins and ends every few seconds, and each time
-        the loss would be told again (`engine.searching` in health.json has it).
+        the loss would be reported again (`engine.searching` in health.json has it).
         """
         fix_ns = estimate.last_fix_ns
         since_s = 0.0 if fix_ns is None else (time.monotonic_ns() - fix_ns) * 1e-9

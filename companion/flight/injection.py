@@ -1,4 +1,7 @@
-"""Estimates become fixes for the flight controller, unless somebody has a reason against them."""
+"""Estimates become fixes for the flight controller, unless somebody has a reason against them.
+
+A fix is made once, for injection and for those who only watch.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,6 @@ from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.alerts.catalogue import CATALOGUE
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
-from mavlink_bridge.injection.fix_queue import PendingJump
 from mavlink_bridge.messages import VisionFix
 
 _log = logging.getLogger(__name__)
@@ -22,6 +24,8 @@ on the localization thread: it looks up what its own thread found and returns at
 raises withholds the fix, and the operator is told.
 """
 
+Observer = Callable[[PoseEstimate, ReferenceBundle, VisionFix], None]
+"""Sees each fix as it was made, whether it is injected or not. It returns at once, likewise."""
 
 _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 
@@ -31,32 +35,24 @@ def is_for_injection(estimate: PoseEstimate) -> bool:
     return estimate.accepted and estimate.state in _INJECTED
 
 
-class JumpPolicy:
-    """Which fix carries a jump (`VisionFix.reset`), so that the EKF is told and does not fight it.
+class JumpCounter:
+    """How often the estimate has jumped (`VisionFix.reset_count`), so that the EKF is told and does
+    not fight it.
 
-    DEGRADED keeps the filter's track: only a new start after LOST may carry one, and the map found
-    again after BRIDGING, whose drift it ends. It stays due until a fix has carried it.
+    DEGRADED keeps the filter's track: only a new start after LOST is a jump, as the first is, and
+    the map found again after BRIDGING, whose drift it ends.
     """
 
     def __init__(self) -> None:
-        self._jump = PendingJump(pending=True)
-        self._was_bridging = False
-
-    @property
-    def is_due(self) -> bool:
-        """Whether the next fix carries it."""
-        return self._jump.pending
+        self.count = 1
+        self._state = TrackingState.INITIALIZING
 
     def note(self, state: TrackingState) -> None:
         """Take in the tracking state of a frame."""
-        found_again = self._was_bridging and state is TrackingState.TRACKING
-        if state is TrackingState.LOST or found_again:
-            self._jump.announce()
-        self._was_bridging = state is TrackingState.BRIDGING
-
-    def carried(self) -> None:
-        """A fix that said so has gone out."""
-        self._jump.told()
+        before, self._state = self._state, state
+        is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
+        found_again = before is TrackingState.BRIDGING and state is TrackingState.TRACKING
+        self.count += is_lost or found_again
 
 
 class FixInjection:
@@ -70,7 +66,8 @@ class FixInjection:
     def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:
         self._bridge = bridge
         self._extrinsics = extrinsics
-        self._jump = JumpPolicy()
+        self._jumps = JumpCounter()
+        self._observers: tuple[Observer, ...] = ()
         self._judges: tuple[Judge, ...] = ()
         self._unjudged = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
 
@@ -78,24 +75,28 @@ class FixInjection:
         """Have `judge` asked about every fix from now on, after those that are there already."""
         self._judges = (*self._judges, judge)
 
-    def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
+    def add_observer(self, observer: Observer) -> None:
+        """Have `observer` see every fix from now on, after its injection."""
+        self._observers = (*self._observers, observer)
+
+    def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
         """Inject an estimate, if it may be. Never blocks."""
-        self._jump.note(estimate.state)
+        self._jumps.note(estimate.state)
         if not is_for_injection(estimate):
             return
         time_ns = estimate.exposure_time_ns
-        fix: VisionFix | None = vision_fix(
+        fix = vision_fix(
             estimate,
             self._extrinsics,
             self._bridge.attitude_at(time_ns),
             self._bridge.gimbal_at(time_ns),
-            reset=self._jump.is_due,
+            self._jumps.count,
         )
-        fix = self._judged(estimate, fix)
-        if fix is not None:
-            if not fix.position_withheld:
-                self._jump.carried()
-            self._bridge.submit(fix)
+        judged = self._judged(estimate, fix)
+        if judged is not None:
+            self._bridge.submit(judged)
+        for observer in self._observers:
+            observer(estimate, bundle, fix)
 
     def _judged(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:
         """The fix as all judges leave it."""

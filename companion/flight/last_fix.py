@@ -60,7 +60,7 @@ class LastFix:
 
     def counts_alike(self, state: VehicleState, time_ns: int) -> bool:
         """Whether the EKF still counts its position from where it did: not after a reboot of the
-        autopilot, whose clock began anew, nor about another origin.
+        autopilot, whose clock restarted, nor about another origin.
         """
         offset_ns, origin = state.clock_offset_ns, _place(state.origin)
         since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS

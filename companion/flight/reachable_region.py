@@ -9,37 +9,19 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from companion.integrity_monitor.inertial import InertialDisplacement, InertialTrack
+from companion.inertial import InertialDisplacement, InertialTrack, VehicleTelemetry
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.relocalization.types import SearchRegion
 from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
-from mavlink_bridge.messages import Attitude, InertialSample, VehicleState
 
 _SIGMAS = 3.0
 _LEAST_M = 15.0  # candidates of the search are metres off themselves
 _GUST_M_S = 8.0  # by which a wind carries an aircraft that holds nothing, beyond its own speed
-
-
-class ReachTelemetry(Protocol):
-    """What is asked of the autopilot: the bridge."""
-
-    def state(self) -> VehicleState:
-        """What the vehicle says about itself."""
-        ...
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """Its attitude at a time."""
-        ...
-
-    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """What its IMU read after a time, oldest first."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -60,10 +42,9 @@ class ReachableRegion:
     second; `region` is asked by the search's thread.
     """
 
-    def __init__(self, vehicle: ReachTelemetry) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
+        self._vehicle, self._track = vehicle, track
         self._lock = threading.Lock()
-        self._track = InertialTrack()
         self._seen: _ConfirmedPosition | None = None
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
@@ -99,8 +80,7 @@ class ReachableRegion:
         return SearchRegion.circle(seen.place + way, radius_m)
 
     def _follow(self) -> None:
-        for sample in self._vehicle.inertial_since(self._track.newest_ns):
-            self._track.add(sample, self._vehicle.attitude_at)
+        self._track.follow(self._vehicle)
         seen = self._seen
         if seen is not None and seen.begun is None:
             begun = self._track.at(seen.time_ns)

@@ -218,7 +218,7 @@ class Recorder:
             raise _unwritable(folder, error) from error
         if stream is not None:
             self._files.append(stream)
-        # A daemon: a disk that stands still must not keep the process from ending.
+        # A daemon: a disk that does not respond must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 

@@ -49,7 +49,7 @@ class ViewReporter:
         joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Offer an estimate; only accepted ones are told. Never blocks."""
+        """Offer an estimate; only accepted ones are reported. Never blocks."""
         if estimate.accepted:
             self._newest = estimate
             self._came.set()

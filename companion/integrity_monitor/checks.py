@@ -12,28 +12,22 @@ import numpy as np
 from companion.calibration_watch.ground import GroundView
 from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
 from companion.calibration_watch.watch import CalibrationWatch
+from companion.inertial import InertialTrack, VehicleTelemetry
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import ActiveAlerts, AlertDebouncer, CheckResult
 from companion.integrity_monitor.ekf import EkfWatch
-from companion.integrity_monitor.inertial import InertialTrack
 from companion.integrity_monitor.jump import JumpCheck
 from companion.integrity_monitor.motion import MotionCheck, MotionVerdict
 from companion.integrity_monitor.position_checks import GnssCheck, HeightCheck
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
 from companion.integrity_monitor.step import StepUncertainty
-from companion.integrity_monitor.telemetry import (
-    ValidatedTelemetry,
-    VehicleTelemetry,
-    known_attitude,
-    known_state,
-    moving_now,
-)
 from companion.integrity_monitor.tilt import TiltCheck
 from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
 from localizer.types import Image
 from mavlink_bridge.alerts.alert import Alert, Inhibits, OutputAction
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.integrity import INTEGRITY
+from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _AIRBORNE_M = 3.0
@@ -48,6 +42,7 @@ _FRESH_NS = 1_000_000_000
 _PICTURE_FRESH_NS = 2_000_000_000
 _CALM_SHARE = 0.5  # of a motion limit, below which vision agrees with the IMU
 _MOVES_S = 5.0  # a position that stood still for less moves
+_OLD_NS = 2_000_000_000  # of a velocity, which comes ten times a second
 _BACKWARDS = 5  # pictures or fixes in a row whose stamps do not advance
 _QUEUE = 256
 
@@ -70,10 +65,15 @@ class IntegrityChecks:
     Above 200 lines: each check has a few lines here that hand it its evidence and take its finding.
     """
 
-    def __init__(self, config: IntegrityMonitorConfig, limits: IntegrityLimits) -> None:
+    def __init__(
+        self,
+        config: IntegrityMonitorConfig,
+        limits: IntegrityLimits,
+        track: InertialTrack | None = None,
+    ) -> None:
         self._config, self._limits = config, limits
         self._pictures = FrozenVideoDetector(config.picture)
-        self._track = InertialTrack()
+        self._track = track or InertialTrack()
         self._motion = MotionCheck(config.motion, self._track)
         self._height = HeightCheck(config)
         self._gnss = GnssCheck(config)
@@ -92,11 +92,11 @@ class IntegrityChecks:
         self._picture: tuple[int, FrameVerdict] | None = None
         self._verdict: MotionVerdict | None = None
         self._height_reading = CheckResult(None)
-        self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self._waiting: deque[tuple[VisionFix, bool]] = deque(maxlen=_QUEUE)
         self._newest: VisionFix | None = None
         self._level: ProtectionLevel | None = None
-        self._jump_held = self._announced = False
-        self._reset_due = False
+        self._jump_held = False
+        self._wrong = 0  # fixes withheld as wrong: after each the next one that passes is a jump
         self._backwards = 0
 
     # --- what there is ------------------------------------------------------------------------
@@ -123,7 +123,7 @@ class IntegrityChecks:
         return {
             one.spec.id: (one.figure, one.word)
             for one in self._active()
-            if Inhibits.INJECTION in one.spec.inhibits
+            if Inhibits.INJECTION in one.spec.inhibits and isinstance(one.word, CalibrationError)
         }
 
     def _active(self) -> list[AlertDebouncer]:
@@ -172,13 +172,12 @@ class IntegrityChecks:
         *,
         held: bool = False,
     ) -> VisionFix | None:
-        """The fix, if it may be injected; with a reset where the last ones were wrong. One of the
-        odometry that its protection level alone speaks against is `position_withheld`.
+        """The fix, if it may be injected; with another reset count where the last were wrong. One
+        of the odometry that its protection level alone speaks against is `position_withheld`.
 
-        attitude: the autopilot's at the fix's time, None where it is not known; withheld: another
-        has a reason against it, and a reset stays due.
+        attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
+        reason against it.
         """
-        state, attitude = known_state(state), known_attitude(attitude)
         self._tilt.add(fix, attitude)
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
@@ -186,43 +185,37 @@ class IntegrityChecks:
         self._doubt_steps(fix, state, admitted=admitted)
         height_m = self._ground.height_m(state, fix.time_ns)
         known_m = self._known_m(state, height_m)
-        moving = moving_now(state, fix.time_ns)
+        moving = _moving_now(state, fix.time_ns)
         self._level = level = protection_level(
             fix, moving, self._config.protection, known_m, height_m
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
-        # The jump has a line of its own; how the place moves after it is judged anew. An announced
-        # one is announced with each fix until one has passed: it began with the first.
-        leaps = self._jumps.leaps or (fix.reset and not self._announced)
-        self._announced = fix.reset
-        self._waiting.append(replace(fix, reset=leaps))
-        self._newest = fix
+        # The jump has a line of its own; how the place moves after it is judged again.
+        before, self._newest = self._newest, fix
+        leaps = before is not None and fix.reset_count != before.reset_count
+        self._waiting.append((fix, self._jumps.leaps or leaps))
         if self.action >= OutputAction.HOLD or not admitted:
-            self._reset_due = (
-                self._reset_due or self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
-            )
+            self._wrong += self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
             moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
             return replace(fix, position_withheld=True) if moves_right else None
         if held:
             return None
-        resets, self._reset_due = self._reset_due or fix.reset, False
         # The EKF must not believe what is known to be off to what noise alone would leave. The
         # checks above keep the noise: what they look for is what it does not explain.
         covariance = fix.position_covariance_ned + known_m**2 * np.eye(3)
-        return replace(fix, reset=resets, position_covariance_ned=covariance)
+        resets = fix.reset_count + self._wrong
+        return replace(fix, reset_count=resets, position_covariance_ned=covariance)
 
     def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[Alert]:
         """Look at everything, a few times a second; the alerts to report."""
-        vehicle = ValidatedTelemetry(vehicle)
         state = vehicle.state()
-        for sample in vehicle.inertial_since(self._track.newest_ns):
-            self._track.add(sample, vehicle.attitude_at)
+        self._track.follow(vehicle)
         self._jumps.hear(state)
         self._follow(now_ns, state)
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
-        results = self._results(now_ns, moving_now(state, now_ns))
+        results = self._results(now_ns, _moving_now(state, now_ns))
         updates = (one.update(now_ns, results[of]) for of, one in self._debouncers.items())
         return [alert for alert in updates if alert is not None]
 
@@ -230,7 +223,7 @@ class IntegrityChecks:
         """What the newest fix, or the stamps since, leave in doubt of the positions."""
         if not state.armed:
             self._steps.begins_anew()
-        elif fix.reset and admitted:
+        elif self._jumps.announced and admitted:
             self._steps.is_found_anew()
         elif self._jumps.step is not None:
             found = self._steps.add(self._jumps.step)
@@ -256,11 +249,11 @@ class IntegrityChecks:
     def _follow(self, now_ns: int, state: VehicleState) -> None:
         """Fixes whose time the IMU's record has reached, in order."""
         while self._waiting:
-            fix = self._waiting[0]
+            fix, leaps = self._waiting[0]
             if not self._motion.ready(fix) and now_ns - fix.time_ns < _WAITS_NS:
                 return
             self._waiting.popleft()
-            self._verdict = self._motion.add(fix)
+            self._verdict = self._motion.add(fix, leaps=leaps)
             self._height_reading = self._height.add(fix, state)
 
     # --- judgement ----------------------------------------------------------------------------
@@ -276,6 +269,7 @@ class IntegrityChecks:
             AlertId.VIDEO_FROZEN: lambda: (
                 self._frozen(now_ns, state) if flies else CheckResult(False)
             ),
+            AlertId.LOW_CONTRAST: lambda: self._dim(now_ns) if flies else CheckResult(False),
             AlertId.VIDEO_REPEATS: lambda: self._repeats(now_ns) if flies else CheckResult(False),
             AlertId.VISION_IMU_MISMATCH: lambda: self._moves_otherwise() if fresh else none,
             AlertId.HEIGHT_MISMATCH: lambda: self._height_reading if fresh else none,
@@ -300,8 +294,8 @@ class IntegrityChecks:
     def _calibration_checks(self) -> dict[AlertId, Callable[[], CheckResult]]:
         limits, known = self._config.calibration, self._calibration.figures()
         share, late = known.focal, known.late_s
-        long = "long" if share.value > 0.0 else "short"
-        when = "late" if late.value > 0.0 else "early"
+        long = CalibrationError.LONG if share.value > 0.0 else CalibrationError.SHORT
+        when = CalibrationError.LATE if late.value > 0.0 else CalibrationError.EARLY
         return {
             AlertId.FOCAL_LENGTH: lambda: _beyond(share, limits.focal_share, 100.0, long),
             AlertId.BORESIGHT: lambda: _beyond(
@@ -324,7 +318,7 @@ class IntegrityChecks:
 
     def _frozen(self, now_ns: int, state: VehicleState) -> CheckResult:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
-            return CheckResult(None)  # a feed that ended is told as such
+            return CheckResult(None)  # a feed that ended is reported as such
         verdict = self._picture[1]
         if verdict.contrast < _SHOWS_GRAY:
             return CheckResult(
@@ -334,6 +328,12 @@ class IntegrityChecks:
         still = verdict.still_s >= self._still_s(now_ns, state)
         still = still or self._should_have_moved(state, verdict)
         return CheckResult(identical or still, verdict.still_s)
+
+    def _dim(self, now_ns: int) -> CheckResult:
+        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+            return CheckResult(None)
+        shown = self._picture[1].detail
+        return CheckResult(shown < self._config.picture.low_detail, shown)
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
@@ -393,9 +393,19 @@ class IntegrityChecks:
         return CheckResult(level_m > self._limits.alert_limit_m, level_m)
 
 
-def _beyond(figure: CalibrationEstimate, limit: float, scale: float, word: str) -> CheckResult:
+def _beyond(
+    figure: CalibrationEstimate, limit: float, scale: float, word: CalibrationError
+) -> CheckResult:
     """Beyond its limit for sure, surely not, or not known."""
     bad = figure.exceeds(limit)
     if not bad and not figure.is_within(limit):
         return CheckResult(None)
     return CheckResult(bad, abs(figure.value) * scale, word)
+
+
+def _moving_now(state: VehicleState, time_ns: int) -> VehicleState:
+    """The state at a time, without a velocity of long before: an EKF that has lost its position
+    says none any more (ArduPilot ends LOCAL_POSITION_NED), and its last one would stand.
+    """
+    old = time_ns - state.local_time_ns > _OLD_NS
+    return replace(state, local_velocity_ned=None) if old else state

@@ -13,21 +13,21 @@ from typing import Any
 from mavlink_bridge.alerts.alert import Alert, AlertSpec, Inhibits
 from mavlink_bridge.alerts.catalogue import CATALOGUE, cleared
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CalibrationError, Name
 from mavlink_bridge.injection.restart_memory import RestartMemory
 
 _LARGEST = 1e4  # per cent, degrees, milliseconds; of what is kept
-_LONGEST = 10  # characters of a word that is
 
 
 @dataclass(frozen=True)
 class CheckResult:
     """A check's answer. bad: None where there is no evidence, which changes nothing. figure, word:
-    the alert's values, as far as it has them.
+    the alert's values, as far as it has them: in which sense, or of which component.
     """
 
     bad: bool | None
     figure: float = 0.0
-    word: str = ""
+    word: CalibrationError | Name | None = None
 
 
 class AlertDebouncer:
@@ -40,7 +40,7 @@ class AlertDebouncer:
         self.spec = spec
         self.raised = False
         self.figure = 0.0
-        self.word = ""
+        self.word: CalibrationError | Name | None = None
         self._since_ns: int | None = None
         self._updated_ns = 0
         self._told_ns = 0
@@ -67,13 +67,14 @@ class AlertDebouncer:
         self._since_ns, self.raised, self._told_ns = None, not self.raised, now_ns
         return self.alert() if self.raised else cleared(self.spec.id)
 
-    def restore(self, figure: float, word: str) -> None:
+    def restore(self, figure: float, word: CalibrationError) -> None:
         """It was active in a process before this one: evidence clears it, as any other."""
         self.raised, self.figure, self.word = True, figure, word
 
     def alert(self) -> Alert:
         """The active alert with its newest values."""
-        return Alert(self.spec.id, (self.figure, self.word)[: len(self.spec.values)])
+        values = (self.figure,) if self.word is None else (self.figure, self.word)
+        return Alert(self.spec.id, values[: len(self.spec.values)])
 
     def _again(self, now_ns: int) -> Alert | None:
         repeats = self.raised and self.spec.repeat_s > 0.0
@@ -83,7 +84,7 @@ class AlertDebouncer:
         return self.alert()
 
 
-ActiveAlerts = Mapping[AlertId, tuple[float, str]]
+ActiveAlerts = Mapping[AlertId, tuple[float, CalibrationError]]
 """Figure and word of active alerts."""
 
 
@@ -120,11 +121,11 @@ class InhibitMemory:
         self._memory.stop(clean_shutdown=clean_shutdown)
 
 
-def _row(told: Any) -> tuple[float, str] | None:
+def _row(told: Any) -> tuple[float, CalibrationError] | None:
     if not isinstance(told, list) or len(told) != 2:
         return None
     figure, word = told
     if not isinstance(figure, float) or not abs(figure) <= _LARGEST:
         return None
-    known = isinstance(word, str) and len(word) <= _LONGEST and word.isprintable()
-    return (figure, word) if known else None
+    sense = next((one for one in CalibrationError if one.value == word), None)
+    return None if sense is None else (figure, sense)

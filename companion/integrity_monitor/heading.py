@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import wrap_pi
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _SPAN_NS = 1_000_000_000  # over which the heading is the median
 _LEAST = 3
 _SIGMAS = 4.0
 _OFF_RAD = math.radians(SENSORS.heading_step_deg)
-_DRIFT_RADPS = math.radians(SENSORS.gyro_drift_deg_per_s)
 _KEPT = 64
 
 
@@ -35,12 +35,13 @@ class HeadingChange:
 
 def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
     """None where one of the two headings is not known."""
-    if attitude is None or fix.yaw_rad is None:
+    yaw_rad = fix.yaw_rad
+    if attitude is None or yaw_rad is None:
         return None
     return HeadingChange(
         fix.time_ns,
-        wrap_pi(fix.yaw_rad - attitude.gyro_heading_rad),
-        wrap_pi(fix.yaw_rad - attitude.yaw_rad),
+        wrap_pi(yaw_rad - attitude.gyro_heading_rad),
+        wrap_pi(yaw_rad - attitude.yaw_rad),
         fix.attitude_sigma_rad,
     )
 
@@ -79,7 +80,7 @@ class HeadingHistory:
         newest = self._turns[-1]
         # Errors of vision are alike within a second: a median has the sigma of one.
         noise = _SIGMAS * math.hypot(newest.sigma, turn.sigma)
-        drift = _DRIFT_RADPS * (turn.time_ns - newest.time_ns) * 1e-9
+        drift = VEHICLE_SENSORS.gyro_drift_radps * (turn.time_ns - newest.time_ns) * 1e-9
         return self.apart(turn) > _OFF_RAD + noise + drift
 
     def _newest(self) -> list[HeadingChange]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from companion.calibration_watch.observation import CalibrationObservation
+from companion.inertial import InertialTrack
 from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import AlertDebouncer, CheckResult, InhibitMemory
@@ -17,6 +18,7 @@ from localizer.types import Image
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import CATALOGUE
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import VisionFix
@@ -49,9 +51,10 @@ class IntegrityMonitor:
         bridge: Bridge,
         memory: InhibitMemory | None = None,
         clock: Callable[[], int] = monotonic_ns,
+        track: InertialTrack | None = None,
     ) -> None:
         self._clock = clock
-        self._monitor, self._memory = IntegrityChecks(config, limits), memory
+        self._monitor, self._memory = IntegrityChecks(config, limits, track), memory
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
@@ -198,7 +201,7 @@ class IntegrityMonitor:
         last_ticks_ns = self._turns()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
-        stalled = CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, name)
+        stalled = CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, Name(name))
         alert = self._stands.update(now_ns, stalled)
         if alert is not None:
             self._bridge.report_alert(alert)

@@ -37,7 +37,7 @@ class EkfDisplacement:
         self._way: deque[tuple[int, Metres, Metres]] = deque(maxlen=_KEPT)  # time, velocity, way
 
     def add(self, state: VehicleState) -> None:
-        """The newest velocity; after a hole in them, or of the clock, the way begins anew."""
+        """The newest velocity; after a hole in them, or of the clock, the way restarts."""
         if state.local_velocity_ned is None:
             return
         north, east, _ = state.local_velocity_ned
@@ -124,9 +124,11 @@ class JumpCheck:
         self.distance_m = 0.0
         self.step: PositionStep | None = None
         """Of the newest fix, if it passed: how far from where the one before led."""
+        self.announced = False
+        """Whether the newest fix says that the estimate jumped since the one that passed last."""
         self.leaps = False
         """Whether the newest fix is at another place than the one before: how it moves is judged
-        anew from here on.
+        again from here on.
         """
 
     def hear(self, state: VehicleState) -> None:
@@ -154,14 +156,15 @@ class JumpCheck:
         self, fix: VisionFix, state: VehicleState, attitude: Attitude | None, *, agrees: bool
     ) -> bool:
         self.step = None
+        self.announced = self._passed is None or (fix.reset_count != self._passed.fix.reset_count)
         turn = turn_of(fix, attitude)
         is_turned = turn is not None and self._is_turned(turn)
         step = None if self._passed is None else self._leap(self._passed, fix)
         jump_m = 0.0 if step is None else math.hypot(*step.offset_m) - step.allowed_m
         if step is not None and is_turned:
             jump_m += step.growth_m  # nor does time explain it
-        announced = fix.reset and not is_turned
-        if jump_m <= (self._config.jump_m if announced else self._config.unreported_jump_m):
+        explained = self.announced and not is_turned
+        if jump_m <= (self._config.jump_m if explained else self._config.unreported_jump_m):
             self.step = step
             self._led = self._led + 1 if step is not None and step.is_led else 0
             self._pass(fix, state)
@@ -196,7 +199,7 @@ class JumpCheck:
         return self._headings.contradict(turn)
 
     def _hold(self, fix: VisionFix) -> _Held:
-        """The fixes held by now, with this one; one that does not follow them begins anew."""
+        """The held fixes with this one; a fix that does not follow them starts a new series."""
         held = self._held
         if held is None or not self._follows(held.newest, fix):
             held = self._held = _Held(fix)

@@ -15,14 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.inertial import InertialDisplacement, InertialTrack
 from companion.integrity_monitor.config import MotionCheckConfig
-from companion.integrity_monitor.inertial import InertialDisplacement, InertialTrack
 from companion.integrity_monitor.position_checks import LocalPlace
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import VisionFix
 
 Array = NDArray[np.float64]
-_BIAS_WALK = 0.002  # m/s^2/sqrt(s): of tilt and accelerometer together, in north and east
 _SIGMA_FLOOR_M = 0.2
 # Of the odometry's from fix to fix, with what its scale error does in a turn; its sigma would hide
 # a frozen picture.
@@ -33,7 +32,7 @@ _SIGMAS = 4.0
 _SLOW_SHARE = 1.5
 _INDEPENDENT_HZ = 2.0  # errors of vision are alike within half a second
 _WINDOWS_S = (1.0, 3.0, 10.0)
-_GAP_S = 3.0  # without fixes, after which the prediction starts anew
+_GAP_S = 3.0  # without fixes, after which the prediction restarts
 _SETTLE_S = 5.0  # until velocity and bias are known
 _BLOCK_S = 1.0
 _LEAST_FIXES = 3  # of a window
@@ -69,8 +68,8 @@ class MotionCheck:
         self._deviations: deque[tuple[int, float, float, float, float]] = deque(maxlen=1024)
         self._still = StillPosition(config.still_m)
 
-    def add(self, fix: VisionFix) -> MotionVerdict:
-        """One fix that the IMU's record reaches; see `ready`."""
+    def add(self, fix: VisionFix, *, leaps: bool) -> MotionVerdict:
+        """One fix that the IMU's record reaches; see `ready`. leaps: judge anew from here on."""
         here = np.array(self._place.ned(fix)[:2])
         still_s = self._still.add(fix.time_ns, here)
         moved = self._track.at(fix.time_ns)
@@ -80,7 +79,7 @@ class MotionCheck:
         sigma = max(_sigma(fix), _SIGMA_FLOOR_M)
         last = self._moved
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
-        anew = self._restarts != self._track.restarts or gap_s > _GAP_S or fix.reset
+        anew = self._restarts != self._track.restarts or gap_s > _GAP_S or leaps
         self._moved, self._restarts = moved, self._track.restarts
         if last is None or anew or gap_s <= 0.0:
             self._start(fix.time_ns, here, sigma)
@@ -107,7 +106,7 @@ class MotionCheck:
         """Predict by the IMU, note the deviation, and take the fix in. Per axis: p, v, bias."""
         h = (moved.time_ns - last.time_ns) * 1e-9
         F = np.array([[1.0, h, -0.5 * h * h], [0.0, 1.0, -h], [0.0, 0.0, 1.0]])
-        q, b = SENSORS.imu_noise**2, _BIAS_WALK**2
+        q, b = SENSORS.imu_noise**2, SENSORS.imu_bias_walk**2
         Q = np.array(
             [[h**3 / 3 * q, h * h / 2 * q, 0.0], [h * h / 2 * q, h * q, 0.0], [0, 0, b * h]]
         )

@@ -13,17 +13,13 @@ from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _FORGET_S = 120.0  # the barometer's drift against vision: its zero follows with this time
-# The barometer's metres are those of the standard atmosphere: 16 % too many at -25 degrees, 9 % too
-# few at 45, of what the aircraft climbed.
-_ATMOSPHERE = 0.16
 _MEDIAN_OF = 15
 _BARO_FRESH_NS = 1_000_000_000
 _FIX_FRESH_NS = 500_000_000
 _SIGMAS = 4.0
-_GNSS_FLOOR_M = 1.0
-_GNSS_SIGMA_M = SENSORS.gnss_m  # where the receiver does not say
 _GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cover
 
 
@@ -78,7 +74,7 @@ class HeightCheck:
         apart = median - self._zero
         sigma = math.sqrt(float(fix.position_covariance_ned[2, 2]))
         climbed_m = altitude - self._altitude_m
-        bad = abs(apart) > self._limit_m + _SIGMAS * sigma + _ATMOSPHERE * abs(climbed_m)
+        bad = abs(apart) > self._limit_m + _SIGMAS * sigma + SENSORS.climb_share * abs(climbed_m)
         if not bad:
             self._zero += apart * dt / _FORGET_S
             self._altitude_m += climbed_m * dt / _FORGET_S
@@ -103,8 +99,7 @@ class GnssCheck:
         place = LocalPlace()
         place.ned(fix)
         north, east = place.north_east(latitude, longitude)
-        accuracy = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
-        accuracy = min(max(accuracy, _GNSS_FLOOR_M), self._cap_m)
+        accuracy = VEHICLE_SENSORS.gnss_sigma_m(state.gps_h_accuracy_m, self._cap_m)
         v_north, v_east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
         later_s = (fix.time_ns - state.gps_time_ns) * 1e-9
         apart = math.hypot(north + v_north * later_s, east + v_east * later_s)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
+from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, VisionFix
 
 _SIGMAS, _CALM_SIGMAS = 3.0, 2.0
@@ -49,20 +50,17 @@ class TiltCheck:
 
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
         """Another fix, and the autopilot's attitude at its time, None where it is unknown."""
-        if attitude is None or fix.roll_rad is None or fix.pitch_rad is None:
+        if attitude is None or fix.quaternion is None:
             since = self._judged_ns
             self.is_known = since is not None and abs(fix.time_ns - since) <= _HOLDS_NS
             return
         self._judged_ns, self.is_known = fix.time_ns, True
-        seen, known = (
-            _level(fix.roll_rad, fix.pitch_rad),
-            _level(attitude.roll_rad, attitude.pitch_rad),
-        )
-        self._off_rad = math.dist(seen, known)
+        self._off_rad = math.dist(_level(fix.quaternion), _level(attitude.quaternion))
         self._share = self._off_rad / math.hypot(self._sigma_rad, fix.attitude_sigma_rad)
         self.tilts = self._share > (_CALM_SIGMAS if self.tilts else _SIGMAS)
 
 
-def _level(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
+def _level(ned_from_body: quat.Quaternion) -> tuple[float, float]:
     """Where the vertical lies in body axes, forward and right: no heading is in it."""
-    return -math.sin(pitch_rad), math.sin(roll_rad) * math.cos(pitch_rad)
+    forward, right, _ = quat.rotate(quat.conjugate(ned_from_body), (0.0, 0.0, 1.0))
+    return forward, right

@@ -178,7 +178,7 @@ class KlvRelay:
         return encode((time_ns + self._utc_ns) // 1000, fields)
 
     def _target_at(self, time_ns: int) -> TargetFix | None:
-        """The target that was seen nearest to a picture's time. Newer ones may have been told since
+        """The target seen nearest to a picture's time. Newer ones may have been reported since
         the picture came: it may have waited for its pose.
         """
         with self._condition:

@@ -38,7 +38,7 @@ class Helm:
 
 
 class Orders:
-    """Carries out the console's orders, if `control` is on; each is told."""
+    """Carries out the console's orders, if `control` is on; each is reported."""
 
     def __init__(
         self, control: bool, helm: Helm, clock: Callable[[], float] = time.monotonic

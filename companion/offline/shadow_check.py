@@ -24,6 +24,7 @@ from companion.flight.components import Assembly
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.priors import AutopilotPose
 from companion.flight.search import PlaceSearch
+from companion.inertial import InertialTrack
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.recorded.autopilot_log import vehicle_messages
 from companion.recorded.flight import RecordedFlight
@@ -42,8 +43,8 @@ from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore
 from mavlink_bridge.vehicle.origin import offset
 
 _KINDS = (
-    MapStack, CameraExtrinsics, Bridge, FixInjection, MapOffsetEstimator, IntegrityMonitor,
-    AutopilotPose, Localizer, PlaceSearch,
+    MapStack, CameraExtrinsics, Bridge, InertialTrack, FixInjection, MapOffsetEstimator,
+    IntegrityMonitor, AutopilotPose, Localizer, PlaceSearch,
 )  # fmt: skip
 _TICK_NS, _TURN_NS, _SCORE_NS = 50_000_000, 100_000_000, 1_000_000_000
 _BEGIN_NS = 1_000_000_000_000  # of the record on its clock: as CLOCK_MONOTONIC some time after boot

@@ -284,8 +284,8 @@ class VideoFileSource:
 
 
 class LiveVideoSource:
-    """A live stream, decoded by a reader thread; the newest picture wins. One that stops is told,
-    and connected to again, waiting longer after each failure.
+    """A live stream, decoded by a reader thread; the newest picture wins. A stream that stops is
+    reported and opened again, after a longer wait with each failure.
 
     Above 200 lines: what the reader's thread finds and what the taker's does are one state to tell.
     """

@@ -96,7 +96,7 @@ class ExposureClock:
         return arrival_ns - self._by_pts.latency_ns
 
     def _from_misp(self, misp: MispTime, arrival_ns: int) -> int:
-        # Both clocks are read anew for each frame, because NTP may step the system's clock.
+        # Both clocks are read again for each frame, because NTP may step the system's clock.
         offset_ns = system_minus_monotonic()
         monotonic = misp.time_us * 1000 - offset_ns
         relative = self._by_misp.map(misp.time_us * 1000, arrival_ns)

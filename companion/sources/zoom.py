@@ -31,7 +31,7 @@ _ALIKE = 1e-3  # a share of the focal length that is no other lens: below what a
 _ELSEWHERE = 0.05  # of the logarithm: so far off a table errs by something else
 _ALIKE_PICTURES = 9.0
 _REMEMBERED = 32  # pictures under way
-_AGAIN_NS = 10_000_000_000  # the same trouble is told so often
+_AGAIN_NS = 10_000_000_000  # the same trouble is reported so often
 
 
 class ZoomTable(BaseModel):
@@ -94,8 +94,8 @@ class FocalCorrection:
         self._variance = min(self._variance + other * self._first, self._first)
 
     def learn(self, seen: float, sigma: float) -> None:
-        """A picture's logarithm. Neighbours err alike: each counts as little as if it were alone
-        among so many.
+        """A picture's logarithm. The errors of neighbours are correlated, so each counts as one of
+        so many.
         """
         noise = _ALIKE_PICTURES * sigma**2
         gain = self._variance / (self._variance + noise)

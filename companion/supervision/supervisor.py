@@ -3,7 +3,7 @@
 It waits for the flight process to end, and for the signs of life of its parts: one that hangs is
 ended. A death is told to the operator and marked in ``health.json`` within a second, and a standby
 process, with map and network in memory, takes over. Deaths that come fast never end it, since the
-aircraft may fly without GNSS: cold starts wait longer and longer, and each is told.
+aircraft may fly without GNSS: cold starts wait longer and longer, and each is reported.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from companion.supervision.processes import ENDING, Beat
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name, ProcessFault
 
 _log = logging.getLogger(__name__)
 _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
 _LOOKED_AWAY_S = 1.5  # after which it was the supervisor that stood still, or the computer
 _PAUSE_S = 0.25  # between looks whether to go on waiting
 _MOST_DEATHS = 64  # that are remembered: more within the window wait no longer
-_WORDS_S = 3.0  # for a death to be told, or marked
+_WORDS_S = 3.0  # for a death to be reported, or marked
 _PART = 10  # characters of a part's name, so that the line is one STATUSTEXT
 _USAGE = 2  # exit code of a named error
 
@@ -148,7 +149,10 @@ class Supervisor:
                     continue
                 if not hangs and (self._stopping or code == 0 or self._is_hopeless(code)):
                     return code
-                self._recover(f"hangs ({hangs})" if hangs else f"died ({described(code)})")
+                if hangs:
+                    self._recover(ProcessFault.HANGS, Name(hangs))
+                else:
+                    self._recover(ProcessFault.DIED, Name(described(code)))
                 if self._flying is None:  # an order to end came while it waited
                     return code if code > 0 else 128 - code
         finally:
@@ -236,14 +240,14 @@ class Supervisor:
         """A wrong configuration is as wrong the next time; it was told where it was found."""
         return code == _USAGE and not self._deaths and self._standby is None
 
-    def _recover(self, how: str) -> None:
+    def _recover(self, how: ProcessFault, what: Name) -> None:
         """Fly again, tell and mark; nothing flies afterwards where an order to end came."""
         assert self._flying is not None
         dead, wait_s = self._flying.pid, self._wait_s()
         process, self._standby = self._standby, None
-        news = alert(AlertId.COMPANION_RESTARTS, how=how)
+        news = alert(AlertId.COMPANION_RESTARTS, how=how, what=what)
         if process is None and wait_s:
-            news = alert(AlertId.COMPANION_WAITS, how=how, seconds=wait_s)
+            news = alert(AlertId.COMPANION_WAITS, how=how, what=what, seconds=wait_s)
         _log.error("the flight process: %s", body(news))
         if process is not None:
             # First of all. It opens the links later than this process, which then tells at once.
@@ -292,8 +296,8 @@ class Supervisor:
 
 
 def _do_in_time(name: str, do: Callable[[], None]) -> None:
-    """What cannot be told must not keep the aircraft waiting: neither an error nor a disk or a port
-    that stands still, which may be what the flight process died of.
+    """Run it with a time limit: a report that fails must not delay the restart. The disk or port
+    that does not respond may be what the flight process died of.
     """
 
     def guarded() -> None:

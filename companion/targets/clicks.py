@@ -18,13 +18,12 @@ from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import ClickRefusal
 from mavlink_bridge.messages import TrackRequest
 
 _OLDEST_NS = 2_000_000_000  # how long the pose of a click's frame is waited for
 _FRAME_NS = 60_000_000  # a frame so near to the wanted time is the one that was seen
 _MOST = 8  # clicked targets at a time
-_UNKNOWN = "position not known"
-_UNCONFIRMED = "position not confirmed yet"
 
 
 class ClickPolicy:
@@ -83,7 +82,7 @@ class ClickPolicy:
         newest = self._history.newest
         if newest is None or now_ns - newest.exposure_time_ns > _OLDEST_NS:
             # The operator points into the present picture; an old pose would place it elsewhere.
-            self._refuse(request, _UNKNOWN)
+            self._refuse(request, ClickRefusal.UNKNOWN)
             return True
         estimate = self._history.at(wanted_ns)
         if estimate is None and abs(newest.exposure_time_ns - wanted_ns) <= _FRAME_NS:
@@ -92,10 +91,10 @@ class ClickPolicy:
         if is_early and now_ns - request.time_ns <= _OLDEST_NS:
             return False
         if estimate is None:
-            self._refuse(request, _UNKNOWN)
+            self._refuse(request, ClickRefusal.UNKNOWN)
         elif estimate.state is not TrackingState.TRACKING:
             # One picture has found a place, and the next ones may still find another.
-            self._refuse(request, _UNCONFIRMED)
+            self._refuse(request, ClickRefusal.UNCONFIRMED)
         else:
             self._begin(request, estimate)
         return True
@@ -121,7 +120,7 @@ class ClickPolicy:
             self._report(alert(AlertId.TARGET_REPLACED, number=oldest.number))
         self._targets.begin(click)
 
-    def _refuse(self, request: TrackRequest, why: str) -> None:
+    def _refuse(self, request: TrackRequest, why: ClickRefusal) -> None:
         """Say it once to an impatient operator."""
         if self._refused is None or (
             request.time_ns - self._refused[0] > _OLDEST_NS or self._refused[1] != why

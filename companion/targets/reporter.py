@@ -64,7 +64,7 @@ class TargetReporter:
 
     @property
     def doubted(self) -> int:
-        """Detections whose place may not be told (`TargetTrack.refusal`)."""
+        """Detections whose place may not be reported (`TargetTrack.refusal`)."""
         return self._population.doubted
 
     @property

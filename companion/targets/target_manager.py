@@ -24,6 +24,7 @@ from localizer.types import PoseEstimate, TargetFix, Visibility
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 
 _log = logging.getLogger(__name__)
 _MAX_DETECTED = 32  # at a time: what a telemetry link bears
@@ -184,7 +185,7 @@ class TargetManager:
         if fix is None:
             self.missed += 1
             self._report_alert(
-                alert(AlertId.TARGET_REFUSED, number=click.number, why=track.refusal)
+                alert(AlertId.TARGET_REFUSED, number=click.number, why=Name(track.refusal))
             )
             self._gone(name)
             return
@@ -310,7 +311,7 @@ class TargetManager:
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
             self._report_alert(
-                alert(AlertId.TARGET_NOT_LOCATED, number=_number(name), why=track.refusal)
+                alert(AlertId.TARGET_NOT_LOCATED, number=_number(name), why=Name(track.refusal))
             )
             self.end((name,))
 
@@ -542,7 +543,9 @@ class TargetManager:
         is_silent = life.told_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
         if is_silent and time_ns - self._silence_said_ns >= _SAID_NS:
             self._silence_said_ns = time_ns
-            self._report_alert(alert(AlertId.TARGET_SILENT, name=name, why=life.track.refusal))
+            self._report_alert(
+                alert(AlertId.TARGET_SILENT, name=Name(name), why=Name(life.track.refusal))
+            )
 
     def _drift(self, click: Click) -> tuple[float, float]:
         """One sigma, in pixels, of the picture's motion within the delay's error."""

@@ -28,7 +28,8 @@ _FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
 @dataclass(frozen=True)
 class Localized:
     """One frame's result. pose: the registration's, also where it was not accepted; covariance:
-    (6, 6) as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose.
+    (6, 6) as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose; beside_map: its
+    view does not meet the map.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Localized:
     accepted: bool = False
     searched: bool = False
     problem: str = ""
+    beside_map: bool = False
 
 
 class FrameLocalizer:
@@ -83,7 +85,7 @@ class FrameLocalizer:
         try:
             estimate = self._localizer.track(frame, passes=_PASSES)
         except OutsideMapError as error:
-            return Localized(name, None, problem=str(error))
+            return Localized(name, None, problem=str(error), beside_map=True)
         if estimate.status is not RegistrationStatus.OK:
             return Localized(name, None, problem=estimate.status.value)
         return Localized(

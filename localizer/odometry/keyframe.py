@@ -75,7 +75,7 @@ def keyframe_anchors(
     """Anchors of a flown picture, at most about `count`.
 
     surface: points (N, 3) on the map's surfaces, off their edges, as seen from about here: the
-    anchors of the map view that was rendered for this frame. Nothing is rendered anew, and their
+    anchors of the map view that was rendered for this frame. Nothing is rendered again, and their
     picture plays no part. ground: gives points where the map has none. Without either there are
     no anchors. sweep: of the picture, see `OdometryFrame`.
     """

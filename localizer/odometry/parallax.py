@@ -38,7 +38,7 @@ _STEPS = 3  # of Levenberg-Marquardt for the second picture, under each pose of 
 _REACH = 2.0  # sigmas of the prior at which the cost is sampled
 _CROSS = 0.7  # of it, for two axes at once
 _DAMPING, _LEAST_OVERLAP, _LEAST_SCALE = 0.003, 0.2, 0.02
-_RADIAN_M = 100.0  # weighs turns against shifts where the axes of a covariance are told
+_RADIAN_M = 100.0  # weighs turns against shifts where the axes of a covariance are reported
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ class AttitudeObservation:
 
 
 def is_new_ground(bias: AttitudeBias, place: Array, distance_m: float) -> bool:
-    """Whether what is seen from `place` (3,) errs by itself: over the same ground it errs alike."""
+    """Whether `place` (3,) gives an independent observation: over the same ground errors repeat."""
     apart_m = max(_LEAST_APART_M, _APART * distance_m)
     return bias.place is None or bool(np.hypot(*(place[:2] - bias.place)) >= apart_m)
 

@@ -254,7 +254,7 @@ class DualThreadEngine:
 
         Until the first acceptance, and again when LOST, a place that was found or the pose known
         outside is the better one. Only the latter, where it owes our own fixes nothing, begins
-        anew at once; anything else is on trial until it is confirmed.
+        again at once; anything else is on trial until it is confirmed.
         """
         tracker = self._localizer.tracker
         known = tracker.motion is not None

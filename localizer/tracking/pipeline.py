@@ -308,7 +308,7 @@ class Localizer:
                     features = query() if query is not None else self.extract_query(frame)
             estimate = self.localize(frame, features, bundle.anchors)
             if remaining and estimate.status is RegistrationStatus.OK:
-                # The same image again is no new evidence: start anew from its result, halving sigma
+                # The same image is no new evidence: start again from its result, halving sigma
                 self.set_prior(
                     PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
                 )
@@ -405,7 +405,7 @@ class Localizer:
                 result = self._fusion.fuse(image, frame.exposure_time_ns)
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
         if anchors is not None and image is not None and estimate.status is RegistrationStatus.OK:
-            # Added to what is told and not to what is filtered: the next frame errs alike.
+            # Added to what is reported, not to what is filtered: the next frame has the same error.
             moving = (ahead.velocity, ahead.rate)
             unknown = calibration_covariance(
                 self._config.calibration, anchors.points_world, estimate.world_from_camera,

@@ -53,7 +53,7 @@ class TrackStatus:
         return self.state not in _SEES and self.accepted_in_row == 0
 
     def begun(self) -> TrackStatus:
-        """Begun anew from a pose that is known."""
+        """Begun again from a pose that is known."""
         return TrackStatus(last_fix_ns=self.last_fix_ns)
 
     def proposed(self, independent: bool) -> TrackStatus:

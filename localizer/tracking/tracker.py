@@ -138,7 +138,7 @@ class Tracker:
         self._store(seen, moved, track_status)
         given, usable = _given(outcome, result, carried, track_status)
         if usable and not bridges:
-            # Position and tilt err together, from frame to frame anew; the turn between two frames
+            # Position and tilt err together, from frame to frame again; the turn between two frames
             # is known several times better. The sigmas told stay the registration's: the map errs
             # alike for seconds, which a filter takes for knowledge.
             given = replace(given, world_from_camera=moved.prior.world_from_camera)

@@ -1,4 +1,6 @@
-"""An alert as components pass it on: an identifier and values. Its text exists only at the edge."""
+"""An alert as components pass it on: an identifier and values. It becomes text only where it leaves
+the process.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +9,12 @@ import string
 from dataclasses import dataclass, field
 
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import ChosenSet, Name, RcChannel, Word
 
 PREFIX = "PiLoT: "
-Value = float | int | str
+Value = float | int | Word | Name | AlertId
+Kind = str | type[Word | AlertId] | tuple[type[Word], type[Word | RcChannel | ChosenSet]]
+"""Of a value: its unit (empty: none), "name" for a `Name`, or the list that it is one of."""
 AlertKey = tuple[AlertId, bool, tuple[str, ...]]
 
 
@@ -48,17 +53,18 @@ class AlertSpec:
     """One row of the catalogue.
 
     title: its name in tables and when it is cleared. text: template of the STATUSTEXT without the
-    prefix, with the values by name. cleared_text: when it ends; None: "cleared: TITLE". units: of
-    each value, in the order of `Alert.values`. raised, cleared: under which condition. raise_s,
-    clear_s: how long the condition must last. repeat_s: period while it is active, 0 for once.
-    lead: what the text begins with.
+    prefix, with the values by name. kinds: of each value, in the order of `Alert.values`. raised,
+    cleared: under which condition; cleared is empty for an event, which happens once and does not
+    end. cleared_text: sent when it ends; None: "cleared: TITLE"; empty: nothing is sent, the next
+    alert or status follows. raise_s, clear_s: how long the condition must last. repeat_s: period
+    while it is active, 0 for once. lead: what the text begins with.
     """
 
     id: AlertId
     severity: Severity
     title: str
     text: str
-    units: dict[str, str] = field(default_factory=dict)
+    kinds: dict[str, Kind] = field(default_factory=dict)
     raised: str = ""
     cleared: str = ""
     meaning: str = ""
@@ -74,7 +80,12 @@ class AlertSpec:
     @property
     def values(self) -> tuple[str, ...]:
         """Names of the values, in the order in which an `Alert` holds them."""
-        return tuple(self.units)
+        return tuple(self.kinds)
+
+    @property
+    def reports_end(self) -> bool:
+        """Whether a text is sent when it is cleared."""
+        return bool(self.cleared) and self.cleared_text != ""
 
     @property
     def template(self) -> str:
@@ -84,20 +95,27 @@ class AlertSpec:
 
     def __post_init__(self) -> None:
         used = {name for _, name, _, _ in string.Formatter().parse(self.text) if name}
-        if not used <= set(self.units):
-            raise ValueError(f"{self.id}: the text uses {used}, the values are {set(self.units)}")
+        if not used <= set(self.kinds):
+            raise ValueError(f"{self.id}: the text uses {used}, the values are {set(self.kinds)}")
 
 
 def event(
-    of: AlertId, severity: Severity, text: str, units: dict[str, str], *told: str, lead: str = ""
+    of: AlertId, severity: Severity, text: str, kinds: dict[str, Kind], *rows: str, lead: str = ""
 ) -> AlertSpec:
-    """The row of what is told when it begins. told: raised, meaning, operator; and, where its end
-    is told, cleared and its text.
+    """What happens once and does not end. rows: raised, meaning, operator."""
+    raised, meaning, operator = rows
+    return condition(of, severity, text, kinds, raised, "", meaning, operator, lead=lead)
+
+
+def condition(
+    of: AlertId, severity: Severity, text: str, kinds: dict[str, Kind], *rows: str, lead: str = ""
+) -> AlertSpec:
+    """What lasts until it is cleared. rows: raised, cleared, meaning, operator, and cleared_text
+    where one is sent.
     """
-    raised, meaning, operator, *end = told
-    cleared, cleared_text = end or ("", None)
+    raised, cleared, meaning, operator, *end = rows
     return AlertSpec(
-        of, severity, of.words, text, units, raised, cleared, meaning, operator, cleared_text,
+        of, severity, of.words, text, kinds, raised, cleared, meaning, operator, "".join(end),
         lead=lead,
     )  # fmt: skip
 

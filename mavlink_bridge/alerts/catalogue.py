@@ -29,7 +29,9 @@ def alert(of: AlertId, **values: Value) -> Alert:
 
 
 def cleared(of: AlertId) -> Alert:
-    """The same alert when it has ended."""
+    """The same alert when it has ended; ValueError for one whose end is not reported."""
+    if not CATALOGUE[of].reports_end:
+        raise ValueError(f"{of}: its end has no text")
     return Alert(of, active=False)
 
 
@@ -48,9 +50,10 @@ def reason(of: Alert) -> str:
     return body(of).removeprefix(spec_of(of).lead)
 
 
-def named(of: Alert) -> dict[str, Value]:
-    """Its values by name."""
-    return dict(zip(spec_of(of).values, of.values, strict=True)) if of.active else {}
+def named(of: Alert) -> dict[str, Value | str]:
+    """Its values by name; another alert as its title."""
+    shown = (CATALOGUE[v].title if isinstance(v, AlertId) else v for v in of.values)
+    return dict(zip(spec_of(of).values, shown, strict=True)) if of.active else {}
 
 
 def text(of: Alert) -> str:

@@ -11,6 +11,7 @@ class AlertId(str, enum.Enum):
     # integrity monitor
     VIDEO_FROZEN = "video_frozen"
     VIDEO_REPEATS = "video_repeats"
+    LOW_CONTRAST = "low_contrast"
     VISION_IMU_MISMATCH = "vision_imu_mismatch"
     HEIGHT_MISMATCH = "height_mismatch"
     POSITION_JUMP = "position_jump"
@@ -55,6 +56,7 @@ class AlertId(str, enum.Enum):
     SOURCE_SET_REFUSED = "source_set_refused"
     SOURCE_SET_HELD = "source_set_held"
     LOOK_AT_REFUSED = "look_at_refused"
+    LOOK_AT_NO_TARGET = "look_at_no_target"
     LOOK_AT_UNANSWERED = "look_at_unanswered"
     LOOK_AT_DENIED = "look_at_denied"
     LOOK_AT_ENDED = "look_at_ended"
@@ -104,7 +106,6 @@ class AlertId(str, enum.Enum):
     CLOCK_NOT_SET = "clock_not_set"
     TLOG_INCOMPLETE = "tlog_incomplete"
     # companion
-    STARTING = "starting"
     INITIALIZING = "initializing"
     TRACKING = "tracking"
     DEGRADED = "degraded"

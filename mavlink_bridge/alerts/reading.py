@@ -42,6 +42,10 @@ def alert_of(statustext: str) -> tuple[AlertId, bool] | None:
     read = values_of(statustext)
     if read is not None:
         return read[0], True
-    ended = (spec.id for spec in CATALOGUE.values() if text(cleared(spec.id)) == statustext)
+    ended = (
+        spec.id
+        for spec in CATALOGUE.values()
+        if spec.reports_end and text(cleared(spec.id)) == statustext
+    )
     of = next(ended, None)
     return None if of is None else (of, False)

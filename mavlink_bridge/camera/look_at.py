@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CommandAnswer, LookAtRefusal
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
 from mavlink_bridge.vehicle.origin import north_east
@@ -78,7 +79,7 @@ class LookAt:
                 self._wanted = self._place_of(target)
 
     def forget(self, number: int) -> None:
-        """A target ended; the gimbal stays where it was last seen, and the operator is told."""
+        """A target ended: the gimbal keeps its direction, which is reported."""
         with self._lock:
             self._targets.pop(number, None)
             if self._number != number:
@@ -87,11 +88,11 @@ class LookAt:
         self._report(alert(AlertId.LOOK_AT_ENDED, number=number))
 
     def command(self, message: Any) -> int:
-        """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is told, too."""
-        why = self._obey(message)
-        if not why:
+        """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is reported, too."""
+        refused = self._obey(message)
+        if refused is None:
             return int(mavlink.MAV_RESULT_ACCEPTED)
-        self._report(alert(AlertId.LOOK_AT_REFUSED, why=why))
+        self._report(refused)
         return int(mavlink.MAV_RESULT_DENIED)
 
     def due(self, now_ns: int) -> tuple[int, int, int, int, float] | None:
@@ -113,8 +114,8 @@ class LookAt:
             return (LOOK_AT_PLACE, wanted.frame, x, y, wanted.altitude_m)
 
     def answered(self, result: int) -> None:
-        """The autopilot's answer to a look-at: what it refuses is told and not tried again. One
-        to nobody's question says nothing.
+        """The autopilot's answer to a look-at. A refusal is reported and not tried again. An answer
+        without a question is ignored.
         """
         with self._lock:
             if self._asked_ns is None:
@@ -123,34 +124,33 @@ class LookAt:
             if result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
                 return
             self._wanted, self._number = None, 0
-        name = mavlink.enums["MAV_RESULT"].get(result)
-        result_name = "unknown" if name is None else name.name.removeprefix("MAV_RESULT_").lower()
-        self._report(alert(AlertId.LOOK_AT_DENIED, result=result_name))
+        self._report(alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.of(result)))
 
-    def _obey(self, message: Any) -> str:
-        """Why not; empty if it is done."""
+    def _obey(self, message: Any) -> Alert | None:
+        """Why not; None if it is done."""
         if not self._allowed:
-            return "bridge.look_at is off"
+            return alert(AlertId.LOOK_AT_REFUSED, why=LookAtRefusal.OFF)
         if not self._has_gimbal:
-            return "the camera is fixed"
+            return alert(AlertId.LOOK_AT_REFUSED, why=LookAtRefusal.FIXED_CAMERA)
         with self._lock:
             if message.command == LOOK_AT_PLACE:
-                return self._look(0, _place(message), "no place on Earth")
+                nowhere = alert(AlertId.LOOK_AT_REFUSED, why=LookAtRefusal.NO_PLACE)
+                return self._look(0, _place(message), nowhere)
             number = 0
             if message.command == LOOK_AT_TARGET:
                 number = int(message.param1) if math.isfinite(message.param1) else -1
             if number == 0:
                 self._number, self._wanted, self._ahead = 0, None, True
-                return ""
+                return None
             target = self._targets.get(number)
             place = None if target is None else self._place_of(target)
-            return self._look(number, place, f"no target {number}")
+            return self._look(number, place, alert(AlertId.LOOK_AT_NO_TARGET, number=number))
 
-    def _look(self, number: int, place: _Place | None, why_not: str) -> str:
+    def _look(self, number: int, place: _Place | None, refused: Alert) -> Alert | None:
         if place is None:
-            return why_not
+            return refused
         self._number, self._wanted, self._sent = number, place, None
-        return ""
+        return None
 
     def _place_of(self, target: TargetReport) -> _Place:
         altitude_m = target.height_m - self._geoid_m

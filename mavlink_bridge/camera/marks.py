@@ -24,7 +24,7 @@ class TargetMark:
 
 class Marks:
     """Which mark is due. Those of targets that are gone are forgotten beyond the newest 256, since
-    a detector names things anew as long as it flies.
+    a detector names things again as long as it flies.
     """
 
     def __init__(self, sigma_m: float) -> None:

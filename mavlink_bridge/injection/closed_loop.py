@@ -158,5 +158,5 @@ class ClosedLoopCheck:
 
 
 def _is_there(distance_m: float, sigma_m: float) -> bool:
-    """Whether the EKF is where it was told to jump to."""
+    """Whether the EKF has followed an announced jump."""
     return distance_m <= _JUMP_SIGMAS * sigma_m + _JUMP_SLACK_M

@@ -1,20 +1,25 @@
-"""The messages that carry a position, or its change, to a flight controller."""
+"""From an estimate to the configured message of five, or to the reason why there can be none."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.alerts.alert import Alert
+from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.propagate import PropagatedFix
-from mavlink_bridge.messages import Attitude, VisionFix, or_nan
-from mavlink_bridge.vehicle.origin import north_east
-from mavlink_bridge.vehicle.profile import CovarianceFormula, covariance_entry
+from mavlink_bridge.link.clock import SteadyUtc
+from mavlink_bridge.messages import Attitude, Origin, VisionFix
+from mavlink_bridge.vehicle.origin import ned_from_origin, north_east
+from mavlink_bridge.vehicle.profile import CovarianceFormula, FirmwareProfile, covariance_entry
 
 NAN = math.nan
 # Index of the diagonal (x, y, z, roll, pitch, yaw) in MAVLink's row-major upper triangle of 6x6.
@@ -36,22 +41,20 @@ _RISK_SIGMAS = 3.7  # of 1e-3, where nobody gives a protection level
 VELOCITY_SIGMA_MPS = (0.1, 2.0)
 _DELTA_NOISE_MPS = 0.3  # of a velocity from two fixes of the odometry
 _DELTA_SCALE = 0.1  # its scale error over ground taken as level, the largest (odometry.md)
-
-
-Angles = tuple[float | None, float | None, float | None]
+_FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 
 @dataclass(frozen=True)
 class EncodedEstimate:
-    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), None where
-    it is not known.
+    """What is about to be sent. position: as propagated; quaternion: body to NED, None where it is
+    not known.
 
     fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
     another time: its velocity is no new measurement. protection_m: horizontal and vertical level.
     """
 
     position: PropagatedFix
-    attitude: Angles
+    quaternion: quat.Quaternion | None
     attitude_sigma_rad: float
     quality: int
     reset_counter: int
@@ -107,7 +110,7 @@ def vision_position_estimate(
 ) -> Any:
     """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
-    angles = (or_nan(angle) for angle in e.attitude)
+    angles = (NAN, NAN, NAN) if e.quaternion is None else quat.to_euler(e.quaternion)
     return mavlink.MAVLink_vision_position_estimate_message(
         e.position.time_ns // 1000, *ned, *angles, covariance, e.reset_counter
     )
@@ -115,7 +118,7 @@ def vision_position_estimate(
 
 def odometry(
     e: EncodedEstimate,
-    attitude: tuple[float, float, float],
+    q: quat.Quaternion,
     ned: tuple[float, float, float],
     formula: CovarianceFormula,
     frame: int,
@@ -124,7 +127,6 @@ def odometry(
 
     A repeated velocity is NaN, "unknown": the EKF would take its error for an independent one.
     """
-    q = quat.from_euler(*attitude)
     vn, ve, vd = (float(v) for v in e.position.velocity_ned)
     body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
@@ -191,8 +193,8 @@ def gps_input(
     p = e.position
     horizontal_m, vertical_m = e.levels_m
     yaw = 0  # 0 means none; north is 36000
-    if config.gps_yaw and e.attitude[2] is not None:
-        yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
+    if config.gps_yaw and e.quaternion is not None:
+        yaw = round(math.degrees(quat.to_euler(e.quaternion)[2]) % 360.0 * 100.0) or 36000
     vn, ve, vd = (float(v) for v in p.velocity_ned) if config.gps_velocity else (0.0, 0.0, 0.0)
     week, ms = week_ms
     return mavlink.MAVLink_gps_input_message(
@@ -265,3 +267,116 @@ def external_position_estimate(
         round(p.longitude_deg * 1e7),
         NAN,
     )
+
+
+@dataclass(frozen=True)
+class HeldOutput:
+    """Why nothing is sent although it is time. counter: the name it is counted under."""
+
+    reason: Alert
+    counter: str
+
+
+@dataclass(frozen=True)
+class EncodedMessage:
+    """One message to send, and the estimate it was made from."""
+
+    message: Any
+    estimate: EncodedEstimate
+
+
+@dataclass(frozen=True)
+class InjectionContext:
+    """What the injector must know about the vehicle. now: the origin and profile of this moment."""
+
+    origin: Origin | None
+    profile: FirmwareProfile
+    attitude_at: Callable[[int], Attitude | None]
+    system_id: int = 1
+
+
+def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat.Quaternion | None:
+    """Vision attitude at time_ns: the fix's, turned as the autopilot turned since."""
+    if time_ns == fix.time_ns or fix.quaternion is None:
+        return fix.quaternion
+    then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)
+    if then is None or now is None:
+        return fix.quaternion
+    turned = quat.multiply(quat.conjugate(then.quaternion), now.quaternion)
+    return quat.multiply(fix.quaternion, turned)
+
+
+class MessageMaker:
+    """Makes one message at a time of estimates; one thread."""
+
+    def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
+        self._config = config
+        self._geoid_m = geoid_separation_m
+        self._utc = utc
+        self._begun_ns: int | None = None
+
+    def make(
+        self, e: EncodedEstimate, now_ns: int, context: InjectionContext
+    ) -> EncodedMessage | HeldOutput:
+        """The configured message of an estimate."""
+        kind = self._config.message
+        altitude = e.position.height_m - self._geoid_m
+        message = self._global(kind, e, altitude, now_ns, context.system_id)
+        if message is not None:
+            return EncodedMessage(message, e)
+        if context.origin is None:
+            return HeldOutput(alert(AlertId.EKF_NO_ORIGIN), "withheld_no_origin")
+        ned = ned_from_origin(
+            context.origin,
+            e.position.latitude_deg,
+            e.position.longitude_deg,
+            altitude,
+            context.profile.projection,
+        )
+        if math.hypot(*ned) > _FARTHEST_M:
+            reason = alert(AlertId.EKF_ORIGIN_FAR, kilometres=math.hypot(*ned) * 1e-3)
+            return HeldOutput(reason, "withheld_far_origin")
+        formula = context.profile.covariance
+        if self._config.covariance != "profile":
+            formula = self._config.covariance
+        if kind == "odometry":
+            return self._odometry(e, ned, formula, context)
+        if not self._config.send_attitude:
+            e = replace(e, quaternion=None)
+        return EncodedMessage(vision_position_estimate(e, ned, formula), e)
+
+    def _global(
+        self,
+        kind: InjectionMessage,
+        e: EncodedEstimate,
+        altitude_amsl_m: float,
+        now_ns: int,
+        system_id: int,
+    ) -> Any:
+        """The message where it has a latitude and a longitude; None for local ones."""
+        if kind == "gps_input":
+            week_ms = self._utc.gps_week_ms(e.position.time_ns)
+            return gps_input(e, altitude_amsl_m, week_ms, self._config)
+        if kind == "global_position_sensor":
+            return global_position_sensor(e, altitude_amsl_m, now_ns)
+        if kind == "external_position_estimate":
+            self._begun_ns = self._begun_ns or now_ns
+            return external_position_estimate(e, system_id, now_ns, self._begun_ns)
+        return None
+
+    def _odometry(
+        self,
+        e: EncodedEstimate,
+        ned: tuple[float, float, float],
+        formula: CovarianceFormula,
+        context: InjectionContext,
+    ) -> EncodedMessage | HeldOutput:
+        """Velocity is rotated by the message's quaternion, so there must be one."""
+        q = e.quaternion
+        if q is None:
+            now = context.attitude_at(e.position.time_ns)
+            if now is None:
+                return HeldOutput(alert(AlertId.NO_ATTITUDE), "withheld_no_attitude")
+            q = now.quaternion
+        frame = context.profile.odometry_frame
+        return EncodedMessage(odometry(e, q, ned, formula, frame), e)

@@ -1,8 +1,8 @@
-"""Fixes from any thread to positions on the link, or to nothing with a reason that is told."""
+"""Turns fixes from any thread into positions on the link, or reports why none is sent."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -10,22 +10,22 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CommandAnswer
 from mavlink_bridge.config import Mode
-from mavlink_bridge.injection.fix_queue import FixQueue
+from mavlink_bridge.injection.encode import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
 
 _QUEUE = 64
-_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
+_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is reported
 _BRIEF = (AlertId.NO_FRESH_FIX, AlertId.LINK_FULL)
 _GOOD_NS = 1_000_000_000
 _FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
@@ -42,15 +42,14 @@ class PositionCommand:
     """
 
     def __init__(self) -> None:
-        self.answer = "not asked, no GNSS"
+        self.answer = CommandAnswer.NOT_ASKED
         self._fuses: bool | None = None
         self._asked_ns = self._accepted_ns = 0
         self._held_ns = self._held_since_ns = 0  # fixes that were not sent
 
     def take(self, result: int, now_ns: int) -> None:
         """The MAV_RESULT of one that was sent."""
-        name = mavlink.enums["MAV_RESULT"][result].name if result in _RESULTS else str(result)
-        self.answer = name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
+        self.answer = CommandAnswer.of(result)
         is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
         if self._fuses is None:
             self._fuses = is_accepted
@@ -75,7 +74,7 @@ class PositionCommand:
             return False
         self._asked_ns = now_ns
         if self._fuses is None:
-            self.answer = "not answered"
+            self.answer = CommandAnswer.NOT_ANSWERED
         return True
 
     def is_held(self, now_ns: int) -> bool:
@@ -84,11 +83,8 @@ class PositionCommand:
         return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
 
 
-_RESULTS = frozenset(mavlink.enums["MAV_RESULT"])
-
-
 class FixSender:
-    """Runs in the flight-controller link's thread; only `fixes` is filled from outside.
+    """Runs in the flight-controller link's thread; only `put` is called from others.
 
     vision: the last position that was sent or scored.
     """
@@ -101,7 +97,9 @@ class FixSender:
         teller: StatusNotifier,
         counters: Counter[str],
     ) -> None:
-        self.fixes = FixQueue(_QUEUE)
+        self.dropped = 0
+        """Fixes that the link's thread came too late for."""
+        self._fixes: deque[VisionFix] = deque(maxlen=_QUEUE)
         self.injector = Injector(shared.config.injection, shared.geoid_separation_m, shared.utc)
         self.vision: PropagatedFix | None = None
         commands = shared.config.injection.message == "external_position_estimate"
@@ -117,10 +115,15 @@ class FixSender:
         self._delivered_ns = 0
         self._sent_ns: int | None = None  # to the flight controller
 
+    def put(self, fix: VisionFix) -> None:
+        """Append a fix; the oldest is dropped where too many wait. Never blocks."""
+        self.dropped += len(self._fixes) == _QUEUE
+        self._fixes.append(fix)
+
     def take(self, now_ns: int) -> None:
-        """The fixes that came since the last call."""
-        for fix in self.fixes.take():
-            self.injector.submit(fix, now_ns)
+        """The fixes that came since the last call, oldest first."""
+        while self._fixes:
+            self.injector.submit(self._fixes.popleft(), now_ns)
 
     def acknowledged(self, link: Link, ack: Any, now_ns: int) -> None:
         """A COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE; a ground station sends that command, too."""
@@ -134,7 +137,7 @@ class FixSender:
         self._command = None if self._command is None else PositionCommand()
 
     def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
-        """Send what is due, as the mode allows, and tell why not. mode: not ``off``."""
+        """Send what is due if the mode allows it, else report why not. mode: not ``off``."""
         profile = select_profile(state.autopilot, state.version)
         context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)
         injection = self.injector.step(now_ns, context)
@@ -160,31 +163,31 @@ class FixSender:
             self._teller.tell_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
-        """Whether positions came of late (and went, where they are to), and the yaw guard is
-        content.
+        """Whether positions came lately (and were sent, in mode ``inject``), and the yaw guard does
+        not block.
         """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
     def reaches_ekf(self, now_ns: int) -> bool:
-        """Whether positions went to the flight controller of late: not while a shadow, withheld,
-        or refused by the port.
+        """Whether positions were sent to the flight controller lately: not in shadow mode, while
+        output is held, or while the port takes none.
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
 
     def fed(self, now_ns: int) -> bool:
-        """Whether what the EKF says may still be made of our positions."""
+        """Whether the EKF's state may still depend on our positions."""
         return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
 
     @property
     def refusal(self) -> Alert | None:
-        """Why positions that are due are not made, once it has lasted and was told; else None."""
+        """Why due positions are not sent, once that has lasted and was reported; else None."""
         reported = self._teller.reported("inject")
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""
-        return {"fixes": len(self.fixes), "due": self.injector.waiting}
+        return {"fixes": len(self._fixes), "due": self.injector.waiting}
 
     def _deliver(
         self, link: Link, state: VehicleState, mode: Mode, injection: EncodedMessage, now_ns: int

@@ -1,10 +1,11 @@
-"""What is wrong with the fixes themselves or with who takes them, told once."""
+"""Warnings about late, unchecked or undated fixes and about firmware, each reported once."""
 
 from __future__ import annotations
 
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.shared import Shared
@@ -33,7 +34,7 @@ class FixWarnings:
         if not profile.known:
             problem = alert(AlertId.UNKNOWN_FIRMWARE)
         elif self._config.message not in profile.messages:
-            message = self._config.message.upper()
+            message = Name(self._config.message.upper())
             problem = alert(AlertId.MESSAGE_UNSUPPORTED, message=message)
         self._teller.tell("profile", problem)
 
@@ -68,6 +69,6 @@ class FixWarnings:
         if lag > limit:
             return late
         is_told = is_over or last is AlertId.FIXES_LATE
-        if is_told and lag > _RELIEF_SHARE * limit:  # not yet over, but nothing new to say
+        if is_told and lag > _RELIEF_SHARE * limit:  # not yet over, but nothing new to report
             return over if is_over else late
         return None

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import InjectionOrder, RcChannel
 from mavlink_bridge.config import InjectionEnableConfig
 from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
 
@@ -27,13 +28,13 @@ COMMANDS = {
 
 
 class InjectionEnable:
-    """Open or closed by whoever spoke last: the channel when it is moved, or a command.
+    """The last order decides: the RC channel when it is moved, or a command.
 
-    A receiver that falls silent changes nothing: to take the position from the EKF at that moment
-    would turn the vehicle's way home into a landing. Any thread may call.
+    If the RC receiver goes silent, injection continues: without a position, ArduPilot would land
+    instead of returning. Any thread may call.
 
-    changed: called with an alert when it opens or closes. memory: of the gate that
-    a process before this one left open.
+    changed: called with an alert when injection is enabled or disabled. memory: whether a process
+    before this one had enabled it.
     """
 
     def __init__(
@@ -48,10 +49,10 @@ class InjectionEnable:
         self._open = False
         self._high: bool | None = None
         self._memory = memory
-        self._at_start = alert(AlertId.INJECTION_OFF, by="at the start")
+        self._at_start = alert(AlertId.INJECTION_OFF, by=InjectionOrder.START)
 
     def recall(self) -> None:
-        """Open it if it was left open by a process that did not end in order; `announce` tells."""
+        """Enable injection if a process that crashed had enabled it; `announce` reports it."""
         remembered = self._memory.recall() if self._memory is not None else None
         if remembered is None:
             return
@@ -65,7 +66,7 @@ class InjectionEnable:
             self._memory.opened(by_channel=by_channel)
 
     def announce(self) -> None:
-        """Tell how it stood at the start: once the links have somebody who hears it."""
+        """Report the state at the start, once a link is connected."""
         self._changed(self._at_start)
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
@@ -91,7 +92,7 @@ class InjectionEnable:
             # At the first look only a switch that is on counts: a command may have come before.
             moved = self._high if before is None else self._high != before
         if moved:
-            self._set(bool(self._high), f"channel {number}", by_channel=True)
+            self._set(bool(self._high), RcChannel(number))
 
     def command(self, command: int, wanted: float) -> int:
         """A command to the localizer's component; the MAV_RESULT to acknowledge it with.
@@ -102,17 +103,17 @@ class InjectionEnable:
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
         if not math.isfinite(wanted) or wanted not in (0.0, 1.0):
             return int(mavlink.MAV_RESULT_DENIED)
-        self._set(wanted == 1.0, "command", by_channel=False)
+        self._set(wanted == 1.0, InjectionOrder.COMMAND)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
-    def _set(self, wanted: bool, by: str, *, by_channel: bool) -> None:
+    def _set(self, wanted: bool, by: RcChannel | InjectionOrder) -> None:
         with self._lock:
             if wanted == self._open:
                 return
             self._open = wanted
             if self._memory is not None:
                 if wanted:
-                    self._memory.opened(by_channel=by_channel)
+                    self._memory.opened(by_channel=isinstance(by, RcChannel))
                 else:
                     self._memory.closed()
         self._changed(alert(AlertId.INJECTION_ON if wanted else AlertId.INJECTION_OFF, by=by))

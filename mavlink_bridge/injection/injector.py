@@ -20,14 +20,14 @@ from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig
-from mavlink_bridge.injection.encode import EncodedEstimate, vision_position_delta
-from mavlink_bridge.injection.fix_queue import Latency, PendingJump
-from mavlink_bridge.injection.message_maker import (
+from mavlink_bridge.injection.encode import (
+    EncodedEstimate,
     EncodedMessage,
     HeldOutput,
     InjectionContext,
     MessageMaker,
     attitude_of,
+    vision_position_delta,
 )
 from mavlink_bridge.injection.propagate import FixPropagator, grown_protection
 from mavlink_bridge.injection.yaw_guard import YawGuard
@@ -39,6 +39,33 @@ _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
 _DELTA_NS = 500_000_000  # between two fixes that give a velocity
+_AGES = 50
+
+
+class Latency:
+    """Ages of the last 50 fixes, from exposure to when they came, milliseconds."""
+
+    def __init__(self) -> None:
+        self._ages_ms: deque[float] = deque(maxlen=_AGES)
+
+    def take(self, age_ms: float) -> None:
+        """Of one fix."""
+        self._ages_ms.append(age_ms)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough fixes came to judge by."""
+        return len(self._ages_ms) == _AGES
+
+    @property
+    def median_ms(self) -> float | None:
+        """None before the first fix."""
+        return statistics.median(self._ages_ms) if self._ages_ms else None
+
+    @property
+    def least_ms(self) -> float | None:
+        """Of the youngest; None before the first fix."""
+        return min(self._ages_ms, default=None)
 
 
 class _FixRate:
@@ -106,11 +133,12 @@ class Injector:
         self._least_gap_ns = int(self._period_ns / 1.5)  # 30 Hz never passes 50 Hz
         self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
         self.guard = YawGuard(config.yaw_guard)
-        self._waiting: deque[VisionFix] = deque()
+        self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
         self.latency = Latency()
         self._fresh: VisionFix | None = None
-        self._jump = PendingJump()
         self._reset_counter = 0
+        self._announced = 0
+        self._sent_jumps = 0  # of the localizer and announced, as the last message had them
         self._newest_ns = 0
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
@@ -144,15 +172,13 @@ class Injector:
         unusable = self._unusable(fix, now_ns)
         if unusable is not None:
             self.counters[unusable] += 1
-            self._jump.note(fix)
             return
         self._newest_ns = fix.time_ns
         self.latency.take((now_ns - fix.time_ns) * 1e-6)
         self.counters["fixes"] += 1
-        self._waiting.append(fix)
-        if len(self._waiting) > _QUEUE:
+        if len(self._waiting) == _QUEUE:
             self.counters["fixes_overflowed"] += 1
-            self._jump.note(self._waiting.popleft())
+        self._waiting.append(fix)
 
     def _unusable(self, fix: VisionFix, now_ns: int) -> str | None:
         """Why a fix is dropped at once (the name it is counted under), or None."""
@@ -163,13 +189,12 @@ class Injector:
         return "fixes_stale" if now_ns - fix.time_ns > _STALE_NS else None
 
     def announce_jump(self) -> None:
-        """Raise the reset counter with the next message."""
-        self._jump.announce()
+        """Raise the reset counter with the next message, whichever fix it is made of."""
+        self._announced += 1
 
     def skip(self) -> None:
-        """Nothing can be sent now: forget what waits, but not that the position jumped."""
-        while self._waiting:
-            self._jump.note(self._waiting.popleft())
+        """Nothing can be sent now: forget what waits."""
+        self._waiting.clear()
         self._fresh = None
 
     def step(self, now_ns: int, context: InjectionContext) -> EncodedMessage | None:
@@ -206,10 +231,9 @@ class Injector:
         while self._waiting and self._waiting[0].time_ns + self._delay_ns <= now_ns:
             fix = self._waiting.popleft()
             attitude = context.attitude_at(fix.time_ns)
-            verdict = self.guard.check(fix.time_ns, fix.yaw_rad, attitude, reset=fix.reset)
+            verdict = self.guard.check(fix, attitude)
             if verdict.difference_rad is not None:
                 self.yaw_difference_rad = verdict.difference_rad
-            self._jump.note(fix)
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
@@ -273,11 +297,11 @@ class Injector:
         if sigma > self._config.max_sigma_m:
             over = alert(AlertId.SIGMA_OVER_LIMIT, metres=sigma)
             return HeldOutput(over, "withheld_covariance")
-        attitude = attitude_of(fix, time_ns, context)
-        counter = (self._reset_counter + self._jump.pending) % 256
+        jumps = fix.reset_count + self._announced
+        counter = (self._reset_counter + (jumps != self._sent_jumps)) % 256
         estimate = EncodedEstimate(
             position,
-            attitude,
+            attitude_of(fix, time_ns, context),
             fix.attitude_sigma_rad,
             fix.quality,
             counter,
@@ -287,7 +311,6 @@ class Injector:
         )
         outcome = self._maker.make(estimate, now_ns, context)
         if isinstance(outcome, EncodedMessage):
-            self._reset_counter = counter
-            self._jump.told()
+            self._reset_counter, self._sent_jumps = counter, jumps
             self._sent_fix_ns = fix.time_ns
         return outcome

@@ -52,7 +52,7 @@ class ShadowInterlock:
         self._open = False
 
     def recall(self) -> None:
-        """What spoke against the map in a process that was killed speaks against it still."""
+        """Restore the failed shadow check of a process that was killed."""
         if self._memory is not None and self._memory.recall():
             self._against = self._reason = alert(AlertId.SHADOW_RESTORED)
             self._teller.report(self._against)
@@ -63,13 +63,13 @@ class ShadowInterlock:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
-        """What may be done of what is wanted. by_pilot: the gate of mode ``rc`` is a person's word:
-        it is obeyed, and told where the score is no go.
+        """The mode that is allowed. by_pilot: the pilot enabled it in mode ``rc``, which is obeyed
+        and reported if the shadow check has not passed.
         """
         self._judge(state, now_ns)
         if wanted != "inject":
             if by_pilot:
-                self._open = False  # its next opening is told again
+                self._open = False  # its next opening is reported again
             self._remember()
             return wanted
         if not self._open and state.connected:
@@ -78,8 +78,8 @@ class ShadowInterlock:
         return "inject" if self._open else "shadow"
 
     def _remember(self) -> None:
-        """Not while it injects: a beginning is not taken back, by a restart no more than by a
-        receiver that is led astray meanwhile.
+        """Not while it injects: injection that has begun is not revoked, neither by a restart nor
+        by a receiver that is spoofed meanwhile.
         """
         if self._memory is not None:
             self._memory.note(not self._open and self._against is not None)
@@ -90,12 +90,12 @@ class ShadowInterlock:
         if self._open:
             return None
         if self.inhibited_by:
-            title = min(CATALOGUE[of].title for of in self.inhibited_by)
-            return alert(AlertId.INHIBITED, alert=title)
+            first = min(self.inhibited_by, key=lambda of: CATALOGUE[of].title)
+            return alert(AlertId.INHIBITED, alert=first)
         return self._reason
 
     def may_switch(self, now_ns: int) -> bool:
-        """Whether vision may be switched to: proven lately, or there is nothing to prove it by."""
+        """Whether the EKF may switch to vision: verified lately, or there was no GNSS to do so."""
         if self._force:
             return True
         if self.inhibited_by:
@@ -110,7 +110,7 @@ class ShadowInterlock:
         return before_last_ns <= _BEFORE_LAST_NS and now_ns - self._go_ns <= _GO_NS
 
     def _may_begin(self, now_ns: int, *, by_pilot: bool) -> bool:
-        """Whether injection may begin, told; a beginning is not taken back."""
+        """Whether injection may begin; reports why it begins unverified. Never revoked."""
         since_ns = self._without_since_ns
         without = since_ns is not None and now_ns - since_ns >= _WITHOUT_GNSS_NS
         if self._recent_go(now_ns) and not self.inhibited_by:
@@ -138,7 +138,7 @@ class ShadowInterlock:
         if score.go:
             self._go_ns, self._against = self._compared_ns(), None
         elif score.samples >= MINIMUM_SAMPLES:
-            # It stays when its samples have aged: what was wrong with GNSS is wrong without. A rate
-            # that was too low says nothing of the map: the injection looks at it itself.
+            # It stays when its samples age: a wrong map is wrong without GNSS, too. A low rate
+            # says nothing about the map; `Injector` checks it.
             self._against = score.against[0] if score.against else None
         self._reason = self._against or (score.reasons[0] if score.reasons else None)

@@ -1,4 +1,4 @@
-"""What came of the positions: how they compare with GNSS, and whether the EKF follows them."""
+"""Compares positions with GNSS, and checks whether the EKF follows them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RECEIVER_LATE_NS = 200_000_000  # from what it measured to the arrival of its r
 
 
 class InjectionOutcome:
-    """Remembers what was made and sent, and judges; one thread.
+    """Keeps recent positions, made and sent, for both checks; one thread.
 
     verdict: the last one; None while nothing is sent or it is too early. ekf_ok_inhibited_by:
     alerts for which "the EKF follows" is not reported. compared_ns: exposure of the last fix that
@@ -82,7 +82,7 @@ class InjectionOutcome:
                 self.compared_ns = fix.time_ns
 
     def judge(self, state: VehicleState, now_ns: int) -> bool:
-        """Whether the EKF follows, told; True when a jump must be announced again."""
+        """Check and report whether the EKF follows. True if a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
         if self.verdict is not None and (self.verdict.reason or not self.ekf_ok_inhibited_by):
             follows = alert(AlertId.EKF_FOLLOWS)

@@ -89,13 +89,13 @@ class FixPropagator:
         R = fix.position_covariance_ned + self._floor
         last, self._fix = self._fix, fix
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
-        if self._filter is None or gap_s > _FORGET_AFTER_S:
+        if last is None or self._filter is None or gap_s > _FORGET_AFTER_S:
             self._start(fix, R)
             return
         F, Q = self._motion(gap_s)
         self._filter.predict(F=F, Q=Q)
         z = self._ned(fix)
-        if fix.reset:
+        if fix.reset_count != last.reset_count:
             # The estimate jumped, the aircraft did not: keep the velocity, take the position.
             self._filter.x[:3, 0] = z
             self._filter.P[:3, :] = 0.0

@@ -28,7 +28,7 @@ _STOP_S = 2.0
 
 class RestartMemory:
     """What holds now, for a process that takes over from one that was killed. Reads once; writes in
-    a thread of its own, so that a disk that stands still stalls nobody.
+    a thread of its own, so that a disk that does not respond stalls nobody.
 
     about: what it holds of, empty where that is always the same; what was kept of another counts
     for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the

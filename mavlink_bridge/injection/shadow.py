@@ -19,12 +19,12 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _WINDOW_NS = 120_000_000_000
 _LENGTH = 4096
 _GNSS_FRESH_NS = 1_500_000_000
 _MINIMUM_FIX = 3
-_REFERENCE_SIGMA_M = 1.5  # the EKF on GNSS, horizontally
 MINIMUM_SAMPLES = 50
 _MEDIAN_LIMIT_M = 3.0
 _P95_LIMIT_M = 6.0
@@ -40,7 +40,7 @@ class ShadowScore:
 
     Without samples nothing of that is known: None. bias_ne_m: mean north and east difference.
     height_m: median difference of the heights. consistency: median squared Mahalanobis distance
-    (1.4 is ideal). reasons: why it is a no-go; empty if it is a go. against: those of them
+    (1.4 is ideal). reasons: why it is not ready; empty if it is a go. against: those of them
     that speak against the positions themselves, not against how many came.
     """
 
@@ -85,7 +85,7 @@ class ShadowScorer:
         difference = np.array(
             north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
         )
-        P = fix.covariance_ned[:2, :2] + np.eye(2) * _REFERENCE_SIGMA_M**2
+        P = fix.covariance_ned[:2, :2] + np.eye(2) * VEHICLE_SENSORS.ekf_on_gnss_m**2
         distance = float(difference @ np.linalg.solve(P, difference))
         north, east = (float(d) for d in difference)
         up = fix.height_m - self._geoid_m - reference[2]

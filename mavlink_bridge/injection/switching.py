@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared, spec_of
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import ChosenSet, GnssProblem, ReturnCause, SwitchRefusal
 from mavlink_bridge.config import SourceSwitchConfig
 from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.propagate import PropagatedFix
@@ -28,9 +29,9 @@ from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _RETRY_NS = 1_000_000_000
-_GNSS_SIGMA_M = 2.5  # where the receiver does not say
 _SPEED_SLACK_S = 0.4  # a receiver's report is this much older than its time of arrival
 _VISION_FRESH_NS = 1_000_000_000
 _LARGEST_SIGMA_M = 5.0  # a receiver that claims to be bad must not hide an error in its claim
@@ -47,7 +48,7 @@ class SwitchOrder:
     """Select a source set (MAV_CMD_SET_EKF_SOURCE_SET), and why. metres: GNSS from vision, or 0."""
 
     source_set: int
-    cause: str
+    cause: GnssProblem | ReturnCause
     metres: float = 0.0
 
     @property
@@ -82,8 +83,7 @@ def _inconsistent_m(state: VehicleState, vision: PropagatedFix | None, sigmas: f
     if vision is None or receiver is None:
         return 0.0
     apart = _apart_m(receiver, (vision.latitude_deg, vision.longitude_deg))
-    claimed = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
-    accuracy = min(claimed, _LARGEST_SIGMA_M)
+    accuracy = VEHICLE_SENSORS.gnss_sigma_m(state.gps_h_accuracy_m, _LARGEST_SIGMA_M)
     speed = math.hypot(*vision.velocity_ned[:2])
     limit = sigmas * math.hypot(accuracy, vision.horizontal_sigma_m) + speed * _SPEED_SLACK_S
     return apart if apart > limit else 0.0
@@ -103,7 +103,7 @@ class GnssFault:
     from vision where that is the cause.
     """
 
-    cause: str
+    cause: GnssProblem
     proven: bool
     metres: float = 0.0
 
@@ -116,16 +116,16 @@ class GnssFault:
 def gnss_fault(
     state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
 ) -> GnssFault | None:
-    """Why GNSS is bad: lost, glitching, or away from vision by more than both errors; or None."""
+    """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; or None."""
     if not gnss_healthy(state, now_ns):
-        return GnssFault("GNSS lost", proven=True)
+        return GnssFault(GnssProblem.LOST, proven=True)
     glitch = mavlink.EKF_GPS_GLITCHING if state.autopilot == "ardupilot" else 0
     if state.ekf_flags & glitch:
-        return GnssFault("GNSS glitch", proven=True)
+        return GnssFault(GnssProblem.GLITCH, proven=True)
     apart = _inconsistent_m(state, vision, sigmas)
     if vision is None or not apart:
         return None
-    return GnssFault("GNSS off vision", _ekf_is_with_vision(state, vision), apart)
+    return GnssFault(GnssProblem.OFF_VISION, _ekf_is_with_vision(state, vision), apart)
 
 
 class SourceSwitch:
@@ -154,7 +154,7 @@ class SourceSwitch:
         self._was_chosen = self._overruled = False
 
     def met_in_flight(self) -> None:
-        """The flight controller has flown before it was heard: nobody says on which set."""
+        """The first heartbeat was of a vehicle in flight: its source set is unknown."""
         self.current = None
 
     def chosen(self, source_set: int) -> None:
@@ -201,7 +201,7 @@ class SourceSwitch:
         )
         self._bad_since_ns = None if fault is None else self._bad_since_ns or now_ns
         self._overruled = self._overruled and fault is not None
-        # As far as GNSS alone is asked: vision's word against it does not count once that is gone.
+        # Judged by GNSS alone: a contradiction with vision does not count once vision is gone.
         sound = fault is None or not fault.is_of_receiver
         self._sound_since_ns = (self._sound_since_ns or now_ns) if sound else None
         if self._vision_ns is None or (fresh and good):
@@ -224,16 +224,16 @@ class SourceSwitch:
         since = self._bad_since_ns
         if since is None or now_ns - since < self._config.bad_after_s * 1e9:
             return None
-        why = ""
-        if self._overruled:
-            why = f"set {self.current} chosen"
+        why: ChosenSet | SwitchRefusal | None = None
+        if self._overruled and self.current is not None:
+            why = ChosenSet(self.current)
         elif not fault.proven:
-            why = "EKF with GNSS"
+            why = SwitchRefusal.EKF_WITH_GNSS
         elif not may_switch:
-            why = "not ready"
+            why = SwitchRefusal.NOT_READY
         elif vision_good:
             return SwitchOrder(self._config.vision_set, fault.cause, fault.metres)
-        if why:
+        if why is not None:
             self.refusal = Alert(AlertId.SOURCE_SET_HELD, (fault.cause, fault.metres, why))
         return None
 
@@ -244,7 +244,7 @@ class SourceSwitch:
             return None
         agrees = self.returning.accepted and fault is None
         if agrees and self._config.return_to_gnss and self.current is not None:
-            return SwitchOrder(self._config.gnss_set, "GNSS good again")
+            return SwitchOrder(self._config.gnss_set, ReturnCause.GNSS_GOOD)
         if self._vision_ns is None or now_ns - self._vision_ns < _VISION_GONE_NS:
             return None
         since = self._sound_since_ns
@@ -256,7 +256,7 @@ class SourceSwitch:
         refused = self.returning.refusal is not None
         if refused or receiver is None or ekf is None or _apart_m(receiver, ekf) > _RETURN_M:
             return None
-        return SwitchOrder(self._config.gnss_set, "vision lost, GNSS good")
+        return SwitchOrder(self._config.gnss_set, ReturnCause.VISION_LOST)
 
 
 class SourceOrders:
@@ -296,8 +296,8 @@ class SourceOrders:
         return self._switch.returning.refusal is not None
 
     def met(self, state: VehicleState) -> None:
-        """The vehicle is heard. An ArduPilot that was in the air before this process (it died, and
-        began anew) may be on any set; one on the ground has begun with its first.
+        """The first message of the vehicle. An ArduPilot in flight may be on any source set (this
+        process was restarted); on the ground it has started with its first.
         """
         if self._has_met:
             return

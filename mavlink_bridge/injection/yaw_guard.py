@@ -18,13 +18,13 @@ from collections import deque
 from dataclasses import dataclass
 
 from mavlink_bridge.config import YawGuardConfig
-from mavlink_bridge.messages import Attitude
+from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import wrap_pi
+from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
 _BASELINE_NS = 1_000_000_000
 _RELEASE_SHARE = 0.7
 _BLIND_AFTER = 20  # fixes in a row
-_DRIFT_RAD_PER_S = math.radians(0.3)  # of the gyros while no fix is seen
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class YawGuard:
         # (time, vision minus gyro heading, vision minus autopilot)
         self._accepted: deque[tuple[int, float, float]] = deque(maxlen=256)
         self._last: deque[bool] = deque(maxlen=config.minimum_samples)
+        self._reset_count = 0  # of the fix before
         self.blocked = False
         self.unchecked = 0
         self._unchecked_in_a_row = 0
@@ -64,20 +65,13 @@ class YawGuard:
         self._last.clear()
         self.blocked = False
 
-    def check(
-        self,
-        time_ns: int,
-        vision_yaw_rad: float | None,
-        autopilot: Attitude | None,
-        *,
-        reset: bool = False,
-    ) -> YawVerdict:
-        """Judge one fix; without a yaw on either side it follows the standing verdict.
-
-        reset: the localizer itself says that its estimate jumps with this fix.
-        """
+    def check(self, fix: VisionFix, autopilot: Attitude | None) -> YawVerdict:
+        """Judge one fix; without a yaw on either side it follows the standing verdict."""
         if not self._config.enabled:
             return YawVerdict(True, None)
+        time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad
+        reset = fix.reset_count != self._reset_count
+        self._reset_count = fix.reset_count
         if autopilot is None or vision_yaw_rad is None:
             self.unchecked += 1
             self._unchecked_in_a_row += 1
@@ -118,7 +112,7 @@ class YawGuard:
             return near
         recent = [entry for entry in self._accepted if newest_ns - entry[0] <= _BASELINE_NS]
         turned = abs(statistics.median(wrap_pi(to_gyros - entry[1]) for entry in recent))
-        if turned <= min(limit + _DRIFT_RAD_PER_S * gap_s, gross):
+        if turned <= min(limit + VEHICLE_SENSORS.gyro_drift_radps * gap_s, gross):
             return True
         # The gyro heading suffers where ATTITUDE was lost in a turn; the autopilot's yaw does not.
         against = abs(statistics.median(wrap_pi(difference - entry[2]) for entry in recent))

@@ -38,7 +38,7 @@ def monotonic_ns() -> int:
 
 
 def boot_id() -> str:
-    """Of this computer's present run: CLOCK_MONOTONIC begins anew with each. Empty: not known."""
+    """Of this computer's present run: CLOCK_MONOTONIC restarts with each. Empty: not known."""
     try:
         return _BOOT.read_text(encoding="ascii").strip()
     except OSError:
@@ -116,7 +116,7 @@ class _StampRun:
         return self._count > 0
 
     def add(self, boot_ns: int) -> None:
-        """One more; a stamp before the last one begins anew."""
+        """Add a stamp; one before the last starts a new series."""
         self._count = self._count + 1 if boot_ns >= self._last_ns else 1
         self._last_ns = boot_ns
 
@@ -226,7 +226,7 @@ class BootClock:
         return wrong
 
     def _ran_back(self, boot_ns: int, received_ns: int) -> bool:
-        """Whether boot time began anew: several stamps in a row, each after the one before.
+        """Whether boot time restarted: several stamps in a row, each after the one before.
 
         One alone may be an old frame that was duplicated or came late.
         """

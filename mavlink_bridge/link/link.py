@@ -71,7 +71,7 @@ class LinkCounters:
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """What a link is told beyond its endpoint. name: of its thread and its counters. wanted: ids of
+    """Settings of a link besides its endpoint. name: of its thread and its counters. wanted: ids of
     messages, None for all. opener: of its transport. recorder: of what passes.
 
     signing_key: 32 bytes, None without signing; window: what outlives a restart of the time stamps
@@ -155,7 +155,7 @@ class Link:
 
     @property
     def stranger(self) -> str:
-        """UDP: the address of another than the peer, who spoke last and was not heard; or empty."""
+        """UDP: the newest sender other than the peer, whose datagrams are dropped; or empty."""
         transport = self._transport
         return transport.stranger if isinstance(transport, UdpTransport) else ""
 

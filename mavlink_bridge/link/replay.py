@@ -30,7 +30,7 @@ class ReplayWindow:
     What is written is 2 s ahead of what was seen, so that a second's messages need one write and
     none of them can be repeated after a kill. After a start our own stamps begin beyond it, and a
     peer that does not know the time follows them. A thread of its own writes: the disk cannot stop
-    a link. A file that is lost or damaged is told in the log and begun anew.
+    a link. A file that is lost or damaged is reported in the log and restarted.
     """
 
     def __init__(self, path: Path) -> None:
@@ -59,7 +59,7 @@ class ReplayWindow:
         self._due.set()
 
     def close(self) -> None:
-        """Write what is left and end; at most about two seconds on a disk that stands still."""
+        """Write what is left and end; at most about two seconds on a disk that does not respond."""
         self._closing = True
         self._due.set()
         self._thread.join(2.0)

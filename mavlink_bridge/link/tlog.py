@@ -106,7 +106,7 @@ class TlogRecorder:
         self._waiting.append((time_us, frame))
 
     def close(self) -> None:
-        """Write what waits and close the file; a disk that stands still is left behind."""
+        """Write what waits and close the file; a disk that does not respond is left behind."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(_CLOSE_S)

@@ -36,7 +36,7 @@ _HEARD = frozenset(
 
 
 class _Speaker:
-    """The handler of one link: says the line once it knows as whom. told: when it has."""
+    """The handler of one link: sends the alert once it knows the system id, then sets `told`."""
 
     def __init__(self, message: Any, component: int, system: int | None, *, hears: bool) -> None:
         self.told = threading.Event()

@@ -21,7 +21,7 @@ _AGAIN_NS = 10_000_000_000
 
 
 class OriginExchange:
-    """Lets the keeper speak, and gives what it knows to the tracker; one thread."""
+    """Exchanges the EKF origin over the link and passes it to the tracker; one thread."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class OriginExchange:
         return self._keeper.origin
 
     def on_message(self, message: Any, time_ns: int) -> None:
-        """GPS_GLOBAL_ORIGIN (49) came. The same news is told once in ten seconds."""
+        """GPS_GLOBAL_ORIGIN (49) came. The same alert is reported once in ten seconds."""
         armed = self._tracker.snapshot(time_ns).armed
         news = self._keeper.on_origin(message, armed=armed)
         moved_m = self._keeper.moved_m

@@ -1,4 +1,4 @@
-"""Whether the flight controller is there, told once by whichever link notices first."""
+"""Reports that the flight controller is found, lost or back; the first link to notice does."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NEWS = {
 
 
 class VehicleWatch:
-    """Every link asks with each tick: the flight controller's own may be waiting to reconnect.
+    """Every link calls `check` with each tick: the flight controller's own may be reconnecting.
 
     report: tell the operator. first: called after the first of these alerts.
     clock: CLOCK_MONOTONIC, ns.
@@ -40,7 +40,7 @@ class VehicleWatch:
         self._known = "nothing"
 
     def check(self, state: VehicleState) -> None:
-        """Tell what changed since the last call."""
+        """Report what changed since the last call."""
         now_ns = self._clock()
         with self._lock:
             before, self._begun_ns = self._known, self._begun_ns or now_ns
@@ -58,7 +58,7 @@ class VehicleWatch:
 
 
 class DuplicateSystemIdMonitor:
-    """Notices two vehicles of the same ids on one link: boot time runs back again and again."""
+    """Detects two vehicles with the same ids on one link: boot time runs back repeatedly."""
 
     def __init__(self) -> None:
         self._begun_ns = 0

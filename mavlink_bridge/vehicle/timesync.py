@@ -24,7 +24,7 @@ _UNANSWERED_NS = 15_000_000_000
 class TimeSync:
     """Asks for the vehicle's clock at 1 Hz and gives each answer to the tracker; one thread.
 
-    That answers have stopped is told.
+    Reports when the answers stop.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Others on the link who mean a wiring or a start by mistake: a second vehicle, a second us."""
+"""Detects a second vehicle, a second companion and other senders: wrong wiring, or forgery."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -20,7 +21,7 @@ _LIES = 3  # of TIMESYNC, which is asked once a second
 
 
 class UnexpectedSenderMonitor:
-    """Tells the operator of them, once each; one thread."""
+    """Reports each once; one thread."""
 
     def __init__(
         self,
@@ -57,7 +58,8 @@ class UnexpectedSenderMonitor:
     def check(self, link: Link, now_ns: int) -> None:
         """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
         if link.stranger:
-            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=link.stranger))
+            ignored = alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
+            self._teller.tell("foreign", ignored)
         others = self._tracker.other_gimbals
         if others and not self._config.camera.gimbal_component:
             component, device = others[0]
@@ -72,7 +74,7 @@ class UnexpectedSenderMonitor:
             self._teller.tell("twins", twins)
 
     def _check_answers(self, now: int, now_ns: int) -> None:
-        """Answers to TIMESYNC of quite another time than the vehicle's stamps are another's."""
+        """TIMESYNC answers far from the vehicle's own time stamps come from another sender."""
         lies, since_ns = self._lies
         if now - lies >= _LIES:
             self._teller.tell("answers", alert(AlertId.TIMESYNC_CONTRADICTS))
@@ -80,7 +82,7 @@ class UnexpectedSenderMonitor:
             self._lies = (now, now_ns)
 
     def _check_arming(self, link: Link, now_ns: int) -> None:
-        """Forged heartbeats of the autopilot's ids: what is shut while armed stays shut then."""
+        """Heartbeats that alternate between armed and disarmed are forged."""
         turns, since_ns = self._turns
         now = self._tracker.arming.turns
         if now - turns >= _TURNS:

@@ -20,6 +20,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import VisionFix
+from mavlink_bridge import quaternion as quat
 from sitl.embedded.physics.rotation import matrix, quaternion
 from sitl.geodesy import Location
 from sitl.ground.connection import silence
@@ -143,7 +144,7 @@ class BridgeFeed:
     ) -> None:
         self.pilot = pilot
         self._sink, self._home, self._geoid_m = sink, home, geoid_m
-        self._model, self._reset = model, False
+        self._model, self._resets = model, 0
         self._hung: Truth | None = None
         self._left: Vector | None = None  # where the map ended
         self._observer = Observer(seed)
@@ -153,9 +154,9 @@ class BridgeFeed:
         self._thread.start()
 
     def change(self, model: FixModel, *, reset: bool = False) -> None:
-        """Another model from now on; reset: its first fix carries an announced jump."""
+        """Another model from now on; reset: its fixes have another reset count."""
         with self._lock:
-            self._model, self._reset = model, self._reset or reset
+            self._model, self._resets = model, self._resets + reset
 
     def close(self) -> None:
         """End the thread."""
@@ -177,7 +178,7 @@ class BridgeFeed:
 
     def _fix(self, truth: Truth) -> VisionFix:
         with self._lock:
-            model, reset, self._reset = self._model, self._reset, False
+            model, resets = self._model, self._resets
         self._hung = (self._hung or truth) if model.frozen else None
         shown, seen_as = truth, model
         if self._hung is not None:
@@ -197,10 +198,10 @@ class BridgeFeed:
             where.latitude_deg,
             where.longitude_deg,
             where.altitude_m + self._geoid_m,
-            *seen.roll_pitch_yaw,
+            quat.from_euler(*seen.roll_pitch_yaw),
             np.eye(3) * variance,
             math.radians(model.attitude_sigma_deg),
-            reset=reset,
+            reset_count=resets,
             velocity_ned=None if measured is None else seen.velocity_ned,
             velocity_sigma_mps=measured or 0.3,
             by_odometry=self._left is not None,

@@ -69,13 +69,12 @@ def test_fix_of_the_prior_is_the_vehicle_again(seed):
         prior.world_from_camera, prior.covariance, 0.9, TrackingState.TRACKING,
         RegistrationStatus.OK, True, 5, 1, Camera.from_fov(640, 480, 60),
     )  # fmt: skip
-    fix = vision_fix(estimate, INSTALLATION, attitude, gimbal, reset=False)
+    fix = vision_fix(estimate, INSTALLATION, attitude, gimbal, 0)
     seen = FRAME.enu_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height_m)
     true = FRAME.enu_from_geodetic(vehicle.latitude_deg, vehicle.longitude_deg, vehicle.height_m)
     np.testing.assert_allclose(seen, true, atol=1e-6)
-    angles = (fix.roll_rad, fix.pitch_rad, fix.yaw_rad)
-    expected = (attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    np.testing.assert_allclose(angles, expected, atol=1e-6)  # NED 0.5 m apart
+    same = abs(np.dot(fix.quaternion, attitude.quaternion))
+    np.testing.assert_allclose(same, 1.0, atol=1e-12)
     np.testing.assert_allclose(np.trace(fix.position_covariance_ned), 75.0)
     assert fix.quality == 90
 
@@ -86,12 +85,13 @@ def test_without_the_gimbal_the_attitude_is_unknown_not_guessed():
         prior.world_from_camera, prior.covariance, 0.9, TrackingState.TRACKING,
         RegistrationStatus.OK, True, 5, 1, Camera.from_fov(640, 480, 60),
     )  # fmt: skip
-    fix = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), None, reset=True)
+    fix = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), None, 3)
+    assert fix.quaternion is None
     assert fix.yaw_rad is None
-    assert fix.reset
+    assert fix.reset_count == 3
     # It is the camera's place that is told for the vehicle's: off by the lever arm, no one knows
     # which way, and within its covariance.
-    known = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), _gimbal(-1.5, 0), reset=True)
+    known = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), _gimbal(-1.5, 0), 3)
     wider = fix.position_covariance_ned - known.position_covariance_ned
     np.testing.assert_allclose(wider, np.eye(3) * (LEVER @ LEVER), atol=1e-9)
 

@@ -26,6 +26,8 @@ from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import alert_of
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
@@ -146,7 +148,8 @@ def test_the_ekf_is_where_my_fixes_say(kind: Any, run: Callable[..., Example]) -
             pilot.link.close()
     assert example.end() == 0
     # With the interlock: "injecting without shadow check", where there is no GNSS to check against.
-    assert any(line.startswith("PiLoT: injecting") for line in example.lines)
+    read = [alert_of(line) for line in example.lines]
+    assert (AlertId.INJECTING, True) in read or (AlertId.INJECTION_UNCHECKED, True) in read
     # The line that is no fix was told, and it was the only one.
     refused = [line for line in example.lines if line.startswith("not a fix")]
     assert len(refused) == 1

@@ -113,7 +113,7 @@ class Flight:
         self.ekf_north_m = 0.0
         self.gnss_north_m: float | None = None  # None: no receiver
         self.armed = False
-        self.reset_next = False
+        self.reset_count = 0
         self.latency_ms = 50
         self.answers_timesync = True
         self.sees = True
@@ -165,19 +165,17 @@ class Flight:
         return [(t, m) for t, m, _ in self.link.sent if m.get_type() in kinds and t > since_ns]
 
     def _fix(self, exposure_ns: int) -> None:
+        yaw = self.yaw(exposure_ns) + self.yaw_error_rad
         fix = VisionFix(
             exposure_ns,
             HOME[0] + self.north_m * METRE,
             HOME[1],
             988.0 + GEOID,
-            0.0,
-            0.0,
-            self.yaw(exposure_ns) + self.yaw_error_rad if self.yaw_is_seen else None,
+            quat.from_euler(0.0, 0.0, yaw) if self.yaw_is_seen else None,
             np.eye(3) * 0.04,
-            reset=self.reset_next,
+            reset_count=self.reset_count,
         )
-        self.reset_next = False
-        self.end.sender.fixes.put(fix)
+        self.end.sender.put(fix)
 
     def _vehicle(self, step: int) -> None:
         boot_ms = self.boot_ns(self.now_ns) // MS

@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import SenderRefusal
 from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig, SigningConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
@@ -171,7 +172,7 @@ def test_orders_of_other_systems_are_denied_and_told_once(
         assert orders.command(66, command, component) == [mavlink.MAV_RESULT_DENIED]
     assert not orders.enable.open
     told = orders.flight.told(AlertId.SENDER_REFUSED)
-    assert told == [alert(AlertId.SENDER_REFUSED, system=66, why="not allowed")]
+    assert told == [alert(AlertId.SENDER_REFUSED, system=66, why=SenderRefusal.NOT_ALLOWED)]
     assert orders.command(66, mavlink.MAV_CMD_REQUEST_MESSAGE, 100) != []  # a question
 
 
@@ -192,7 +193,7 @@ def test_with_signing_an_unsigned_ground_link_gives_no_orders(
     orders = Orders(monkeypatch, signing=signing, ground_connection="udpout:127.0.0.1:1")
     orders.flight.end.components = Components(orders.flight.shared, ground=True)
     assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_DENIED]
-    refused = alert(AlertId.SENDER_REFUSED, system=255, why="not signed")
+    refused = alert(AlertId.SENDER_REFUSED, system=255, why=SenderRefusal.NOT_SIGNED)
     assert refused in orders.flight.alerts
     assert not orders.enable.open
 

@@ -25,9 +25,9 @@ from mavlink_bridge.components import COMMANDS_IN
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, InjectionMessage
 from mavlink_bridge.errors import FixError
 from mavlink_bridge.flight_controller import FC_WANTED
+from mavlink_bridge.injection.encode import InjectionContext
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import CameraView, Origin, TargetReport, VisionFix
 from mavlink_bridge.place_hint import PLACE_HINT
@@ -303,7 +303,12 @@ _COMMANDS = (
 # --- what goes in on our own side --------------------------------------------------------------
 
 FIX = VisionFix(
-    SECOND, *HOME, 500.0, 0.0, 0.0, 0.0, velocity_ned=(0.0, 0.0, 0.0), protection_m=(1.0, 1.0)
+    SECOND,
+    *HOME,
+    500.0,
+    (1.0, 0.0, 0.0, 0.0),
+    velocity_ned=(0.0, 0.0, 0.0),
+    protection_m=(1.0, 1.0),
 )
 TARGET = TargetReport(
     SECOND, *HOME, 500.0, (0.0, 0.0, 0.0), 1.0, 1.0, (0.5, 0.5), 1, 0.1, (0.1, 0.1, 0.2, 0.2), 0.5

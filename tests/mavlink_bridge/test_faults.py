@@ -13,13 +13,12 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import TargetReport, VisionFix
+from mavlink_bridge import TargetReport
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.ground import GroundEnd
-from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
@@ -47,7 +46,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     assert before.reset_counter == 0
     flight.link.open = False
     flight.run(100.0)
-    flight.north_m, flight.ekf_north_m, flight.reset_next = 25.0, 25.0, True
+    flight.north_m, flight.ekf_north_m, flight.reset_count = 25.0, 25.0, 1
     flight.run(200.0)
     lost_ns = flight.now_ns
     assert max(flight.waiting().values()) <= 256
@@ -171,8 +170,8 @@ def test_step_of_our_wall_clock_is_in_no_stamp(
 
 def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
     for i in range(300):
-        flight.north_m, flight.reset_next = float(i % 7), True
-        flight.run(0.5)
+        flight.north_m, flight.reset_count = float(i % 7), i + 1
+        flight.run(0.3)
     messages = [m for _, m in flight.vision()]
     counters = [m.reset_counter for m in messages]
     assert max(counters) == 255
@@ -180,17 +179,6 @@ def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
     jumps = [(a, b) for a, b in itertools.pairwise(messages) if abs(a.x - b.x) > 0.5]
     assert len(jumps) > 290
     assert all((a.reset_counter + 1) % 256 == b.reset_counter for a, b in jumps)
-
-
-def test_jump_is_not_lost_with_the_fix_that_carried_it() -> None:
-    queue = FixQueue(4)
-    for i in range(10):
-        queue.put(VisionFix(i + 1, *HOME, 500.0, reset=i == 2))
-    fixes = queue.take()
-    assert [f.time_ns for f in fixes] == [7, 8, 9, 10]
-    assert [f.reset for f in fixes] == [True, False, False, False]
-    assert queue.dropped == 6
-    assert queue.take() == []
 
 
 def test_no_position_from_an_origin_on_another_continent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -399,10 +387,10 @@ def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(
     """
     killed = Flight(monkeypatch)
     for _ in range(jumps):
-        killed.reset_next = True
+        killed.reset_count += 1
         killed.run(8.0)
     again = Flight(monkeypatch)
-    again.armed = again.reset_next = True
+    again.armed, again.reset_count = True, 1
     again.north_m = again.ekf_north_m = 8.0
     again.run(15.0)
     seen = [m.reset_counter for _, m in (*killed.vision()[-1:], *again.vision())]
@@ -424,7 +412,7 @@ def test_a_jump_that_the_ekf_missed_is_announced_again(
 
     taken_at: the value of the counter at which this one takes it; None: never.
     """
-    flight.north_m, flight.reset_next = 10.0, True
+    flight.north_m, flight.reset_count = 10.0, 1
     for _ in range(200):
         flight.run(0.1)
         counters = {m.reset_counter for _, m in flight.vision()}

@@ -393,7 +393,7 @@ def test_no_flood_of_clicks_ends_the_targets_that_are_followed(flight: Flight) -
 def test_a_line_repeated_at_once_is_told_once_and_on_after_off_is_told() -> None:
     told: list[Alert] = []
     status = OperatorStatus(lambda *_: None, told.append)
-    refused = alert(AlertId.LOOK_AT_REFUSED, why="no target 3")
+    refused = alert(AlertId.LOOK_AT_NO_TARGET, number=3)
     for hundredth in range(250):
         status.report(refused, hundredth * 10 * MS)
     assert told == [refused] * 3

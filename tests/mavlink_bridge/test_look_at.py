@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, BridgeConfig, TargetReport
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CommandAnswer, LookAtRefusal
 from mavlink_bridge.camera.look_at import LOOK_AHEAD, LOOK_AT_PLACE, LOOK_AT_TARGET, LookAt
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.link.link import sleep_until
@@ -73,7 +74,7 @@ def test_a_place_is_sent_once_and_a_wrong_one_is_refused_with_a_word():
     nan = math.nan
     wrong = [station.command(LOOK_AT_PLACE, 0, 0, 0, 0, nan, 8.0, 1.0), station.place(0.0, 0.0)]
     assert [*wrong, station.place(95.0), station.place(frame=8)] == [DENIED] * 4
-    assert station.said == [alert(AlertId.LOOK_AT_REFUSED, why="no place on Earth")] * 4
+    assert station.said == [alert(AlertId.LOOK_AT_REFUSED, why=LookAtRefusal.NO_PLACE)] * 4
     assert station.command(LOOK_AHEAD) == OK
     ahead = station.look.due(30 * SECOND)
     assert ahead is not None
@@ -114,7 +115,7 @@ def test_an_autopilot_that_refuses_or_does_not_answer_is_told():
     assert station.look.due(10 * SECOND) is not None
     assert station.look.due(14 * SECOND) is None
     assert station.said == [
-        alert(AlertId.LOOK_AT_DENIED, result="unsupported"),
+        alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.UNSUPPORTED),
         alert(AlertId.LOOK_AT_UNANSWERED),
     ]
 
@@ -140,7 +141,7 @@ def test_a_stations_command_reaches_the_autopilot_through_the_bridge(autopilot):
             LOOK_AT_PLACE, mavlink.MAV_RESULT_FAILED, 0, 0, 1, 191
         )
         autopilot.send(refused)
-        news = alert(AlertId.LOOK_AT_DENIED, result="failed")
+        news = alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.FAILED)
         assert sleep_until(lambda: news in bridge.alerts(), 30.0)
 
 

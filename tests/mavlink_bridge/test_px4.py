@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.injection.encode import InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin
 from mavlink_bridge.preflight.doctor import check_parameters
@@ -70,9 +70,7 @@ def injected(kind: Any, sent_ns: int = 10 * SECOND + 80 * MS) -> Any:
             HOME[0] + math.degrees(100.0 / 6371000.0),  # on PX4's sphere
             HOME[1],
             488.0 + 60.0 + GEOID,
-            0.0,
-            0.0,
-            YAW,
+            from_euler(0.0, 0.0, YAW),
             P,
             attitude_sigma_rad=0.03,
             quality=77,

@@ -42,7 +42,7 @@ NORTH, EAST, DOWN, HEADING = 3.0, 4.0, -2.0, 60.0
 COURSE = math.degrees(math.atan2(EAST, NORTH))
 EXPOSURE_S, NOW_S, UPTIME_S = 1000.0, 1000.2, 77.0
 WEEK_S = 345_600.5
-NOSE = (0.0, 0.0, math.radians(HEADING))
+NOSE = quat.from_euler(0.0, 0.0, math.radians(HEADING))
 
 
 def scaled(kind: Any, field: str, value: float) -> float:

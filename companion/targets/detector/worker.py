@@ -1,7 +1,7 @@
 """The detector at work: at most `rate_hz` pictures a second, on a thread of its own.
 
 It looks at a picture only when its pose is known, never at two at once, and rests after each, so
-that it takes no more than a share of one processor. What goes wrong is counted and told once.
+that it takes no more than a share of one processor. What goes wrong is counted and reported once.
 """
 
 from __future__ import annotations

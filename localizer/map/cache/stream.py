@@ -163,7 +163,7 @@ class TileStreamer:
             return self._waiting and not (self._nodes.evicted or self._to_load())
 
     def close(self) -> None:
-        """Stop the loader thread and drop all tiles; a disk that stands still is left behind."""
+        """Stop the loader thread, unless its disk does not respond, and drop all tiles."""
         with self._lock:
             self._closed = True
             self._lock.notify_all()

@@ -37,7 +37,7 @@ _DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "IMA
 _SENSOR_TAGS = ("SATELLITEID", "SENSOR", "SENSOR_ID", "PLATFORM")
 _MAX_SIDECAR_BYTES = 16 << 20
 # What sidecar files may name is not fetched: no address of the network is one of these. Vertical
-# keys of GeoTIFF 1.0 are told only when they are asked for.
+# keys of GeoTIFF 1.0 are reported only when they are asked for.
 _GDAL_OPTIONS = {
     "GTIFF_REPORT_COMPD_CS": "YES",
     "CPL_VSIL_CURL_ALLOWED_FILENAME": "/vsicurl/none",

@@ -234,7 +234,7 @@ class _Reader:
         self.warnings.append(f"{path.name}: {said}, read as 1.0")
 
     def _corners(self, volume: Any, T: Array, path: Path) -> Array | None:
-        """See `_corners`; a region in degrees is told, and read as meant."""
+        """See `_corners`; a region in degrees is reported, and read as meant."""
         region: Any = volume.get("region") if isinstance(volume, dict) else None
         if _is_in_degrees(region):
             self.warnings.append(

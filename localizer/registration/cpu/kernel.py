@@ -243,8 +243,8 @@ def refine_kernel(channels: int) -> Callable[..., int]:
     """The compiled kernel for feature maps of `channels` channels.
 
     It closes over the number alone: numba's cache on disk tells closures apart by their pickled
-    variables, and a compiled function among them is pickled with a number of its process's own, so
-    that the kernel would be compiled anew in every process. The functions that need the number as a
+    variables. A compiled function among them is pickled with a number of its process, so the
+    kernel would be compiled in every process again. The functions that need the number as a
     constant are inlined instead.
     """
     C = channels

@@ -171,7 +171,7 @@ class Baker:
 
     def _albedo(self, region: NDArray[np.uint16], west: float, north: float, light: WindowLight
                 ) -> Float32:  # fmt: skip
-        """Colours (n, n, 3) of a block's ground, 0 to 255, with what grew anew at this visit."""
+        """Colours (n, n, 3) of a block's ground, 0 to 255, with what grew again at this visit."""
         albedo = self._painted(region, west, north, light, np.zeros(2))
         changes = self.scene.visit.changes
         if changes is None or not changes.regrown:

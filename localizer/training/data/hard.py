@@ -15,7 +15,7 @@ State = dict[str, list[list[object]]]
 class HardShare:
     """share: of the samples, drawn from hard pairs; ranks: which pairs are hard, as shares of all
     that were seen, the worst first (the very worst often show nothing that could be matched);
-    every_steps: how often the list is made anew.
+    every_steps: how often the list is made again.
     """
 
     share: float

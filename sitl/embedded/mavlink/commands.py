@@ -179,8 +179,9 @@ class Commands:
             self._vehicle.use_source(position)
 
     def _data_stream(self, link: SerialPort, message: Any) -> None:
-        """REQUEST_DATA_STREAM, the old way: the attitude and position groups."""
+        """REQUEST_DATA_STREAM, the old way: the groups of status, attitude and position."""
         groups = {
+            2: (mavlink.MAVLINK_MSG_ID_SYS_STATUS,),
             6: (
                 mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
                 mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,

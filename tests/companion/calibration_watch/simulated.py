@@ -13,7 +13,7 @@ from companion.calibration_watch.config import CalibrationLimits
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.integrity_monitor.inertial import InertialTrack
+from companion.inertial import InertialTrack
 from localizer.geometry.pose import matrix_from_euler, so3_exp
 from localizer.sensors.error_model import GRAVITY_MPS2
 from mavlink_bridge import quaternion as quat

@@ -8,6 +8,8 @@ import numpy as np
 
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from localizer.map.cache.cache import TileCache
+from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.ids import AlertId
 from tests.companion.console.companion_flying import CAMERA, HEIGHT_M
 
 S = 1_000_000_000
@@ -37,7 +39,7 @@ def write_record(folder, map_path):
     )  # fmt: skip
     target = {"exposure_time_ns": 12 * S, "target_id": "car"} | at
     write_rows(folder / "targets.csv", TARGET_COLUMNS, [target])
-    event = {"time_ns": 25 * S, "level": "warning", "text": "PiLoT: lost"}
+    event = {"time_ns": 25 * S, "level": "warning", "text": text(alert(AlertId.LOST, seconds=9.0))}
     write_rows(folder / "events.csv", EVENT_COLUMNS, [event])
     image = np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
     cv2.imwrite(str(folder / "snapshots" / f"{10 * S}.jpg"), image)

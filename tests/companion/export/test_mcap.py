@@ -78,7 +78,7 @@ def flight(tmp_path, small_assets):
         recorder.target(
             TargetFix("car", np.array([20.0, 5.0, 1.0]), np.eye(3), (3.0, 4.0), later_ns)
         )
-        recorder.event("warning", "PiLoT: withheld")
+        recorder.event("warning", "no fixes")
         recorder.text(4, "EKF3 lane switch 1", "1/1")
         recorder.snapshot(Frame(np.full((48, 64, 3), 90, np.uint8), BEGIN_NS, camera, 0))
         if close:
@@ -139,7 +139,7 @@ def test_a_record_is_what_foxglove_expects(flight, small_assets):
     ((schema, _, event),) = messages["/events"]
     assert (schema, event.message, event.level) == (
         "foxglove.Log",
-        "PiLoT: withheld",
+        "no fixes",
         event.WARNING,
     )
     assert attached == ["record.json"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.calibration_watch.observation import CalibrationObservation
-from companion.conversions import CameraExtrinsics
+from companion.conversions import CameraExtrinsics, vision_fix
 from companion.flight.calibration_observer import CalibrationObserver, middle_depth_m
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -18,33 +18,34 @@ from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
 DOWN = np.diag([1.0, -1.0, -1.0])  # a camera straight down whose top is north, in ENU
-BRIDGE: Any = SimpleNamespace(attitude_at=lambda _: None, gimbal_at=lambda _: None)
+EXTRINSICS = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
 
 
 def bundle(depth: np.ndarray) -> Any:
     return SimpleNamespace(view=SimpleNamespace(depth=depth))
 
 
-def estimate(time_s: float, *, accepted: bool = True, state: str = "TRACKING") -> PoseEstimate:
+def estimate(time_s: float, *, state: str = "TRACKING") -> PoseEstimate:
     pose = Pose(DOWN, np.array([0.0, 0.0, 80.0]))
     return PoseEstimate(
-        pose, np.eye(6) * 0.04, 1.0, TrackingState[state], RegistrationStatus.OK, accepted,
+        pose, np.eye(6) * 0.04, 1.0, TrackingState[state], RegistrationStatus.OK, True,
         round(time_s * 1e9), 0, Camera.from_fov(640, 480, 60),
     )  # fmt: skip
 
 
 def test_four_a_second_of_what_the_map_confirmed() -> None:
     taken: list[CalibrationObservation] = []
-    sightings = CalibrationObserver(
-        BRIDGE, CameraExtrinsics(FRAME, 47.0, np.zeros(3)), taken.append
-    )
+    observer = CalibrationObserver(EXTRINSICS, taken.append)
+
+    def see(seen: PoseEstimate, depth: np.ndarray) -> None:
+        observer.add_fix(seen, bundle(depth), vision_fix(seen, EXTRINSICS, None, None, 1))
+
     depth = np.full((240, 320), 80.0, np.float32)
     for tenth in range(1, 21):
-        sightings.add_estimate(estimate(0.1 * tenth), bundle(depth))
+        see(estimate(0.1 * tenth), depth)
     assert 6 <= len(taken) <= 8
-    sightings.add_estimate(estimate(5.0, accepted=False), bundle(depth))
-    sightings.add_estimate(estimate(6.0, state="BRIDGING"), bundle(depth))
-    sightings.add_estimate(estimate(7.0), bundle(np.zeros((240, 320), np.float32)))
+    see(estimate(6.0, state="BRIDGING"), depth)
+    see(estimate(7.0), np.zeros((240, 320), np.float32))
     assert taken[-1].time_ns < 5e9
     one = taken[0]
     assert one.place == pytest.approx((47.0, 8.0, 580.0), abs=1e-6)

@@ -16,6 +16,7 @@ from companion.conversions import CameraExtrinsics
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly, BuildContext, Component
 from companion.flight.injection import FixInjection
+from companion.inertial import InertialTrack
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge.bridge import Bridge
 
@@ -35,8 +36,8 @@ def test_the_guardian_is_made_of_a_deployment_in_a_folder_whose_name_is_no_utf8(
     record = {"folder": "record"}
     deployment.write_text(yaml.safe_dump({"map": "m", "camera": camera, "record": record}))
     stand_ins = {
-        Bridge: object(), CameraExtrinsics: object(),
-        FixInjection: SimpleNamespace(add_judge=lambda _: None),
+        Bridge: object(), CameraExtrinsics: object(), InertialTrack: object(),
+        FixInjection: SimpleNamespace(add_judge=lambda _: None, add_observer=lambda _: None),
     }  # fmt: skip
     parts: list[Component[Any]] = [
         Component(kind.__name__, kind, partial(_given, one)) for kind, one in stand_ins.items()

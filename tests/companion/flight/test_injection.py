@@ -47,21 +47,21 @@ def _estimate(state, accepted=True):
 
 
 @pytest.mark.parametrize(
-    ("states", "resets"),
+    ("states", "counts"),
     [
-        ((INITIALIZING, TRACKING, TRACKING), [True, False]),
-        ((TRACKING, DEGRADED, TRACKING), [True, False]),  # it kept the filter's track
-        ((TRACKING, LOST, INITIALIZING, TRACKING, TRACKING), [True, True, False]),
+        ((INITIALIZING, TRACKING, TRACKING), [1, 1]),
+        ((TRACKING, DEGRADED, TRACKING), [1, 1]),  # it kept the filter's track
+        ((TRACKING, LOST, LOST, INITIALIZING, TRACKING, TRACKING), [1, 2, 2]),
         # What odometry drifted by ends where the map is found again.
-        ((TRACKING, BRIDGING, BRIDGING, TRACKING, TRACKING), [True, False, False, True, False]),
+        ((TRACKING, BRIDGING, BRIDGING, TRACKING, TRACKING), [1, 1, 1, 2, 2]),
     ],
 )
-def test_only_a_new_start_carries_a_jump(states, resets):
+def test_only_a_new_start_is_a_jump(states, counts):
     bridge = FakeBridge()
     injection = FixInjection(bridge, INSTALLATION)
     for state in states:
         injection.add_estimate(_estimate(state), None)
-    assert [fix.reset for fix in bridge.fixes] == resets
+    assert [fix.reset_count for fix in bridge.fixes] == counts
 
 
 def test_what_is_rejected_or_unconfirmed_is_not_injected():
@@ -73,8 +73,8 @@ def test_what_is_rejected_or_unconfirmed_is_not_injected():
     assert bridge.fixes == []
 
 
-def test_a_jump_survives_the_fix_that_a_judge_withholds():
-    bridge, verdicts = FakeBridge(), iter([None, "wider", "as it is"])
+def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made():
+    bridge, seen, verdicts = FakeBridge(), [], iter([None, "wider", "as it is"])
     injection = FixInjection(bridge, INSTALLATION)
 
     def judge(estimate, fix):
@@ -84,21 +84,20 @@ def test_a_jump_survives_the_fix_that_a_judge_withholds():
         return fix if verdict else None
 
     injection.add_judge(judge)
+    injection.add_observer(lambda _estimate, _bundle, fix: seen.append(fix))
     for _ in range(3):
         injection.add_estimate(_estimate(TRACKING), None)
-    assert [fix.reset for fix in bridge.fixes] == [True, False]
     widths = [fix.position_covariance_ned[0, 0] for fix in bridge.fixes]
     assert widths == pytest.approx([4e-4, 1e-4])
+    assert [fix.position_covariance_ned[0, 0] for fix in seen] == pytest.approx([1e-4] * 3)
 
 
-def test_a_withheld_position_is_handed_on_and_does_not_carry_the_jump():
-    bridge, withholds = FakeBridge(), iter([True, False])
+def test_a_fix_of_the_odometry_says_so():
+    bridge = FakeBridge()
     injection = FixInjection(bridge, INSTALLATION)
-    injection.add_judge(lambda _, fix: replace(fix, position_withheld=next(withholds)))
-    for state in (BRIDGING, TRACKING):
+    for state in (TRACKING, BRIDGING):
         injection.add_estimate(_estimate(state), None)
-    told = [(fix.by_odometry, fix.position_withheld, fix.reset) for fix in bridge.fixes]
-    assert told == [(True, True, True), (False, False, True)]
+    assert [fix.by_odometry for fix in bridge.fixes] == [False, True]
 
 
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from companion.flight.reachable_region import ReachableRegion
+from companion.inertial import InertialTrack
 from localizer.geometry.pose import Pose
 from localizer.types import TrackingState
 from mavlink_bridge.messages import Attitude, InertialSample, VehicleState
@@ -53,14 +54,14 @@ def _estimate(time_ns, east, north, state=TrackingState.TRACKING):
 
 
 def _seen_at_two(vehicle):
-    reach = ReachableRegion(vehicle)
+    reach = ReachableRegion(vehicle, InertialTrack())
     vehicle.until(2.0, reach)
     reach.add_estimate(_estimate(round(1.8 * S), 100.0, -50.0), None)
     return reach
 
 
 def test_nothing_is_known_before_a_place_was_seen():
-    reach = ReachableRegion(Flying())
+    reach = ReachableRegion(Flying(), InertialTrack())
     assert reach.region(5 * S) is None
     reach.add_estimate(_estimate(S, 0.0, 0.0, TrackingState.BRIDGING), None)
     assert reach.region(5 * S) is None

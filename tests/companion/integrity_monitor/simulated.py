@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -162,7 +163,6 @@ class Flight:
     def _fix(self, at_s: float) -> VisionFix:
         north, east = (self.seen or self.path)(at_s) + self.noise_m * self._rng.standard_normal(2)
         latitude, longitude = offset(LATITUDE, LONGITUDE, float(north), float(east))
-        reset = 0.0 <= at_s - self.reset_at_s < 0.5 / FIX_HZ
         covariance = np.eye(3) * self.claimed_m**2
         height = HEIGHT + self.height_m(at_s)
         return VisionFix(
@@ -170,7 +170,7 @@ class Flight:
             latitude,
             longitude,
             height,
-            reset=reset,
+            reset_count=int(at_s >= self.reset_at_s),
             position_covariance_ned=covariance,
             by_odometry=self.by_odometry,
         )
@@ -183,6 +183,15 @@ class Flight:
         self.held.append(self.at_s)
         if admitted is not None:
             self.moved.append(self.at_s)
+
+
+def jumps(flight: Flight) -> list[float]:
+    """Seconds of the fixes that passed with another reset count than the one before."""
+    return [
+        fix.time_ns * 1e-9
+        for before, fix in itertools.pairwise(flight.passed)
+        if fix.reset_count != before.reset_count
+    ]
 
 
 def outside(flight: Flight) -> list[float]:

@@ -12,7 +12,7 @@ from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import VehicleState, VisionFix
-from tests.companion.integrity_monitor.simulated import Flight, Path, leg, second
+from tests.companion.integrity_monitor.simulated import Flight, Path, jumps, leg, second
 
 Velocity = tuple[float, float]
 
@@ -99,7 +99,7 @@ def test_a_turned_frame_never_passes_by_waiting_and_the_right_one_passes_at_once
     assert flight.told(AlertId.POSITION_JUMP) < 12.3
     assert until_s <= taken(flight, 12.0) < until_s + 0.2  # the monitor's next turn
     assert max(flight.held) < until_s + 0.1
-    assert [fix.time_ns * 1e-9 for fix in flight.passed if fix.reset] == [taken(flight, 12.0)]
+    assert jumps(flight) == [taken(flight, 12.0)]
 
 
 def test_a_right_place_is_taken_though_the_ekf_drifts() -> None:
@@ -111,7 +111,7 @@ def test_a_right_place_is_taken_though_the_ekf_drifts() -> None:
 
     flight = Reckoned(monitor(), cruise, relocalized, error=drifting(12.0)).fly(20.0)
     assert 17.0 <= taken(flight, 12.0) < 17.3
-    assert [fix.time_ns * 1e-9 for fix in flight.passed if fix.reset] == [taken(flight, 12.0)]
+    assert jumps(flight) == [taken(flight, 12.0)]
 
 
 def test_a_right_place_is_taken_in_the_end_though_the_ekf_stands() -> None:
@@ -166,16 +166,6 @@ def test_without_the_ekfs_velocity_what_is_held_is_taken_after_its_time() -> Non
     assert 17.0 <= taken(flight, 12.0) < 17.3
 
 
-@dataclass
-class Announced(Flight):
-    """A flight whose jump stays announced until a fix has carried it, as `FixInjection` does."""
-
-    def _offer(self, fix: VisionFix) -> None:
-        carried = any(f.reset for f in self.passed)
-        is_due = self.reset_at_s <= self.at_s and not carried
-        super()._offer(replace(fix, reset=is_due))
-
-
 def test_an_announced_jump_that_does_not_move_is_never_taken() -> None:
     """A jump that is announced again with each fix that is withheld began its evidence anew with
     each: nothing was settled, so nothing spoke against it, and it was taken after its time.
@@ -184,7 +174,7 @@ def test_an_announced_jump_that_does_not_move_is_never_taken() -> None:
     def elsewhere(at_s: float) -> tuple[float, float]:
         return swung(at_s) if at_s < 12.0 else (200.0, 60.0)
 
-    flight = Announced(monitor(), swung, elsewhere, noise_m=0.03, reset_at_s=12.0).fly(34.0)
+    flight = Flight(monitor(), swung, elsewhere, noise_m=0.03, reset_at_s=12.0).fly(34.0)
     assert flight.told(AlertId.POSITION_JUMP) < 12.3
     assert taken(flight, 12.0) == np.inf
 
@@ -196,7 +186,7 @@ def test_an_announced_jump_that_moves_rightly_is_taken_after_its_time() -> None:
         north, east = leg(at_s)
         return north, east + (40.0 if at_s < 12.0 else 0.0)
 
-    flight = Announced(monitor(), leg, found, noise_m=0.1, reset_at_s=12.0).fly(24.0)
+    flight = Flight(monitor(), leg, found, noise_m=0.1, reset_at_s=12.0).fly(24.0)
     assert 17.0 <= taken(flight, 12.0) < 17.3
     assert max(flight.held) < 17.3
     assert {one.active for _, one in flight.lines} == {True, False}

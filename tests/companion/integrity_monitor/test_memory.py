@@ -15,12 +15,13 @@ from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.injection.restart_memory import RestartMemory
 from mavlink_bridge.messages import VehicleState
 from tests.companion.integrity_monitor.simulated import Flight
 from tests.companion.integrity_monitor.test_checks import looking
 
-LONG = {AlertId.FOCAL_LENGTH: (5.0, "long")}
+LONG = {AlertId.FOCAL_LENGTH: (5.0, CalibrationError.LONG)}
 KEPT = {"focal_length": [5.0, "long"]}
 
 
@@ -98,7 +99,7 @@ def test_what_flies_is_not_taken_back_by_a_restart() -> None:
 def test_evidence_ends_what_was_kept() -> None:
     """The camera looks where it is said to: 4 degrees off was another, or wrong."""
     monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    monitor.restore({AlertId.BORESIGHT: (4.0, "yaw")})
+    monitor.restore({AlertId.BORESIGHT: (4.0, CalibrationError.YAW)})
     flight = Flight(monitor, noise_m=0.05)
     for quarter in range(1, 160):
         flight.fly(0.25 * quarter)

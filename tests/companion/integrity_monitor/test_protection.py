@@ -41,9 +41,7 @@ def test_only_a_recent_calibration_says_how_well_the_camera_is_known(
 
 
 def level_m(sigma_m: float, *, calibrated: bool) -> float:
-    fix = VisionFix(
-        1, 47.0, 8.0, 500.0, position_covariance_ned=np.eye(3) * sigma_m**2, reset=False
-    )
+    fix = VisionFix(1, 47.0, 8.0, 500.0, position_covariance_ned=np.eye(3) * sigma_m**2)
     config = ProtectionConfig().of_camera(calibrated=calibrated)
     return protection_level(fix, AT_120_M, config, 0.0, 120.0).horizontal_m
 

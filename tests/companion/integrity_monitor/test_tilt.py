@@ -14,6 +14,7 @@ from companion.integrity_monitor.tilt import TiltCheck
 from mavlink_bridge.alerts.catalogue import cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
+from mavlink_bridge.quaternion import from_euler
 from tests.companion.integrity_monitor.simulated import Flight, leg, outside, second
 
 Angle = Callable[[float], float]
@@ -49,7 +50,7 @@ class Tilted(Flight):
         pitch = self.tilt_rad + np.radians(self.vision_deg(at_s) - self.gimbal_deg)
         sigma = float(np.radians(CLAIMED_DEG))
         fix = replace(super()._fix(at_s), attitude_sigma_rad=sigma)
-        return replace(fix, roll_rad=0.0, pitch_rad=float(pitch), yaw_rad=0.0)
+        return replace(fix, quaternion=from_euler(0.0, float(pitch), 0.0))
 
 
 def low(vision_deg: Angle = never, gimbal_deg: float = 0.5, above_m: float = 30.0) -> Tilted:
@@ -95,7 +96,7 @@ def fixes(seed: int, constant_deg: float, wander_deg: float, seconds: int) -> It
         wander = kept * wander + drive * rng.standard_normal(2)
         roll, pitch = aligned + wander + 0.5 * sigma * rng.standard_normal(2)
         yield VisionFix(
-            second(0.1 * k), 47.4, 8.5, 535.0, float(roll), float(pitch), 0.0,
+            second(0.1 * k), 47.4, 8.5, 535.0, from_euler(float(roll), float(pitch), 0.0),
             attitude_sigma_rad=sigma,
         )  # fmt: skip
 
@@ -156,7 +157,7 @@ def test_a_tilt_at_an_unknown_height_is_widened() -> None:
     """A vehicle without a home says no height, and its position was taken to be right."""
     check = TiltCheck(IntegrityMonitorConfig())
     for fix in fixes(1, 0.0, 0.0, 1):
-        check.add(replace(fix, pitch_rad=0.1), LEVEL)
+        check.add(replace(fix, quaternion=from_euler(0.0, 0.1, 0.0)), LEVEL)
     assert check.metres(None) == IntegrityMonitorConfig().unreported_jump_m
     for fix in fixes(1, 0.5, 0.3, 1):
         check.add(fix, LEVEL)
@@ -168,6 +169,6 @@ def test_without_an_attitude_nothing_is_said() -> None:
     check = TiltCheck(IntegrityMonitorConfig())
     for fix in fixes(1, 20.0, 0.3, 2):
         check.add(fix, None)
-        check.add(replace(fix, roll_rad=None), LEVEL)
+        check.add(replace(fix, quaternion=None), LEVEL)
     assert not check.tilts
     assert check.metres(30.0) == 0.0

@@ -22,6 +22,13 @@ from companion.supervision.supervisor import RestartPolicy, Supervisor, describe
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name, ProcessFault
+
+DIED = alert(AlertId.COMPANION_RESTARTS, how=ProcessFault.DIED, what=Name("SIGKILL"))
+
+
+def hanging(what: str) -> Alert:
+    return alert(AlertId.COMPANION_RESTARTS, how=ProcessFault.HANGS, what=Name(what))
 
 
 @dataclass
@@ -143,7 +150,7 @@ def test_a_death_is_told_marked_and_the_standby_flies_on() -> None:
     assert second.released
     assert third.dismissed  # the second's own
     assert not third.released
-    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")]
+    assert stage.told == [DIED]
     assert stage.marked == ["companion died (SIGKILL), restarting"]
 
 
@@ -184,7 +191,8 @@ def test_quick_deaths_never_end_it_and_cold_starts_wait_longer_and_longer() -> N
     stage = Stage([*(Scripted(2, 1) for _ in range(9)), Scripted(2, 0)], standby_after_s=1e3)
     assert stage.supervisor.run() == 0
     assert len(stage.spawned) == 10
-    waits = [("died (exit 1)",)] * 4 + [("died (exit 1)", float(s)) for s in (2, 4, 8, 16, 30)]
+    how = (ProcessFault.DIED, "exit 1")
+    waits = [how] * 4 + [(*how, float(s)) for s in (2, 4, 8, 16, 30)]
     assert [told.values for told in stage.told] == waits
     assert stage.waited_s == 2 + 4 + 8 + 16 + 30
     assert stage.marked == [body(told) for told in stage.told]
@@ -218,7 +226,7 @@ def test_a_computer_without_a_process_to_give_is_asked_again(refusals: int) -> N
     stage = Stage([Scripted(3, -9), Scripted(3, 0)], standby_after_s=60.0)
     stage.refusals = refusals
     assert stage.supervisor.run() == 0
-    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")]
+    assert stage.told == [DIED]
     assert stage.waited_s == sum(min(2**i, 30) for i in range(refusals))
 
 
@@ -285,7 +293,7 @@ def test_real_processes_killed_and_released(tmp_path: Path) -> None:
         RestartPolicy(standby_after_s=0.0),
     )
     assert supervisor.run() == 0
-    assert told == [alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")]
+    assert told == [DIED]
 
 
 @pytest.mark.parametrize(
@@ -302,7 +310,7 @@ def test_what_hangs_is_told_ended_and_taken_over(
     flights = [Scripted(20, 0, says=says), Scripted(20, 0), Scripted(9, 0)]
     stage = Stage(flights, standby_after_s=1.0)
     assert stage.supervisor.run() == 0
-    news = alert(AlertId.COMPANION_RESTARTS, how=f"hangs ({hangs})")
+    news = hanging(hangs)
     told = [news] if hangs else []
     assert stage.spawned[0].killed == bool(hangs)
     assert stage.spawned[1].released == bool(hangs)
@@ -318,7 +326,7 @@ def test_a_process_that_never_shows_life_is_ended_after_its_patience() -> None:
     assert stage.told == []
     stage = Stage([Scripted(1000, 0, says=mute), Scripted(9, 0)], cold_s=120.0)
     assert stage.supervisor.run() == 0
-    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="hangs (process)")]
+    assert stage.told == [hanging("process")]
 
 
 def ends(word: str) -> Callable[[int], Beat | None]:
@@ -343,7 +351,7 @@ def test_an_end_that_is_none_or_comes_to_none_is_not_waited_for(
     stage = Stage([Scripted(40, 0, says=ends(word)), Scripted(3, 0)], standby_after_s=60, **policy)
     assert stage.supervisor.run() == 0
     assert stage.spawned[0].killed
-    assert stage.told == [alert(AlertId.COMPANION_RESTARTS, how="hangs (process)")]
+    assert stage.told == [hanging("process")]
 
 
 def test_a_computer_that_slept_hangs_nothing() -> None:
@@ -406,7 +414,7 @@ def test_real_processes_that_stop_or_block_are_ended(how: str, what: str) -> Non
         RestartPolicy(standby_after_s=0.0, silent_s=0.6),
     )
     assert supervisor.run() == 0
-    assert told == [alert(AlertId.COMPANION_RESTARTS, how=f"hangs ({what})")]
+    assert told == [hanging(what)]
 
 
 def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:

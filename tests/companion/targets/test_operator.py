@@ -13,6 +13,7 @@ from localizer.targets.track import projected
 from localizer.types import TrackingState, Visibility
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import ClickRefusal
 from mavlink_bridge.messages import TrackRequest
 from tests.companion.targets.scene import CAMERA, MS, cast, estimate, pose_at
 
@@ -149,7 +150,7 @@ def test_a_click_waits_for_its_frame_and_is_refused_when_none_comes():
         lost = estimate(pose_at(0.0), operator.time_ms * MS, TrackingState.LOST, accepted=False)
         operator.clicks.add_estimate(lost)
         operator.time_ms += FRAME_MS
-    assert operator.alerts[-1] == alert(AlertId.NO_TARGET, why="position not known")
+    assert operator.alerts[-1] == alert(AlertId.NO_TARGET, why=ClickRefusal.UNKNOWN)
 
 
 def test_an_impatient_operator_is_told_once_and_a_place_seen_too_long_ago_is_none():
@@ -158,7 +159,7 @@ def test_an_impatient_operator_is_told_once_and_a_place_seen_too_long_ago_is_non
     operator.now_ms += 3000  # nothing came since
     for _ in range(5):
         operator.clicks_at(0.5, 0.5)
-    assert operator.alerts == [alert(AlertId.NO_TARGET, why="position not known")]
+    assert operator.alerts == [alert(AlertId.NO_TARGET, why=ClickRefusal.UNKNOWN)]
     assert not operator.told
 
 
@@ -169,7 +170,7 @@ def test_no_click_is_placed_by_a_pose_that_nothing_confirms(state):
     operator.fly(10)
     operator.fly(1, state)
     operator.clicks_at(0.5, 0.5, after_ms=220)
-    assert operator.alerts == [alert(AlertId.NO_TARGET, why="position not confirmed yet")]
+    assert operator.alerts == [alert(AlertId.NO_TARGET, why=ClickRefusal.UNCONFIRMED)]
     operator.fly(10)
     operator.clicks_at(0.5, 0.5)
     assert len(operator.told) == 1

@@ -178,13 +178,13 @@ def cache(cache_path: Path) -> TileCache:
     return TileCache.open(cache_path)
 
 
+def built(source: Path, out: Path, **options) -> TileCache:
+    """A cache that was built in this process."""
+    build_cache(source, out, BuildOptions(workers=1, **options))
+    return TileCache.open(out)
+
+
 @pytest.fixture
 def build(tmp_path: Path) -> Callable[..., TileCache]:
     """Build into a fresh folder in this process and open the result."""
-
-    def run(source: Path, **options) -> TileCache:
-        out = tmp_path / "cache"
-        build_cache(source, out, BuildOptions(workers=1, **options))
-        return TileCache.open(out)
-
-    return run
+    return lambda source, **options: built(source, tmp_path / "cache", **options)

@@ -108,7 +108,7 @@ def test_draws_that_all_look_elsewhere_leave_the_swarm(scene, prior):
 
 def test_more_anchors_sharpen_the_winner(jngo, place, camera, scene_factory, prior):
     errors_by_count: dict[int, list[Any]] = {150: [], 1500: []}
-    for seed in range(10):
+    for seed in range(6):
         scene = scene_factory(300 + seed, 1.0, 1.0)
         view = place.view(scene.reference, camera)
         features = place.pyramid(scene.reference, camera, 0.1, seed)
@@ -147,7 +147,7 @@ def test_covariance_matches_the_errors(scene_factory, prior):
     """
     jngo = JNGO(JNGOConfig(correlation=1.0, few_anchors=0.0, map_error_m2=0.0))
     nees = []
-    for seed in range(40):
+    for seed in range(24):
         scene = scene_factory(200 + seed, 1.0, 1.0)
         result = jngo.register(
             scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0)

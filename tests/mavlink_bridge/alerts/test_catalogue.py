@@ -4,53 +4,79 @@ from __future__ import annotations
 
 import pytest
 
-from mavlink_bridge.alerts.alert import Alert, AlertSpec, OutputAction, Severity, Value
+from mavlink_bridge.alerts.alert import (
+    PREFIX,
+    Alert,
+    AlertSpec,
+    Inhibits,
+    Kind,
+    OutputAction,
+    Severity,
+    Value,
+)
 from mavlink_bridge.alerts.catalogue import CATALOGUE, TEXT_LENGTH, alert, cleared, severity, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
+from mavlink_bridge.alerts.words import CalibrationError, ChosenSet, Name, RcChannel, Word
 
-WORDS: dict[str, Value] = {
-    "direction": "north-east", "axis": "pitch", "how": "hangs (localizati)", "sender": "10.0.0.2:1",
-    "output": "nothing is injected", "message": "VISION_POSITION_ESTIMATE",
-    "cause": "GNSS off vision",
-    "result": "temporarily_rejected", "by": "channel 12", "host": "255.255.255.255",
-    "alert": "GNSS/vision mismatch", "applied": ", applied", "name": "car 12",
+NUMBERS = {
     "used": 200, "system": 200, "device": 200, "number": 12, "level": 88.0, "seconds": 30.0,
 }  # fmt: skip
-WHY = {  # the longest that is told
-    AlertId.LOOK_AT_REFUSED: "no place on Earth", AlertId.SENDER_REFUSED: "not allowed",
-    AlertId.SENDERS_REFUSED: "not allowed", AlertId.SOURCE_SET_HELD: "EKF with GNSS",
-    AlertId.TLOG_INCOMPLETE: "Read-only file system", AlertId.NO_TARGET: "position not known",
+NAMES = {  # the longest that comes from outside
+    "sender": "10.0.0.2:1", "host": "255.255.255.255", "message": "VISION_POSITION_ESTIMATE",
+    "component": "integrity monitor", "what": "localizati",
+    "name": "car 12",
+}  # fmt: skip
+WHY = {
+    AlertId.TLOG_INCOMPLETE: "Read-only file system",
     AlertId.TARGET_REFUSED: "the map has a hole there", AlertId.TARGET_SILENT: "moved 12 m",
-    AlertId.GNSS_REFUSED: "m/s off vision", AlertId.TARGET_NOT_LOCATED: "no map under it",
+    AlertId.TARGET_NOT_LOCATED: "no map under it",
 }  # fmt: skip
 
 
 def example(spec: AlertSpec) -> Alert:
     """The longest that its values make it."""
-    words: dict[str, Value] = WORDS | {"why": WHY.get(spec.id, "")}
-    if spec.id is AlertId.COMPONENT_STALLED:
-        words["component"] = "integrity monitor"
-    if spec.id is AlertId.FOCAL_LENGTH or spec.id is AlertId.TIME_OFFSET:
-        words["direction"] = "short"
-    return Alert(spec.id, tuple(words.get(name, 88.8) for name in spec.values))
+    return Alert(spec.id, tuple(longest(spec, name, kind) for name, kind in spec.kinds.items()))
+
+
+def longest(spec: AlertSpec, name: str, kind: Kind) -> Value:
+    if kind == "name":
+        return Name(WHY[spec.id] if name == "why" else NAMES[name])
+    if isinstance(kind, str):
+        return NUMBERS.get(name, 88.8)
+    if kind is AlertId:
+        inhibit = (one for one in CATALOGUE.values() if Inhibits.INJECTION in one.inhibits)
+        return max(inhibit, key=lambda one: len(one.title)).id
+    of = kind if isinstance(kind, tuple) else (kind,)
+    words: list[Value] = [word for one in of if issubclass(one, Word) for word in one]
+    numbered = [one(18) for one in of if issubclass(one, RcChannel | ChosenSet)]
+    return max(*words, *numbered, key=lambda one: len(str(one)))
 
 
 @pytest.mark.parametrize("of", AlertId)
 def test_every_alert_renders_and_is_read_again(of: AlertId) -> None:
     """Texts fit one STATUSTEXT: a chunked one may be cut by a lossy link just where it matters."""
     spec = CATALOGUE[of]
-    raised, over = example(spec), cleared(of)
-    assert (severity(raised), severity(over)) == (spec.severity, Severity.NOTICE)
-    for one in (raised, over) if spec.cleared else (raised,):
+    raised = example(spec)
+    assert severity(raised) == spec.severity
+    for one in (raised, cleared(of)) if spec.reports_end else (raised,):
         line = text(one)
         assert len(line) <= TEXT_LENGTH, line
-        assert line.startswith("PiLoT: ")
+        assert line.startswith(PREFIX)
         assert line.isascii()
         assert alert_of(line) == (of, one.active)
     assert ("output held" in text(raised)) is (spec.action is not OutputAction.NONE)
-    for told in (spec.raised, spec.meaning, spec.operator):
-        assert told
+    assert spec.raised
+    assert spec.meaning
+    assert spec.operator
+
+
+def test_only_an_alert_that_lasts_is_cleared() -> None:
+    assert severity(cleared(AlertId.VIDEO_FROZEN)) == Severity.NOTICE
+    assert CATALOGUE[AlertId.FC_SILENT].cleared
+    for of in (AlertId.FC_REBOOTED, AlertId.FC_SILENT):  # an event; another alert says its end
+        with pytest.raises(ValueError, match="its end has no text"):
+            cleared(of)
 
 
 def test_values_are_named_by_the_catalogue() -> None:
@@ -63,7 +89,10 @@ def test_values_are_named_by_the_catalogue() -> None:
 def test_alerts_that_differ_in_numbers_only_have_one_key() -> None:
     four, nine = (alert(AlertId.VIDEO_FROZEN, seconds=s) for s in (4.0, 9.0))
     assert four.key == nine.key
-    long, short = (alert(AlertId.FOCAL_LENGTH, percent=3.0, direction=d) for d in ("long", "short"))
+    long, short = (
+        alert(AlertId.FOCAL_LENGTH, percent=3.0, direction=one)
+        for one in (CalibrationError.LONG, CalibrationError.SHORT)
+    )
     assert long.key != short.key
 
 

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import RcChannel
 from mavlink_bridge.config import InjectionEnableConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 
@@ -30,7 +31,7 @@ def test_channel_is_followed_and_each_change_is_told_once() -> None:
     for pulse in (1100, 1100, 1900, 1900, 1100, 1100):
         it.channels(channels(pulse))
     assert told == [
-        alert(of, by="channel 9") for of in (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
+        alert(of, by=RcChannel(9)) for of in (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
     ]
 
 
@@ -38,7 +39,7 @@ def test_a_pulse_at_the_threshold_does_not_flutter() -> None:
     it, told = enable(inject_above_us=1700)
     for pulse in (1690, 1705, 1690, 1702, 1655):
         it.channels(channels(pulse))
-    assert told == [alert(AlertId.INJECTION_ON, by="channel 9")]
+    assert told == [alert(AlertId.INJECTION_ON, by=RcChannel(9))]
     it.channels(channels(1640))
     assert not it.open
 

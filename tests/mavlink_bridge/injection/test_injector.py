@@ -14,9 +14,8 @@ import pytest
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, YawGuardConfig
-from mavlink_bridge.injection.encode import DIAGONAL
+from mavlink_bridge.injection.encode import DIAGONAL, EncodedMessage, InjectionContext
 from mavlink_bridge.injection.injector import Injector
-from mavlink_bridge.injection.message_maker import EncodedMessage, InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.quaternion import from_euler
@@ -56,16 +55,20 @@ def injector(**options: Any) -> Injector:
     return Injector(InjectionConfig(**options), GEOID, utc)
 
 
-def fix(time_ns: int, north: float = 0.0, east: float = 0.0, **options: Any) -> VisionFix:
-    options.setdefault("yaw_rad", 0.0)
+def fix(
+    time_ns: int,
+    north: float = 0.0,
+    east: float = 0.0,
+    yaw_rad: float | None = 0.0,
+    **options: Any,
+) -> VisionFix:
     options.setdefault("position_covariance_ned", np.eye(3) * 0.25)
     return VisionFix(
         time_ns,
         HOME[0] + north * METRE,
         HOME[1] + east * METRE / math.cos(math.radians(HOME[0])),
         488.0 + GEOID + 60.0,
-        0.0,
-        0.0,
+        None if yaw_rad is None else from_euler(0.0, 0.0, yaw_rad),
         **options,
     )
 
@@ -272,10 +275,7 @@ def test_reset_counter_changes_on_the_very_message_that_carries_the_jump() -> No
     jump_at = 3 * SECOND
 
     def jump(f: VisionFix) -> VisionFix:
-        if f.time_ns < jump_at:
-            return f
-        first = jump_at <= f.time_ns < jump_at + 125 * MS
-        return fix(f.time_ns, north=10.0, reset=first)
+        return f if f.time_ns < jump_at else fix(f.time_ns, north=10.0, reset_count=1)
 
     sent = fly(it, seconds=5, fix_hz=8, latency_ms=60, change=jump)
     counters = [i.message.reset_counter for _, i in sent]
@@ -291,9 +291,9 @@ def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
     it = injector(rate_hz=10, delay_ms=0)
     it.submit(fix(SECOND), SECOND)
     it.step(SECOND, context())
-    # Two fixes inside one slot: the older carries the reset and is superseded.
-    it.submit(fix(SECOND + 10 * MS, north=10.0, reset=True), SECOND + 10 * MS)
-    it.submit(fix(SECOND + 20 * MS, north=10.0), SECOND + 20 * MS)
+    # Two fixes inside one slot: the older is the first after the jump, and is superseded.
+    it.submit(fix(SECOND + 10 * MS, north=10.0, reset_count=1), SECOND + 10 * MS)
+    it.submit(fix(SECOND + 20 * MS, north=10.0, reset_count=1), SECOND + 20 * MS)
     it.step(SECOND + 20 * MS, context())
     sent = None
     for t in range(SECOND + 21 * MS, SECOND + 200 * MS, MS):
@@ -338,9 +338,8 @@ def test_announced_turn_towards_the_autopilots_yaw_is_taken() -> None:
     it = injector(rate_hz=10, delay_ms=0)
 
     def relocalized(f: VisionFix) -> VisionFix:
-        jumps = f.time_ns == 3 * SECOND
-        yaw = math.radians(3.0 if f.time_ns < 3 * SECOND else -1.0)
-        return fix(f.time_ns, yaw_rad=yaw, reset=jumps)
+        jumps = f.time_ns >= 3 * SECOND
+        return fix(f.time_ns, yaw_rad=math.radians(-1.0 if jumps else 3.0), reset_count=int(jumps))
 
     sent = fly(it, seconds=6, fix_hz=10, latency_ms=0, change=relocalized)
     assert max(i.estimate.position.time_ns for _, i in sent) > 5.5 * SECOND

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import ChosenSet, GnssProblem, Output
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.interlock import ShadowInterlock
@@ -65,7 +66,7 @@ def test_a_map_20_m_off_is_neither_injected_nor_switched_to(
     assert flight.vision() == []
     assert orders(flight) == []
     lost = flight.told(AlertId.GNSS_LOST)
-    assert lost == [alert(AlertId.GNSS_LOST, output="nothing is injected")]
+    assert lost == [alert(AlertId.GNSS_LOST, output=Output.NOTHING)]
 
 
 def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
@@ -347,7 +348,7 @@ def test_what_the_pilot_chooses_is_followed_and_not_undone(
     flight.run(8.0)
     assert len(orders(flight)) == begun
     assert [a.values for a in flight.told(AlertId.SOURCE_SET_HELD)] == [
-        ("GNSS lost", 0.0, "set 1 chosen")
+        (GnssProblem.LOST, 0.0, ChosenSet(1))
     ]
     # Once GNSS was well again, the next fault is another one.
     flight.gnss_north_m = 0.0
@@ -406,7 +407,7 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
     flight.end.inhibit(AlertId.FOCAL_LENGTH)
     flight.run(18.0)
     assert flight.vision() == []
-    assert flight.told(AlertId.INHIBITED) == [alert(AlertId.INHIBITED, alert="focal length")]
+    assert flight.told(AlertId.INHIBITED) == [alert(AlertId.INHIBITED, alert=AlertId.FOCAL_LENGTH)]
     flight.gnss_north_m = None
     flight.run(5.0)
     assert flight.vision() == []

@@ -18,6 +18,7 @@ import pytest
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
@@ -134,7 +135,7 @@ def test_an_old_file_and_one_from_the_future_count_for_nothing(
     path.chmod(0o600)
     enable, told = restarted(path, later_s)
     assert not enable.open
-    assert told == [alert(AlertId.INJECTION_OFF, by="at the start")]
+    assert told == [alert(AlertId.INJECTION_OFF, by=InjectionOrder.START)]
     enable.stop()
 
 

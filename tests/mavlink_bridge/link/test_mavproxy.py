@@ -6,6 +6,7 @@ MAVPROXY names its program, `mavproxy.py` of an environment of its own; without 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, TargetReport
 from mavlink_bridge.alerts.catalogue import alert, text
@@ -23,7 +25,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
 from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
+from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
 
 PROGRAM = shutil.which(os.environ.get("MAVPROXY", "mavproxy.py"))
 HOME = Location(47.397742, 8.545594, 488.0)
@@ -38,7 +40,7 @@ pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no mavproxy.py (MAVPROX
 
 @pytest.fixture(params=[EmbeddedSitl, pytest.param(ArduPilotSitl, marks=REAL)])
 def vehicle(request: pytest.FixtureRequest) -> Iterator[Any]:
-    with request.param(HOME, parameters=GIMBAL) as process:
+    with request.param(HOME, parameters=GIMBAL | vision_only_parameters()) as process:
         yield process
 
 
@@ -83,6 +85,13 @@ def test_mavproxy_receives_figures_targets_and_texts(vehicle: Any, tmp_path: Pat
             console.close()
 
 
+def _masks(console: Console) -> list[tuple[int, int]]:
+    """Enabled and healthy sensors of SYS_STATUS, as it printed them."""
+    pattern = re.compile(r"sensors_enabled : (\d+).*sensors_health : (\d+)")
+    found = (pattern.search(line) for line in list(console.lines))
+    return [(int(m[1]), int(m[2])) for m in found if m]
+
+
 def _converse(bridge: Bridge, console: Console) -> None:
     assert sleep_until(lambda: console.shows("online system 1"), 60.0), console.lines
     wanted = ("name : VPS_SIGNAL, value : 2.0", "CAMERA_TRACKING_GEO_STATUS", TEXT)
@@ -94,9 +103,14 @@ def _converse(bridge: Bridge, console: Console) -> None:
         console.ask("status NAMED_VALUE_FLOAT*")
         console.ask("status CAMERA_TRACKING_GEO*")
         console.ask("status STATUSTEXT*")
-        return all(console.shows(part) for part in wanted)
+        console.ask("status SYS_STATUS*")
+        return all(console.shows(part) for part in wanted) and bool(_masks(console))
 
     assert sleep_until(told, 60.0, step_s=0.5), console.lines
     assert console.shows("lat : 473980000, lon : 85460000, alt : 488.0, h_acc : 2.0")
+    # The autopilot's vision bit is in the numbers only: nothing was injected, so not healthy.
+    enabled, health = _masks(console)[-1]
+    vision = mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION
+    assert (enabled & vision, health & vision) == (vision, 0)
     # It keeps the texts of other components, and prints none: `bridge.texts_as_autopilot`.
     assert not any(TEXT in line for line in console.lines if "STATUSTEXT" not in line)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.camera import Camera
@@ -19,12 +20,22 @@ from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkMessage
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest
-from mavlink_bridge.config import CameraConfig, TargetsConfig
+from mavlink_bridge import (
+    Bridge,
+    BridgeConfig,
+    CameraView,
+    TargetReport,
+    TrackRequest,
+    VisionFix,
+)
+from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import values_of
+from mavlink_bridge.alerts.words import InjectionOrder
+from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
 from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
+from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
 
 PROMISED = (
     "CAMERA_TRACKING_GEO_STATUS",
@@ -42,7 +53,7 @@ REAL = [
 
 @pytest.fixture(params=[EmbeddedSitl, pytest.param(ArduPilotSitl, marks=REAL)])
 def vehicle(request: pytest.FixtureRequest) -> Iterator[Any]:
-    with request.param(HOME, parameters=GIMBAL) as process:
+    with request.param(HOME, parameters=GIMBAL | vision_only_parameters()) as process:
         yield process
 
 
@@ -153,14 +164,53 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     assert not bridge.injecting
     assert station.command(mavlink.MAV_CMD_USER_2, 197, 1.0) == mavlink.MAV_RESULT_UNSUPPORTED
 
-    def texts() -> list[str]:
-        return [m["text"] for m in station.heard["STATUSTEXT"] if "injection" in m["text"]]
+    def alerts() -> list[Any]:
+        switched = (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
+        read = [values_of(m["text"]) for m in station.heard["STATUSTEXT"]]
+        return [one for one in read if one is not None and one[0] in switched]
 
-    assert sleep_until(lambda: len(texts()) == 2, 30.0), station.heard["STATUSTEXT"]
-    assert texts() == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
+    assert sleep_until(lambda: len(alerts()) == 2, 30.0), station.heard["STATUSTEXT"]
+    by = {"by": InjectionOrder.COMMAND.value}
+    assert alerts() == [(AlertId.INJECTION_ON, by), (AlertId.INJECTION_OFF, by)]
 
     def gimbal() -> Any:
         return bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
 
     assert sleep_until(lambda: gimbal() is not None, 30.0)
     assert gimbal().source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
+
+
+def test_the_autopilots_vision_bit_is_healthy_while_positions_come(vehicle: Any) -> None:
+    """SYS_STATUS, which QGroundControl lists by name."""
+    config = BridgeConfig(
+        connection=vehicle.companion_endpoint,
+        mode="inject",
+        injection=InjectionConfig(force=True),
+        origin=OriginConfig(latitude_deg=47.397742, longitude_deg=8.545594, altitude_amsl_m=488.0),
+    )
+    sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+    with Bridge(config, GEOID) as bridge:
+        try:
+            sdk.add_any_connection(vehicle.spare_endpoint.replace("tcp:", "tcpout://"))
+            station = Station(sdk)
+            for name in ("COMMAND_ACK", "SYS_STATUS"):
+                station.listen(name)
+            station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 1, 1.0, 100_000.0)
+
+            def bits() -> tuple[bool, ...]:
+                newest = station.heard["SYS_STATUS"][-1] if station.heard["SYS_STATUS"] else {}
+                kinds = ("present", "enabled", "health")
+                masks = (int(newest.get(f"onboard_control_sensors_{k}", 0)) for k in kinds)
+                return tuple(bool(m & mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION) for m in masks)
+
+            def fed() -> bool:
+                place = (47.397742, 8.545594, 488.0 + GEOID)
+                exposed_ns, sigma = time.monotonic_ns() - 50_000_000, np.eye(3) * 0.25
+                bridge.submit(VisionFix(exposed_ns, *place, position_covariance_ned=sigma))
+                return bits() == (True, True, True)
+
+            assert sleep_until(lambda: bits() == (True, True, False), 60.0), station.heard
+            assert sleep_until(fed, 60.0, step_s=0.05), (bits(), bridge.alerts())
+            assert sleep_until(lambda: bits() == (True, True, False), 60.0), station.heard
+        finally:
+            sdk.destroy()

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.link.tlog import TlogRecorder, read_tlog
@@ -49,7 +50,7 @@ def test_a_full_disk_is_told_once_and_costs_the_record_only(autopilot: Any) -> N
     with Bridge(config, 0.0) as bridge:
         assert sleep_until(lambda: int(bridge.counters()["tlog_dropped"]) > 20, 30.0)
         assert sleep_until(lambda: bridge.state().connected, 30.0)
-        incomplete = alert(AlertId.TLOG_INCOMPLETE, why="No space left on device")
+        incomplete = alert(AlertId.TLOG_INCOMPLETE, why=Name("No space left on device"))
         assert bridge.alerts().count(incomplete) == 1
         assert bridge.counters()["fc_handler_errors"] == 0
 

@@ -11,10 +11,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.words import Name, ProcessFault
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.vehicle.crash_notifier import report_without_bridge
 
-DIED = alert(AlertId.COMPANION_RESTARTS, how="died (SIGKILL)")
+DIED = alert(AlertId.COMPANION_RESTARTS, how=ProcessFault.DIED, what=Name("SIGKILL"))
 
 
 class Autopilot:

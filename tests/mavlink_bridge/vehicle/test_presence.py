@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
 from mavlink_bridge.alerts.alert import Alert
-from mavlink_bridge.alerts.catalogue import alert
+from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
 from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
@@ -228,7 +228,7 @@ def test_what_the_operator_reads_is_logged_and_recorded_once(
         bridge.set_health(HealthLevel.DEGRADED, [alert(AlertId.FC_SILENT)], tell=False)
     bridge.stop()
     lines = [r.getMessage() for r in caplog.records if "localization" in r.getMessage()]
-    assert lines == ["PiLoT: localization degraded"]
+    assert lines == [text(degraded)]
     assert recorded == [degraded, bridging[0]]
 
 

@@ -310,46 +310,43 @@ def test_two_builds_do_not_share_a_folder(source, tmp_path):
         build_cache(source, tmp_path / "c", BuildOptions(workers=1))
 
 
-def test_overwrite_replaces_the_cache(source, tmp_path):
-    out = tmp_path / "c"
-    build_cache(source, out, BuildOptions(workers=1))
-    (out / "mark").write_text("old")
-    build_cache(source, out, BuildOptions(workers=1, overwrite=True))
-    assert not (out / "mark").exists()
-    assert TileCache.open(out).manifest.tiles == 21
-    assert [p.name for p in tmp_path.iterdir() if p.name.startswith("c")] == ["c"]
+def test_overwrite_replaces_the_cache(source, copy):
+    (copy / "mark").write_text("old")
+    build_cache(source, copy, BuildOptions(workers=1, overwrite=True))
+    assert not (copy / "mark").exists()
+    assert TileCache.open(copy).manifest.tiles == 21
+    assert [p.name for p in copy.parent.iterdir()] == ["copy"]
 
 
-def test_a_cache_that_a_flight_has_open_is_not_replaced(source, tmp_path):
+def test_a_cache_that_a_flight_has_open_is_not_replaced(source, copy):
     """Its tiles are read for as long as it flies: another map's are not those of its index."""
-    out = tmp_path / "c"
-    build_cache(source, out, BuildOptions(workers=1))
     again = BuildOptions(workers=1, overwrite=True)
-    with TileStreamer(TileCache.open(out)) as flight, TileStreamer(TileCache.open(out)):
+    with TileStreamer(TileCache.open(copy)) as flight, TileStreamer(TileCache.open(copy)):
         with pytest.raises(MapCacheError, match=r"flight.*another folder"):
-            build_cache(source, out, again)
-        assert not (tmp_path / "c.building").exists()  # known before the work and not after it
+            build_cache(source, copy, again)
+        assert not copy.with_name(
+            "copy.building"
+        ).exists()  # known before the work and not after it
         assert flight.cache.load_tile(20).faces.size
-    assert build_cache(source, out, again).tiles == 21
+    assert build_cache(source, copy, again).tiles == 21
 
 
-def test_a_cache_that_is_opened_while_its_successor_is_built_stays(source, tmp_path):
+def test_a_cache_that_is_opened_while_its_successor_is_built_stays(source, copy):
     """The build is kept: the same command puts it there after the flight."""
-    out, built = tmp_path / "c", []
-    build_cache(source, out, BuildOptions(workers=1))
+    built = []
     again = BuildOptions(workers=1, overwrite=True)
     with ExitStack() as flight:
 
         def opened(done, total):
             built.append(done)
             if done == total:
-                flight.enter_context(TileStreamer(TileCache.open(out)))
+                flight.enter_context(TileStreamer(TileCache.open(copy)))
 
         with pytest.raises(MapCacheError, match="same command"):
-            build_cache(source, out, again, progress=opened)
-        TileCache.open(out).load_tile(20)
+            build_cache(source, copy, again, progress=opened)
+        TileCache.open(copy).load_tile(20)
     built.clear()
-    build_cache(source, out, again, progress=lambda done, _: built.append(done))
+    build_cache(source, copy, again, progress=lambda done, _: built.append(done))
     assert set(built) == {21}  # none was imported again
 
 

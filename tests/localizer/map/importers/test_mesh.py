@@ -16,6 +16,7 @@ from localizer.map.building.cutting import shelves
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.georeference import Georeference, ecef_from_crs, read_georeference
 from localizer.render.numba_raster import NumbaRenderer
+from tests.localizer.map.conftest import built
 
 DATUM = {"geoid_separation_m": 48.0, "vertical_datum": "ellipsoidal"}
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -41,17 +42,24 @@ def leaf_meshes(cache):
     ]
 
 
-@pytest.fixture
-def glb(make, tmp_path):
+@pytest.fixture(scope="module")
+def glb(make, tmp_path_factory):
     positions, uvs, faces = make.patch(-100, -100, 200, 60)
-    path = tmp_path / "model.glb"
+    path = tmp_path_factory.mktemp("mesh") / "model.glb"
     png = cv2.imencode(".png", picture())[1].tobytes()
     path.write_bytes(make.glb(make.y_up(positions), uvs, faces, png, "image/png"))
     return path
 
 
-def test_vertices_stand_about_the_origin(glb, make, build):
-    cache = build(glb, georeference=Georeference(origin=make.origin), **DATUM)
+@pytest.fixture(scope="module")
+def cache(glb, make):
+    """Of the model; read only."""
+    return built(
+        glb, glb.with_name("cache"), georeference=Georeference(origin=make.origin), **DATUM
+    )
+
+
+def test_vertices_stand_about_the_origin(cache, make):
     points = np.concatenate([m.world_from_tile.apply(m.positions) for m in leaf_meshes(cache)])
     assert np.abs(points[:, 2] - make.height(points[:, 0], points[:, 1])).max() < 1e-3
     assert cache.manifest.origin.height_m == pytest.approx(make.origin.height_m, abs=1e-3)
@@ -65,8 +73,7 @@ def test_heading_turns_clockwise():
     assert enu[0] == pytest.approx([10, 0, 1], abs=1e-6)
 
 
-def test_tiles_show_their_part_of_the_texture(glb, make, build):
-    cache = build(glb, georeference=Georeference(origin=make.origin), **DATUM)
+def test_tiles_show_their_part_of_the_texture(cache, make):
     assert cache.manifest.levels >= 2
     for mesh in leaf_meshes(cache):
         assert mesh.mips[0].size < picture().size / 3
@@ -79,8 +86,7 @@ def test_tiles_show_their_part_of_the_texture(glb, make, build):
         assert np.abs(100 - green / 255.0 * 200 - points[:, 1]).max() < 4
 
 
-def test_made_levels_show_the_same_surface(glb, make, build):
-    cache = build(glb, georeference=Georeference(origin=make.origin), **DATUM)
+def test_made_levels_show_the_same_surface(cache, make):
     root = int(cache.index.tile_start[0])
     points = cache.load_tile(root).world_from_tile.apply(cache.load_tile(root).positions)
     error = points[:, 2] - make.height(points[:, 0], points[:, 1])

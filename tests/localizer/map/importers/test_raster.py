@@ -18,6 +18,7 @@ from localizer.map.cache.pick import cast_rays
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.georeference import ecef_from_crs
 from localizer.render.numba_raster import NumbaRenderer
+from tests.localizer.map.conftest import built
 
 UTM = "EPSG:32632"
 LEFT, TOP = 500_100.0, 5_228_300.0
@@ -48,8 +49,8 @@ def write(path, data, step, crs=UTM, **options):
     return path
 
 
-@pytest.fixture
-def rasters(tmp_path):
+@pytest.fixture(scope="module")
+def rasters(tmp_path_factory):
     """dsm.tif with a nodata corner, ortho.tif whose red and green tell the place."""
     s = LEFT + (np.arange(CELLS) + 0.5) * STEP
     dsm = height(s[None], (TOP - (np.arange(CELLS) + 0.5) * STEP)[:, None]).astype(np.float32)
@@ -57,10 +58,17 @@ def rasters(tmp_path):
     n = int(CELLS * STEP / GSD)
     ramp = np.linspace(0, 255, n).astype(np.uint8)
     ortho = np.stack([np.tile(ramp, (n, 1)), np.tile(ramp[:, None], (1, n)), np.full((n, n), 60)])
+    folder = tmp_path_factory.mktemp("rasters")
     return (
-        write(tmp_path / "dsm.tif", dsm, STEP, nodata=-9999),
-        write(tmp_path / "ortho.tif", ortho.astype(np.uint8), GSD),
+        write(folder / "dsm.tif", dsm, STEP, nodata=-9999),
+        write(folder / "ortho.tif", ortho.astype(np.uint8), GSD),
     )
+
+
+@pytest.fixture(scope="module")
+def cache(rasters, tmp_path_factory):
+    """Of both; read only."""
+    return built(rasters, tmp_path_factory.mktemp("built") / "cache", **DATUM)
 
 
 def surface(cache: TileCache, east, north):
@@ -76,8 +84,7 @@ def surface(cache: TileCache, east, north):
     return np.array(found)
 
 
-def test_heights_agree_with_the_dsm(rasters, build):
-    cache = build(rasters, **DATUM)
+def test_heights_agree_with_the_dsm(cache):
     rng = np.random.default_rng(0)
     # At cell centres, where the DSM states a height; away from its nodata corner.
     i, j = rng.integers(70, CELLS - 5, (2, 60))
@@ -88,15 +95,13 @@ def test_heights_agree_with_the_dsm(rasters, build):
     assert np.abs(error[~block]).max() < 0.05
 
 
-def test_nodata_stays_empty(rasters, build):
-    cache = build(rasters, **DATUM)
+def test_nodata_stays_empty(cache):
     inside = surface(cache, [LEFT + 10.0, LEFT + 50.0], [TOP - 10.0, TOP - 50.0])
     assert np.isnan(inside[0])
     assert np.isfinite(inside[1])
 
 
-def test_the_picture_lies_on_the_right_ground(rasters, build):
-    cache = build(rasters, **DATUM)
+def test_the_picture_lies_on_the_right_ground(cache):
     spot = LEFT + 100.0, TOP - 110.0
     ground = ecef_from_crs(UTM, np.array([[*spot, float(height(*spot))]]))
     target = cache.frame.ecef_from_enu.inverse.apply(ground)[0]
@@ -112,8 +117,7 @@ def test_the_picture_lies_on_the_right_ground(rasters, build):
     assert green / 255 * width == pytest.approx(110, abs=1.0)
 
 
-def test_coarser_levels_cover_the_same_ground(rasters, build):
-    cache = build(rasters, **DATUM)
+def test_coarser_levels_cover_the_same_ground(cache):
     assert cache.manifest.levels >= 3
     root = cache.load_tile(0)
     low, high = root.bounds
@@ -121,7 +125,7 @@ def test_coarser_levels_cover_the_same_ground(rasters, build):
     assert len(root.faces) < 40_000
 
 
-def test_projections_are_undone(rasters, build, tmp_path):
+def test_projections_are_undone(rasters, cache, build, tmp_path):
     dsm, ortho = rasters
     moved = tmp_path / "geographic.tif"
     with rasterio.open(ortho) as source:
@@ -139,10 +143,9 @@ def test_projections_are_undone(rasters, build, tmp_path):
                     resampling=Resampling.bilinear,
                 )
     textures = []
-    for source in (ortho, moved):
-        cache = build([dsm, source], overwrite=True, **DATUM)
-        whole = np.flatnonzero(cache.index.child_count == 0)[0]
-        textures.append(cache.load_tile(int(cache.index.tile_start[whole])).mips[0])
+    for one in (cache, build([dsm, moved], **DATUM)):
+        whole = np.flatnonzero(one.index.child_count == 0)[0]
+        textures.append(one.load_tile(int(one.index.tile_start[whole])).mips[0])
     first, second = textures
     assert np.abs(first.astype(int) - second).mean() < 3
 

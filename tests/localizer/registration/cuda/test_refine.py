@@ -129,8 +129,10 @@ def test_any_number_of_channels(make_backend, problems, swarm, channels, half):
     mix = rng.standard_normal((levels[2].features.shape[-1], channels)).astype(np.float32) / 4
     problem = replace(
         levels[2],
+        points=np.ascontiguousarray(levels[2].points[:, :100]),
         features=np.ascontiguousarray(levels[2].features @ mix),
-        anchor_features=np.ascontiguousarray(levels[2].anchor_features @ mix),
+        anchor_features=np.ascontiguousarray(levels[2].anchor_features[:100] @ mix),
+        anchor_confidence=levels[2].anchor_confidence[:100],
     )
     few = tuple(x[:6] for x in swarm)
     if not half:

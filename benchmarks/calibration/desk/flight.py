@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from benchmarks.calibration.desk.port import RecordedPort, RecordingServer
 from companion.geometry import GimbalAngles, GimbalFrame, Mount
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose
@@ -15,7 +16,6 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.vehicle.streams import wanted_streams
 from sitl.camera.gimbal_error import GimbalError
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
-from sitl.desk.port import RecordedPort, RecordingServer
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.dynamics import ATTITUDE, RATES, TICK_S

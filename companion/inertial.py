@@ -8,22 +8,48 @@ bias.
 
 from __future__ import annotations
 
+import threading
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.messages import Attitude, InertialSample
+from mavlink_bridge.messages import Attitude, GimbalAttitude, InertialSample, VehicleState
 
 Array = NDArray[np.float64]
 _LEAN_S = 20.0  # towards the autopilot's attitude
 _BIAS_S = 60.0  # of the gyros' bias
 _GAP_S = 0.3  # longer without samples the motion is unknown
 _KEPT = 1024
+
+
+class VehicleTelemetry(Protocol):
+    """What the monitor asks of the vehicle: the bridge, which lets no impossible number in."""
+
+    def state(self) -> VehicleState:
+        """What the vehicle says about itself."""
+        ...
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """Its attitude at a time."""
+        ...
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """What its IMU read after a time, oldest first."""
+        ...
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a time."""
+        ...
+
+    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -39,15 +65,22 @@ class InertialDisplacement:
 
 
 class InertialTrack:
-    """Integrates samples as they come; one thread. restarts counts the gaps."""
+    """Integrates samples as they come, for all who ask; any thread. restarts counts the gaps."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self.restarts = 0
         self.newest_ns = 0
         self._q: quat.Quaternion | None = None
         self._bias = np.zeros(3)
         self._last: tuple[int, Array] | None = None
         self._track: deque[InertialDisplacement] = deque(maxlen=_KEPT)
+
+    def follow(self, vehicle: VehicleTelemetry) -> None:
+        """Take in what the IMU read meanwhile."""
+        with self._lock:
+            for sample in vehicle.inertial_since(self.newest_ns):
+                self.add(sample, vehicle.attitude_at)
 
     def add(self, sample: InertialSample, attitude_at: Callable[[int], Attitude | None]) -> None:
         """One sample; without the autopilot's attitude it cannot be used."""
@@ -68,6 +101,10 @@ class InertialTrack:
 
     def at(self, time_ns: int) -> InertialDisplacement | None:
         """The integral at a time, linear between samples; None outside of them."""
+        with self._lock:
+            return self._at(time_ns)
+
+    def _at(self, time_ns: int) -> InertialDisplacement | None:
         track = self._track
         if not track or not track[0].time_ns <= time_ns <= track[-1].time_ns:
             return None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.calibration.desk.flight import DeskFlightRecord
 from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics
 from companion.flight.priors import AutopilotPose
@@ -27,7 +28,6 @@ from localizer.types import Frame, PoseEstimate
 from sitl.camera.movers import Mover
 from sitl.camera.realism import CameraClock, CameraRealism
 from sitl.camera.world_camera import CameraOptions, WorldCamera
-from sitl.desk.flight import DeskFlightRecord
 
 _LATENCY_NS = 120_000_000  # from the exposure to the estimate, as flights have it
 

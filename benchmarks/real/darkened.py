@@ -1,0 +1,121 @@
+"""How dark is too dark: images darkened step by step, and what is still accepted.
+
+    python -m benchmarks.real.darkened FOLDER [--sets fengyuan caliterra ...] [--images 10]
+
+FOLDER keeps the maps between runs. A sensor of 1.5 um pixels (6000 electrons at white, 2.5 of
+reading) gets ever less light, with a gain that is fixed or that rises to 16; the image is coded
+again as JPEG of quality 70. Each row is a set: of images that are accepted as they are, the share
+still accepted by `detail` of the darkened frame (`companion.integrity_monitor.video`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.common.arguments import Parser, whole
+from benchmarks.common.named_errors import named_errors, needs_torch
+
+with needs_torch():
+    from benchmarks.basin.views import load_views
+    from benchmarks.real.judged import judged_images
+    from benchmarks.real.sets import SETS, RealView, describe, load
+from companion.integrity_monitor.config import VideoCheckConfig
+from companion.integrity_monitor.video import detail, thumbnail
+from localizer.types import Image
+
+_LIGHTS = tuple((1.0 / n, gain) for gain in (1.0, 16.0)
+                for n in (64, 256, 512, 1024, 2048, 4096, 8192, 16384))  # fmt: skip
+_WHITE, _READ, _NATIVE_PX = 6000.0, 2.5, 1280
+_GAMMA, _QUALITY = 2.2, 70
+_ATTITUDE_DEG, _WIDTH = 1.0, 320
+_EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, np.inf)
+
+
+@dataclass(frozen=True)
+class DarkenedView(RealView):
+    """A view whose image gets a share of the light it was exposed for. light: 1 changes nothing."""
+
+    light: float = 1.0
+    most_gain: float = 1.0
+    seed: int = 0
+
+    def image(self) -> Image:
+        """See `RealView.image`."""
+        rgb = super().image()
+        if self.light == 1.0:
+            return rgb
+        rng = np.random.default_rng((self.seed, int(1.0 / self.light), int(self.most_gain)))
+        return darkened(rgb, self.light, self.most_gain, rng)
+
+
+def darkened(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
+    """An image (H, W, 3) with so much of its light; smaller ones count as binned."""
+    binned = (_NATIVE_PX / rgb.shape[1]) ** 2
+    white, read = _WHITE * binned, _READ * np.sqrt(binned)
+    electrons = (rgb.astype(np.float32) / 255.0) ** _GAMMA * (white * light)
+    noise = rng.standard_normal(electrons.shape, dtype=np.float32)
+    electrons += noise * np.sqrt(electrons + read**2)
+    shown = np.clip(electrons * min(1.0 / light, most_gain) / white, 0.0, 1.0) ** (1.0 / _GAMMA)
+    dark = (shown * 255.0 + 0.5).astype(np.uint8)
+    _, data = cv2.imencode(".jpg", dark[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return np.ascontiguousarray(decoded[..., ::-1])
+
+
+def rows(name: str, views: list[RealView]) -> Iterator[tuple[float, bool]]:
+    """Of every darkened image that is accepted as it is: (detail, accepted), from one prior."""
+    described = describe("quito" if name == "generated" else name)
+    good: set[int] = set()
+    for light, most_gain in ((1.0, 1.0), *_LIGHTS):
+        dark = [
+            DarkenedView(
+                v.map_cache, v.camera, v.truth, v.condition, v.file, v.rgb, light, most_gain, k
+            )
+            for k, v in enumerate(views)
+        ]
+        for j in judged_images(name, described, dark, _ATTITUDE_DEG, _WIDTH):
+            is_taken = j.accepted and j.right
+            if light == 1.0:
+                good |= {j.image} if is_taken else set()
+            elif j.image in good:
+                yield detail(thumbnail(dark[j.image].image())), is_taken
+
+
+def main() -> None:
+    p = Parser(__doc__)
+    p.add_argument("folder", type=Path, help="of the maps that are built")
+    p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real data")
+    p.add_argument("--sets", nargs="+", choices=(*SETS, "generated"), default=list(SETS))
+    p.add_argument("--images", type=whole(1, 100), default=10, help="of each set")
+    args = p.parse_args()
+    limit = VideoCheckConfig().low_detail
+    bins = list(itertools.pairwise(_EDGES))
+    print(
+        f"| set | {' | '.join(f'{a:g} to {b:g}' for a, b in bins)} | as they are, below {limit} |"
+    )
+    for name in args.sets:
+        if name == "generated":
+            made = load_views(name, args.folder, args.data, 40)
+            all_views = [
+                RealView(v.map_cache, v.camera, v.truth, v.condition, rgb=v.query) for v in made
+            ]
+        else:
+            all_views = load(name, args.folder, args.data)
+        found = list(rows(name, all_views[:: max(1, len(all_views) // args.images)][: args.images]))
+        cells = []
+        for low, high in bins:
+            some = [ok for figure, ok in found if low <= figure < high]
+            cells.append(f"{sum(some)} of {len(some)}")
+        alarms = sum(detail(thumbnail(v.image())) < limit for v in all_views)
+        print(f"| {name} | {' | '.join(cells)} | {alarms} of {len(all_views)} |", flush=True)
+
+
+if __name__ == "__main__":
+    with named_errors():
+        main()
