@@ -29,7 +29,6 @@ _POSITION_LOST_WITH_VELOCITY_MS = 10000
 _ATTITUDE_LOST_MS = 15000
 _GPS_GOOD_MS = 10000
 _HEIGHT_FRESH_MS = 500
-_DELTA_FRESH_MS = 5000
 _COMPASS_SIGMA = 0.25  # rad per sample; what EKF3's 0.05 gauss per axis amounts to in heading
 
 # EK3_SRCn_* values
@@ -61,7 +60,6 @@ class AidedFilter:
         self.aligned = False
         self._last_position_source = -1
         self._last_yaw_source = -1
-        self._delta_ms = -_DELTA_FRESH_MS
 
     def set_origin(self, origin: Location) -> bool:
         """Set the origin once; a second one is refused, silently, as EKF3 does."""
@@ -95,12 +93,6 @@ class AidedFilter:
     def _tell(self, severity: int, text: str) -> None:
         for lane in (0, 1):
             self._notify(severity, f"EKF3 IMU{lane} {text}")
-
-    @property
-    def holds_relative(self) -> bool:
-        """Whether changes of the position hold a relative one, as EKF3's body odometry does."""
-        fresh = self.gated.now_ms - self._delta_ms < _DELTA_FRESH_MS
-        return fresh and self.aiding is Aiding.ABSOLUTE
 
     # --- sources and aiding ------------------------------------------------------------------
 
@@ -230,7 +222,7 @@ class AidedFilter:
         vertical = observed.velocity[2] if self.source("VELZ") == EXTERNAL else None
         horizontal = (observed.velocity[0], observed.velocity[1])
         if observed.is_delta:
-            self._delta_ms = self.gated.now_ms
+            self.gated.clock.position_delta = self.gated.now_ms
         self.gated.fuse_velocity(horizontal, vertical, observed.sigma, observed.sigma)
 
     def _fuse_baro(self, height: float) -> None:

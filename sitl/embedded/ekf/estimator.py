@@ -25,6 +25,7 @@ from sitl.geodesy import Location
 _MAX_HORIZON_MS = 250
 _BASE_HORIZON_MS = 110
 _TICK_MS = 10
+_DELTA_FRESH_MS = 5000  # of a change of the position, as EKF3 has it for body odometry
 _MIN_EXTERNAL_INTERVAL_MS = 20
 
 
@@ -132,7 +133,9 @@ class Estimator:
     @property
     def position_valid(self) -> bool:
         """Whether a relative or absolute horizontal position is claimed."""
-        return self._is_absolute or self.sources.holds_relative
+        since_ms = self._gated.now_ms - self._gated.clock.position_delta
+        holds = self.sources.aiding is Aiding.ABSOLUTE and since_ms < _DELTA_FRESH_MS
+        return self._is_absolute or holds
 
     @property
     def _is_absolute(self) -> bool:
