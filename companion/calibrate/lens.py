@@ -15,8 +15,8 @@ from localizer.geometry.pose import Array
 
 _LEAST_VIEWS = 8
 _OUTLIER = 3.0  # medians of a view's own error: blurred, or a bent board
-_WORTH = 0.97  # k3 is used where the errors fall below this share without it
-_HONEST = 2.0  # a board is not flat, and its corners do not err independently
+_K3_GAIN = 0.97  # k3 is used where the errors fall below this share without it
+_SIGMA_FACTOR = 2.0  # a board is not flat, and its corners do not err independently
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstim
     if _LEAST_VIEWS <= len(kept) < len(used):
         used, fitted = kept, _fit(kept, (width, height), with_k3=False)
     more = _fit(used, (width, height), with_k3=True)
-    if more.rms < _WORTH * fitted.rms:
+    if more.rms < _K3_GAIN * fitted.rms:
         fitted = more
     K, d = fitted.K, fitted.distortion
     camera = Camera(
         width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]),
         (float(d[0]), float(d[1]), float(d[2]), float(d[3]), float(d[4])),
     )  # fmt: skip
-    return LensEstimate(camera, _HONEST * fitted.sigmas, fitted.rms, (len(used), len(views)))
+    return LensEstimate(camera, _SIGMA_FACTOR * fitted.sigmas, fitted.rms, (len(used), len(views)))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import CalibrationProblem, Guess
 from companion.calibrate.spatial_correlation import ImageNormalEquations, pictures_part
-from companion.calibrate.wander import AttitudeWander, Wander
+from companion.calibrate.wander import AttitudeProcess, GaussMarkovProcess
 from localizer.geometry.pose import Array
 
 _ROUNDS, _STEPS = 4, 5  # of noise, and of the poses and numbers under it
@@ -42,8 +42,8 @@ class Solution:
     covariance: Array
     information: Array
     pixel_sigma: float
-    attitude: AttitudeWander
-    place: Wander
+    attitude: AttitudeProcess
+    place: GaussMarkovProcess
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class _Noise:
 
     pixel_sigma: float
     weight: Array
-    attitude: AttitudeWander
-    place: Wander
+    attitude: AttitudeProcess
+    place: GaussMarkovProcess
 
 
 def solve(
@@ -66,8 +66,8 @@ def solve(
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
     prior: Array = 1.0 / sigmas**2 * np.where(still, 1e12, 1.0)
     up = guess.rotations[:, 2]
-    attitude = AttitudeWander(np.full(5, _FIRST["attitudes"]), _FIRST_MEMORY_S, up)
-    place = Wander(np.full(3, _FIRST["places"]), np.full(3, _FIRST_MEMORY_S))
+    attitude = AttitudeProcess(np.full(5, _FIRST["attitudes"]), _FIRST_MEMORY_S, up)
+    place = GaussMarkovProcess(np.full(3, _FIRST["places"]), np.full(3, _FIRST_MEMORY_S))
     noise = _Noise(1.0, np.ones(len(evidence.owner)), attitude, place)
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
@@ -96,14 +96,14 @@ def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise
     squares = (off**2).sum(axis=1)
     sigma = float(np.sqrt(np.median(squares) / (2.0 * np.log(2.0))))
     weight = 1.0 / (1.0 + squares / (_CAUCHY * sigma) ** 2)
-    attitude = AttitudeWander.of(
+    attitude = AttitudeProcess.of(
         evidence.attitudes(guess), guess.rotations[:, 2], evidence.times_s,
         _LEAST["attitudes"], _WHITE["attitudes"],
     )  # fmt: skip
     place, placed = before.place, evidence.placed
     if placed.any():
         left = evidence.places(guess)[placed]
-        place = Wander.of(left, evidence.times_s[placed], _LEAST["places"])
+        place = GaussMarkovProcess.of(left, evidence.times_s[placed], _LEAST["places"])
     return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
 
 
@@ -178,7 +178,7 @@ def _add_pictures(pictures: ImageNormalEquations, H: Array, g: Array) -> None:
 
 
 def _add_wander(
-    function: Callable[[Guess], Array], name: str, wander: Wander | AttitudeWander,
+    function: Callable[[Guess], Array], name: str, wander: GaussMarkovProcess | AttitudeProcess,
     evidence: CalibrationProblem, guess: Guess, H: Array, g: Array,
 ) -> None:  # fmt: skip
     """One account of the autopilot's: each value less what is left of the one before it."""

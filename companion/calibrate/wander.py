@@ -29,7 +29,7 @@ _FEW = 100  # frames suffice for the sigmas
 
 
 @dataclass(frozen=True)
-class Wander:
+class GaussMarkovProcess:
     """Along three axes, each for itself. sigma, memory_s: (3,)."""
 
     sigma: Array
@@ -48,7 +48,7 @@ class Wander:
         return made.reshape(-1, values.shape[2])
 
     @classmethod
-    def of(cls, left: Array, times_s: Array, least: float) -> Wander:
+    def of(cls, left: Array, times_s: Array, least: float) -> GaussMarkovProcess:
         """Of what is left over, (K, 3), whose mean was taken off it: by restricted likelihood
         (Patterson and Thompson 1971), and of memories that are about as likely the longest. Else
         what lasts looks shorter and smaller than it is, and so do the sigmas of what is found.
@@ -68,7 +68,7 @@ class Wander:
             sigmas[axis], memories[axis] = found[longest][1], _MEMORIES_S[longest]
         return cls(sigmas, memories)
 
-    def over_long_steps(self, left: Array, times_s: Array) -> Wander:
+    def over_long_steps(self, left: Array, times_s: Array) -> GaussMarkovProcess:
         """The same memories, with no smaller sigmas than steps of `_LONG_STEP_S` say. From picture
         to picture an EKF smooths its receiver's errors, and the poses that were solved for follow
         it: those steps are too small for how far it strays in a minute. left: (K, 3).
@@ -86,7 +86,7 @@ class Wander:
                 squares += _restricted(left[k::stride, axis], np.diff(some), memory_s)[0]
                 told += len(some) - 1
             sigma[axis] = max(sigma[axis], np.sqrt(squares / told))
-        return Wander(sigma, self.memory_s)
+        return GaussMarkovProcess(sigma, self.memory_s)
 
 
 def _restricted(errors: Array, gaps_s: Array, memory_s: float) -> tuple[float, float]:
@@ -103,7 +103,7 @@ def _restricted(errors: Array, gaps_s: Array, memory_s: float) -> tuple[float, f
 
 
 @dataclass(frozen=True)
-class AttitudeWander:
+class AttitudeProcess:
     """Of attitudes, rad. sigma: (5,) about the camera's axes, and about the vertical of a gimbal
     and of a compass; the gimbal's errors last for memory_s. up: (K, 3), the vertical in each
     camera's axes.
@@ -114,7 +114,7 @@ class AttitudeWander:
     up: Array
 
     def whitened(self, values: Array, times_s: Array, white: float) -> Array:
-        """As `Wander.whitened`."""
+        """As `GaussMarkovProcess.whitened`."""
         C: Array = np.eye(self.up.size) * white**2
         for part in _covariances(np.log(self.sigma), self.memory_s, self.up, times_s):
             C += part
@@ -125,10 +125,10 @@ class AttitudeWander:
     @classmethod
     def of(
         cls, left: Array, up: Array, times_s: Array, least: float, white: float
-    ) -> AttitudeWander:
-        """Of what is left over, (K, 3), from which a mounting and a heading were taken: by
-        restricted likelihood, as `Wander.of`. A flight that cannot tell the vertical from the
-        boresight shares the error out between them.
+    ) -> AttitudeProcess:
+        """Of residuals (K, 3) after a mounting and a heading were estimated, by restricted
+        likelihood as `GaussMarkovProcess.of`. If a flight cannot separate vertical and boresight,
+        they share the error.
         """
         few = np.unique(np.linspace(0, len(times_s) - 1, min(_FEW, len(times_s))).round())
         k = few.astype(int)

@@ -1,3 +1,3 @@
-"""In flight: whether the camera is as the deployment says, from the fixes themselves. Told, and no
-number changed; ``companion.calibrate`` finds the numbers.
+"""In flight: checks by the fixes themselves whether the camera is as the deployment says. It raises
+alerts and changes no number; ``companion.calibrate`` estimates the numbers.
 """

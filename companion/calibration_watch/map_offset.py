@@ -1,7 +1,7 @@
-"""How far the map lies beside GNSS: estimated while GNSS is healthy, told, applied on wish.
+"""Estimates, reports and optionally applies the map's offset from GNSS.
 
-Orthophotos are often metres off. As long as GNSS is followed that shows as a constant difference
-between vision and the EKF; afterwards nothing would tell it any more.
+Orthophotos are often metres off. While the EKF follows GNSS, the offset is a constant difference
+between vision and the EKF. After the loss of GNSS it cannot be observed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import Compass, MapOffsetUse
+from mavlink_bridge.alerts.words import Direction, MapOffsetUse
 from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
 from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
@@ -36,7 +36,7 @@ _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the monitor's m
 _AGAIN_M = 2.0  # by which another estimate is reported again
 _OUTLIER = 3.0  # robust sigmas of a block's median
 _SLEW_M_S = 0.2  # of what is applied: far below what the EKF or the monitor take for a motion
-_WINDS = tuple(Compass)
+_WINDS = tuple(Direction)
 
 Policy = Literal["tell", "apply"]
 
@@ -69,7 +69,7 @@ class MapOffset:
     significant: bool
 
     @property
-    def direction(self) -> Compass:
+    def direction(self) -> Direction:
         """Of the map from GNSS."""
         north, east = self.ne_m
         return _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]
@@ -93,11 +93,11 @@ def estimate(blocks: Array, bias_m: float) -> MapOffset:
 
 
 class MapOffsetEstimator:
-    """A judge of fixes (`FixInjection.add_judge`) that leaves them as they are, or shifts them.
+    """A judge of fixes (`FixInjection.add_judge`) that passes them on unchanged or shifted.
 
-    It stands before the others: whatever compares fixes with GNSS compares what is injected. What
-    it knows it keeps when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the receiver
-    that the vehicle reports is our own injection, of which nothing can be learned.
+    It comes before the other judges, so that they compare with GNSS what is injected. It keeps its
+    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the vehicle's receiver
+    is our own GPS_INPUT, which shows nothing.
     """
 
     def __init__(

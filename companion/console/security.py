@@ -92,7 +92,7 @@ class _Bucket:
         return True
 
 
-class Guarded:
+class RequestGuard:
     """An ASGI application that lets through only what may pass to `app`."""
 
     def __init__(

@@ -23,7 +23,7 @@ from companion.console import deployment, exports
 from companion.console.examination import Examination
 from companion.console.pictures import WIDTHS_PX, page_message
 from companion.console.records import Records, archive
-from companion.console.security import REPORT_POLICY, Guarded
+from companion.console.security import REPORT_POLICY, RequestGuard
 from companion.console.source import ConsoleSource, sample_of
 from companion.console.tiles import TileName, TopTiles
 from companion.errors import CompanionError
@@ -302,7 +302,7 @@ class Views:
             raise RefusedError("not while the vehicle is armed")
 
 
-def make_application(site: ConsoleSite) -> Guarded:
+def make_application(site: ConsoleSite) -> RequestGuard:
     """The whole site."""
     views, pages = Views(site), Pages(site.source)
 
@@ -332,7 +332,7 @@ def make_application(site: ConsoleSite) -> Guarded:
         WebSocketRoute("/ws", pages.serve),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]
-    return Guarded(Starlette(routes=routes, lifespan=lifespan), site.config, site.token)
+    return RequestGuard(Starlette(routes=routes, lifespan=lifespan), site.config, site.token)
 
 
 def _named(answer: Answer) -> Answer:
@@ -357,7 +357,7 @@ async def _object(request: Request) -> dict[str, Any]:
         raise RefusedError("the body is JSON")
     try:
         value = json.loads(await request.body())
-    except ClientDisconnect as error:  # `Guarded` ended it, too
+    except ClientDisconnect as error:  # `RequestGuard` ended it, too
         raise RefusedError("the body is too long") from error
     except (ValueError, RecursionError) as error:
         raise RefusedError(f"not JSON: {error}") from error

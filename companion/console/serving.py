@@ -1,7 +1,7 @@
-"""The HTTP server under the page: uvicorn's, with no patience for requests that never become whole.
+"""The page's HTTP server: uvicorn with a time limit for incomplete requests.
 
-uvicorn waits for ever for the rest of a request, and counts who waits among the connections that
-may be open: a hundred clients that send half a line each would keep the operator out.
+uvicorn waits without limit for the rest of a request and counts it among the open connections. So a
+hundred clients that send half a line each would lock the operator out.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MOST_WAITING = 32  # connections without a whole request: one more, and the olde
 _MOST_CONNECTIONS = 64
 
 
-class HurriedProtocol(H11Protocol):
+class RequestTimeoutProtocol(H11Protocol):
     """Closes what does not bring a whole request in time, and the oldest such where many wait."""
 
     _deadline: asyncio.TimerHandle | None = None
@@ -37,7 +37,7 @@ class HurriedProtocol(H11Protocol):
         self._begin()
         waiting = [
             (other.due_s, id(other), other) for other in self.connections
-            if isinstance(other, HurriedProtocol) and other.due_s is not None
+            if isinstance(other, RequestTimeoutProtocol) and other.due_s is not None
         ]  # fmt: skip
         if len(waiting) > MOST_WAITING:
             min(waiting)[-1].give_up()
@@ -82,7 +82,7 @@ class Server(uvicorn.Server):
         super().__init__(
             uvicorn.Config(
                 make_application(site), host=config.host, port=config.port, log_level="warning",
-                http=HurriedProtocol, ws="websockets-sansio", ws_max_size=4096,
+                http=RequestTimeoutProtocol, ws="websockets-sansio", ws_max_size=4096,
                 # JPEGs do not get smaller, and trying costs both ends.
                 ws_per_message_deflate=False,
                 limit_concurrency=_MOST_CONNECTIONS, timeout_keep_alive=5,

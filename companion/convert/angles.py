@@ -70,9 +70,9 @@ def pose_of_autopilot(angles: AutopilotAngles, frame: LocalFrame) -> Pose:
 def autopilot_of_pose(
     name: str, time_ns: int | None, pose: Pose, frame: LocalFrame
 ) -> AutopilotAngles:
-    """A vehicle that would see so: level, its nose where the camera looks, the rest the gimbal's.
+    """A vehicle with this view: level, heading as the camera, roll and pitch by the gimbal.
 
-    A camera's pose alone does not say how the vehicle was tilted.
+    A camera's pose alone does not determine the vehicle's attitude.
     """
     position = frame.position(pose.translation)
     gimbal = gimbal_of_pose(pose, frame)

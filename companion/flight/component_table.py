@@ -39,7 +39,7 @@ from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.klv.metadata import KlvContext
 from companion.klv.relay import KlvRelay
-from companion.live.orders import Helm, OrderError, Orders
+from companion.live.orders import OrderContext, OrderError, Orders
 from companion.live.protocol import socket_path
 from companion.live.publisher import Publisher
 from companion.live.shown import Instruments, Shown
@@ -418,7 +418,7 @@ def _console(making: BuildContext) -> Publisher:
     def track(request: TrackRequest) -> None:
         bridge.track(replace(request, time_ns=request.time_ns + late_ns))
 
-    helm = Helm(bridge.report_alert, track, hint)
+    helm = OrderContext(bridge.report_alert, track, hint)
     orders = Orders(config.console.control, helm)
     record = None if config.record is None else config.record.folder
     path = socket_path(config.map, record, config.console.listen)

@@ -49,7 +49,9 @@ _OF_STATE = {
 
 @dataclass(frozen=True)
 class HealthStatus:
-    """alerts: that are true now, worst first. is_reported: somebody else told the worst one."""
+    """alerts: that are true now, worst first. is_reported: another component has reported the worst
+    one.
+    """
 
     level: HealthLevel
     alerts: tuple[Alert, ...]
@@ -295,7 +297,7 @@ def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
 
 
 def _file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:
-    """``health.json``, told once where a full disk does not take it."""
+    """``health.json``; a disk that does not take it is reported once."""
     path = folder / "health.json"
     return NewestFile(path, lambda e: event("warning", f"{path} cannot be written: {e}"))
 

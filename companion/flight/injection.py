@@ -1,6 +1,6 @@
-"""Estimates become fixes for the flight controller, unless somebody has a reason against them.
+"""Turns estimates into fixes for the flight controller, unless a judge objects.
 
-A fix is made once, for injection and for those who only watch.
+Each fix is made once, for injection and for those who only observe.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class LastFix:
     autopilot_ns: int | None = None
     origin: tuple[float, float, float] | None = None
 
-    def counts_alike(self, state: VehicleState, time_ns: int) -> bool:
+    def has_same_origin(self, state: VehicleState, time_ns: int) -> bool:
         """Whether the EKF still counts its position from where it did: not after a reboot of the
         autopilot, whose clock restarted, nor about another origin.
         """
@@ -159,8 +159,8 @@ class FixMemory:
         self._leaves = True
 
     def stop(self) -> None:
-        """Stop keeping; a flight that ended in order leaves nothing to go on from. A disk that
-        stands still is left behind.
+        """Stop keeping. A flight that ended in order leaves no fix to start from. A disk that does
+        not respond is not waited for.
         """
         self._stop.set()
         if joined(self._thread) and self._path is not None and not self._leaves:
@@ -186,7 +186,7 @@ class FixMemory:
         local, rotation = self._local_at(time_ns), self._autopilot.rotation(time_ns)
         if local is None or rotation is None:
             return None
-        if not last.counts_alike(self._state(), time_ns):
+        if not last.has_same_origin(self._state(), time_ns):
             self._before = None
             return None
         way = np.array(local[:3]) - np.array(last.local_ned)

@@ -78,8 +78,8 @@ def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] |
 
 @dataclass(frozen=True)
 class Belief:
-    """How well the autopilot's position may be believed. independent: it owes our own fixes
-    nothing. sigma_m: horizontal, one sigma; None: nothing is known.
+    """How far the autopilot's position can be trusted. independent: it does not derive from our own
+    fixes. sigma_m: horizontal, one sigma; None: nothing is known.
     """
 
     sigma_m: float | None
@@ -261,7 +261,7 @@ class AutopilotPose:
 
 
 class PriorSources:
-    """Whoever may know where the camera is, asked in order; the first answer counts."""
+    """Sources of a pose prior, asked in order; the first answer counts."""
 
     def __init__(self, *sources: PriorProvider) -> None:
         self._sources = sources

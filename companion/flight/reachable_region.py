@@ -1,8 +1,8 @@
-"""Where the camera can be since the map last said where it was.
+"""The region in which the camera can be since the last registration.
 
-An EKF that has lost its position says nothing of the place, but the aircraft has not left the
-neighbourhood: it was seen seconds ago, moved as its IMU says, and no faster than it can. So a
-search need not begin with the whole map, where other ground looks like the frame's.
+An EKF that has lost its position gives none, but the aircraft was located seconds ago, moved as its
+IMU says, and no faster than it can. So a search need not begin with the whole map, where other
+ground looks similar.
 """
 
 from __future__ import annotations

@@ -354,7 +354,7 @@ class Recorder:
 
 
 def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | None:
-    """``record.mcap``; None, and told, where it cannot be had: the tables suffice."""
+    """Open ``record.mcap``. None, with a warning, if that fails: the tables hold the record."""
     try:
         from companion.export.mcap_file import McapFile
 
@@ -369,7 +369,7 @@ def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | 
 
 
 class RecordKeeper:
-    """The record of one process, where the disk takes one: this may be a restart in the air.
+    """The record of one process, if the disk takes one (this may be a restart in the air).
 
     say_incomplete: tells the operator why something is missing in it; from any thread.
     """

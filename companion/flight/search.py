@@ -274,7 +274,7 @@ class PlaceSearch:
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 
     def prepare(self) -> None:
-        """Make the search ready on this thread; what hinders it is told."""
+        """Make the search ready on this thread; report what prevents it."""
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)

@@ -136,7 +136,7 @@ class IntegrityChecks:
         return holding == {AlertId.HPL_OVER_LIMIT}
 
     def restore(self, found: ActiveAlerts) -> None:
-        """What stood in a process before this one stands until evidence speaks against it."""
+        """Alerts of the process before this one stay active until evidence clears them."""
         for of, (figure, word) in found.items():
             self._debouncers[of].restore(figure, word)
 
@@ -220,11 +220,11 @@ class IntegrityChecks:
         return [alert for alert in updates if alert is not None]
 
     def _doubt_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
-        """What the newest fix, or the stamps since, leave in doubt of the positions."""
+        """By how much the newest fix, or the time stamps since, make positions uncertain."""
         if not state.armed:
             self._steps.begins_anew()
         elif self._jumps.announced and admitted:
-            self._steps.is_found_anew()
+            self._steps.is_found_again()
         elif self._jumps.step is not None:
             found = self._steps.add(self._jumps.step)
             if found is not None:
@@ -234,8 +234,8 @@ class IntegrityChecks:
             self._steps.stamps_are_right()
 
     def _leave_out_old_pictures(self) -> None:
-        """A picture that stands still or comes again shows no camera: its sightings agree with no
-        motion, which looks like late stamps (a frozen hover was blamed on them, ArduPilot).
+        """Frozen or repeated frames show no motion, which looks like late time stamps (ArduPilot: a
+        frozen hover was blamed on them).
         """
         if self._picture is None:
             return
@@ -259,10 +259,11 @@ class IntegrityChecks:
     # --- judgement ----------------------------------------------------------------------------
 
     def _results(self, now_ns: int, state: VehicleState) -> dict[AlertId, CheckResult]:
+        """Of each check, at a time: None as `bad` where it has no evidence."""
         newest = self._newest
         fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
         height = state.altitude_relative_m
-        # Below take-off it flies, too: it began on a hill.
+        # It may fly below its take-off height, from a hill.
         flies = state.armed and (height is None or abs(height) >= _AIRBORNE_M)
         none = CheckResult(None)
         checks: dict[AlertId, Callable[[], CheckResult]] = {
@@ -337,9 +338,9 @@ class IntegrityChecks:
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
-        """Whether the EKF flew metres while the picture stood still; a hover is too slow to tell.
+        """Whether the EKF moved by metres during a frozen frame; in a hover that is not known.
 
-        The EKF still has its speed then: it takes a second or two to follow a frozen position.
+        The EKF keeps its speed at first: it follows a frozen position after a second or two.
         """
         if state.local_velocity_ned is None or verdict.still_s < _MOVED_LEAST_S:
             return False

@@ -1,7 +1,8 @@
-"""Vision's heading against the gyros': a place whose frame turned is not where the aircraft is.
+"""Compares vision's heading with the gyros': a frame that turned puts the position elsewhere.
 
-A frame turned by 5 degrees about home puts a hover at 120 m 10 m aside. From then on it moves as
-the IMU does, so its motion never speaks against it; the turn does, against gyros and autopilot.
+A map frame turned by 5 degrees about home puts a hover at 120 m 10 m aside. From then on the
+position moves as the IMU does, so its motion shows no fault. The turn itself does, against gyros
+and autopilot.
 """
 
 from __future__ import annotations

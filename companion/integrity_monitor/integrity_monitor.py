@@ -32,14 +32,14 @@ _LOCK_S = 1.0  # a turn takes a twentieth of it
 
 
 class IntegrityMonitor:
-    """Watches pictures, fixes and the vehicle, tells the operator, and withholds fixes.
+    """Checks frames, fixes and the vehicle; reports alerts and holds output.
 
-    Pictures come from the feed's thread and fixes from the localization thread; neither waits for
-    more than the lock. What is costly happens on a thread of its own, ten times a second.
+    Frames come from the feed's thread and fixes from the localization thread; neither waits for
+    more than the lock. Costly checks run on a thread of their own, ten times a second.
 
-    What cannot be judged is withheld: a position that nobody watches is believed unwarned. A fix
-    that fails it costs itself; a thread that fails for a second, or takes no turn for two, costs
-    all until it turns again. Then those who ask tell it: its own thread cannot.
+    If a check raises an exception, that fix is dropped. If the monitor's thread fails for one
+    second or makes no progress for two, output stops until it runs again; then the calling threads
+    report it.
 
     Above 200 lines: it wires every check to its alert, and the checks share the debounced state.
     """
@@ -95,7 +95,9 @@ class IntegrityMonitor:
             self._memory.stop(clean_shutdown=False)
 
     def watch(self, last_ticks_ns: Callable[[], Mapping[str, int]]) -> None:
-        """Tell of parts that stand. turns: when each began its newest turn, CLOCK_MONOTONIC ns."""
+        """Report components that stall. last_ticks_ns: when each began its newest turn,
+        CLOCK_MONOTONIC ns.
+        """
         self._turns = last_ticks_ns
 
     def see(self, time_ns: int, image: Image) -> None:
@@ -161,7 +163,7 @@ class IntegrityMonitor:
                 self._lock.release()
 
     def _hangs(self) -> bool:
-        """Whether its thread stands; told by whoever asks."""
+        """Whether the monitor's own thread has stalled; the calling threads report it."""
         now_ns = self._clock()
         if now_ns - self.last_tick_ns < _STANDS_NS:
             return False
@@ -197,7 +199,7 @@ class IntegrityMonitor:
             self._bridge.report_alert(alert)
 
     def _tell_what_stands(self, now_ns: int) -> None:
-        """Another part that takes no turns tells nothing any more: its last word would stand."""
+        """Report a stalled component: its last state would be taken for the present one."""
         last_ticks_ns = self._turns()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
@@ -212,7 +214,7 @@ class IntegrityMonitor:
             return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_TURNS
 
     def _fail(self, what: str) -> None:
-        """A monitor that died in silence would be believed: told with its next turn."""
+        """Note a failure of the monitor; the next turn reports it."""
         with self._failures:
             count = self._fails[what] = self._fails.get(what, 0) + 1
         if count == 1:

@@ -37,7 +37,7 @@ class EkfDisplacement:
         self._way: deque[tuple[int, Metres, Metres]] = deque(maxlen=_KEPT)  # time, velocity, way
 
     def add(self, state: VehicleState) -> None:
-        """The newest velocity; after a hole in them, or of the clock, the way restarts."""
+        """Integrate the EKF's newest velocity. A gap in its time stamps restarts the integral."""
         if state.local_velocity_ned is None:
             return
         north, east, _ = state.local_velocity_ned

@@ -1,10 +1,10 @@
-"""Vision's displacement against the IMU's over 1, 3 and 10 s.
+"""Compares vision's displacement with the IMU's over 1, 3 and 10 s.
 
-The EKF cannot be asked: on vision alone it follows what it is fed. A small filter of its own
-predicts each fix from those before and the IMU; a frozen or foreign picture of a moving aircraft
-is metres off that prediction within a second. A hover gives the IMU little to contradict: a tenth
-of a metre per second squared is what its tilt may be wrong by. There the pictures must tell; a
-position that stands still is no fault by itself, only no proof that a fault is over.
+The EKF cannot be the reference: on vision alone it follows what it is fed. A small filter predicts
+each fix from earlier fixes and the IMU. A frozen or foreign image of a moving aircraft is metres
+off that prediction within a second. In a hover the IMU shows little: its tilt may be wrong by a
+tenth of a metre per second squared. There the images must show a fault. A position that does not
+move is no fault, but it does not prove that a fault is over.
 """
 
 from __future__ import annotations

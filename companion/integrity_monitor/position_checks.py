@@ -82,7 +82,7 @@ class HeightCheck:
 
 
 class GnssCheck:
-    """GNSS against vision while GNSS is there, whatever mode; neither is said to be right."""
+    """Compares GNSS with vision while GNSS is there, in every mode; neither counts as the truth."""
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
         self._cap_m = config.gnss_accuracy_cap_m

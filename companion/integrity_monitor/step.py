@@ -27,7 +27,7 @@ _SPEED_MPS = 1.0  # what leads from one to the next may be off by
 
 @dataclass(frozen=True)
 class PositionStep:
-    """A position off from where the one before led. offset_m, velocity: (north, east), m, m/s.
+    """Offset of a position from its prediction. offset_m, velocity: (north, east), m, m/s.
 
     sigma_m: of the position. allowed_m: what the offset may be; growth_m: of that, what the time
     between the two adds; after_s: that time.
@@ -43,18 +43,18 @@ class PositionStep:
 
     @property
     def is_led(self) -> bool:
-        """Whether it came soon, to where the one before led."""
+        """Whether it came soon and near the prediction."""
         return self.after_s <= _SOON_S and math.hypot(*self.offset_m) <= self.allowed_m
 
     @property
     def is_suspect(self) -> bool:
-        """Whether it is more than noise and time explain, and enough to matter."""
+        """Whether it exceeds what noise and elapsed time explain, and `STEP_M`."""
         return math.hypot(*self.offset_m) > max(self.allowed_m, STEP_M)
 
 
 @dataclass(frozen=True)
 class _Off:
-    """What all steps together lead to, at a time: metres off a dead reckoning."""
+    """Sum of all steps at a time: metres from dead reckoning."""
 
     time_ns: int
     north: float
@@ -182,7 +182,7 @@ class StepUncertainty:
         """Known since the last step: it was no delay, so what lies along the way is none."""
         self._leave(0.0, self._across_m)
 
-    def is_found_anew(self) -> None:
+    def is_found_again(self) -> None:
         """The place was searched and confirmed: what lies across the way is settled."""
         self._finder.forget()
         self._leave(self._along_m, 0.0)

@@ -1,7 +1,8 @@
-"""Vision's roll and pitch against the autopilot's and the gimbal's.
+"""Compares vision's roll and pitch with the autopilot's and the gimbal's.
 
-Low over ground that shows little, a tilt and a shift look alike: the position is wrong by the tilt
-times the height, its motion is nearly right, and the picture matches. Gravity knows the tilt.
+Low over ground with little structure, a tilt and a shift have the same effect on the image: the
+position is wrong by the tilt times the height, its motion is nearly right, and the image matches.
+The gravity direction of the other sensors shows the tilt.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""Whether the video still lives: identical, standing still, or repeated pictures.
+"""Detects identical, frozen and repeated frames.
 
-A localizer registers a frozen picture as perfectly as a fresh one, and the clock of a hung encoder
-goes on. A flying camera, however, never stands still: what the aircraft sways moves the picture by
-more than the hundredth of a pixel to which two pictures can be compared as a whole. The comparison
-is a least-squares fit of shift, rotation, scale, gain and offset between two thumbnails, so the
-error of an encoder, fresh noise or another exposure on a frozen picture are not taken for motion:
-they do not move edges.
+A localizer registers a frozen frame as well as a fresh one, and the clock of a hung encoder runs
+on. But a flying camera always moves: the aircraft's sway moves the image by more than the hundredth
+of a pixel to which two images can be compared. The comparison is a least-squares fit of shift,
+rotation, scale, gain and offset between two thumbnails. Encoder errors, noise and another exposure
+do not move edges, so they do not count as motion.
 """
 
 from __future__ import annotations

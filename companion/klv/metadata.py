@@ -1,4 +1,4 @@
-"""What is told of one picture: from its pose, the map and the newest target to ST 0601's fields."""
+"""The ST 0601 fields of one frame, from its pose, the map and the newest target."""
 
 from __future__ import annotations
 

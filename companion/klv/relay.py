@@ -45,7 +45,7 @@ class KlvRelay:
     """A `PacketTap` that writes to `config.output` on a thread of its own.
 
     attitude: the aircraft's, NED from body (3, 3), at a time; None where it is not known.
-    utc_minus_monotonic_ns: of this computer. Whatever fails here is counted, and told once.
+    utc_minus_monotonic_ns: of this computer. Failures are counted and reported once.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ class OrderError(CompanionError):
 
 
 @dataclass(frozen=True)
-class Helm:
+class OrderContext:
     """What orders act on. report: tells the operator and the log; track: a click, its time that of
     the frame that it points into; hint: (latitude_deg, longitude_deg, radius_m), raises
     `OrderError` for a place off the map.
@@ -41,7 +41,7 @@ class Orders:
     """Carries out the console's orders, if `control` is on; each is reported."""
 
     def __init__(
-        self, control: bool, helm: Helm, clock: Callable[[], float] = time.monotonic
+        self, control: bool, helm: OrderContext, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._control, self._helm, self._clock = control, helm, clock
         self._taken: deque[float] = deque(maxlen=_MOST)

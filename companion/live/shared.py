@@ -1,9 +1,9 @@
-"""Memory in which a picture passes from the flight to one console, without a copy through a socket.
+"""Shared memory that passes a frame from the flight to one console without a copy through a socket.
 
-2 MB through a stream socket are a dozen pieces: for each the flight's thread is woken, and waits
-for a console that stands far behind it in priority. Here the flight writes once, into memory that
-it allocated; the console is told by a message and says when it has read. Neither side maps it: who
-shortens a mapped file kills who reads there, and each may be anybody's to the other.
+Through a stream socket, 2 MB are a dozen pieces. For each, the flight's thread would wake and wait
+for a console of much lower priority. Here the flight writes once, into memory that it allocated. A
+message announces the frame, and the console answers when it has read it. Neither side maps the
+memory, because whoever shortens a mapped file kills the process that reads it.
 """
 
 from __future__ import annotations

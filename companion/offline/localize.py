@@ -57,9 +57,9 @@ def localize_images(
 ) -> Iterator[LocalizedImage]:
     """Localize images in their order.
 
-    An image named in `priors` starts from its own; the others go on from the one before, as a
-    video's frames do. An image that cannot be used, or that is outside the map, is told and left
-    out.
+    An image named in `priors` starts from its own prior; the others continue from the image before,
+    as frames of a video do. An image that cannot be used, or that is outside the map, is reported
+    and left out.
     """
     for sequence, (path, time_ns) in enumerate(zip(images, times_ns, strict=True)):
         prior = priors.get(path.name)

@@ -1,8 +1,8 @@
-"""A recorded flight through the parts of the flight process: what they would have told and held.
+"""Runs a recorded flight through the parts of the flight process: which alerts and holds result.
 
 The parts are those of `companion.flight.component_table`, not started: bridge and integrity monitor
-take their turns by the record's clock, and frames are localized one after the other. What the
-threads of a flight leave out when the processor is busy is not in it.
+run by the record's clock, and frames are localized one after the other. Frames that a busy
+processor would drop are not simulated.
 """
 
 from __future__ import annotations

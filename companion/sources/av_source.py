@@ -45,7 +45,7 @@ from companion.sources.datagrams import (
 )
 from companion.sources.misp import MispTime, parse_message
 from companion.sources.references import Damage, References
-from companion.sources.sdp import Session
+from companion.sources.sdp import SdpSession
 from companion.sources.timing import ExposureClock, FrameTimestamps
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange, grey_levels
@@ -518,7 +518,7 @@ def live_input(
         lock = SenderLock(settings.sender, round(settings.stall_timeout_s * 1e9))
         sets = b""
         if location.endswith(".sdp"):
-            session = Session.read(Path(location))
+            session = SdpSession.read(Path(location))
             address, sets = UdpAddress(session.host, session.port), session.sets
         else:
             address = UdpAddress.parse(location)

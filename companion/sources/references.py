@@ -1,11 +1,10 @@
-"""Whether a picture was predicted from one that was lost or damaged.
+"""Detects frames that were predicted from a lost or damaged frame.
 
-A decoder marks a picture of which a part did not come, and fills the part from the picture before;
-those that are predicted from it carry the part on without a mark (`Damage`, any codec). A decoder
-that misses a whole picture repeats the one before in its place and goes on: what follows is sharp,
-of good quality, without a mark, and shows the ground as it was one picture earlier until the next
-key frame. H.264's `frame_num` counts reference pictures, so that a gap in it tells the loss
-(`References`; ITU-T H.264, 7.3 and 7.4.3).
+A decoder marks a frame of which a part is missing and fills the part from the frame before. Frames
+predicted from it repeat the fault without a mark (`Damage`, any codec). If a whole frame is
+missing, the decoder repeats the frame before and continues: what follows is sharp and unmarked, and
+shows the ground as it was one frame earlier until the next key frame. H.264's `frame_num` counts
+reference frames, so a gap in it shows the loss (`References`; ITU-T H.264, 7.3 and 7.4.3).
 """
 
 from __future__ import annotations
@@ -86,10 +85,10 @@ class Damage:
         self._has_begun = False
 
     def is_damaged(self, arrival_ns: int, *, marked: bool, clean: bool) -> bool:
-        """Whether this picture is damaged itself or leans on one that is.
+        """Whether this frame is damaged or predicted from a damaged one.
 
-        marked: the decoder says so of it. clean: it is predicted from none. After 5 s the stream
-        has mended itself, or never will: one without key frames is refreshed part by part.
+        marked: the decoder's own mark. clean: the frame is predicted from none. After 5 s the
+        stream counts as whole: one without key frames is refreshed part by part.
         """
         self._has_begun = True
         waited = self._since_ns is not None and arrival_ns - self._since_ns > _LONGEST_NS
@@ -106,10 +105,10 @@ class Damage:
 
 
 class References:
-    """Follows a stream's `frame_num`; `is_broken` for each packet (one picture), in order.
+    """Follows a stream's `frame_num`; call `is_broken` for each packet (one frame), in order.
 
-    A stream that is not H.264 with start codes, or whose encoder does not count as the standard
-    says, is never broken, as far as can be said here.
+    A stream without H.264 start codes, or whose encoder does not count as the standard demands,
+    never counts as broken.
     """
 
     def __init__(self, extradata: bytes = b"") -> None:
@@ -123,10 +122,10 @@ class References:
             self._learn(nal)
 
     def is_broken(self, packet: bytes, arrival_ns: int) -> bool:
-        """Whether this packet's picture leans on one that never came.
+        """Whether this packet's frame is predicted from a frame that never came.
 
-        It ends with a picture that leans on none, after as many as a recovery point says, and
-        after 5 s at the latest: a stream without key frames has mended itself by then, or never.
+        That ends with a frame that is predicted from none, after as many frames as a recovery point
+        names, and after 5 s at the latest (a stream without key frames).
         """
         slices = []
         for nal in _nal_units(packet):

@@ -22,7 +22,7 @@ _MOST_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
-class Session:
+class SdpSession:
     """host: to listen on, a multicast group, or 0.0.0.0. sets: the parameter sets, Annex B."""
 
     host: str
@@ -30,7 +30,7 @@ class Session:
     sets: bytes
 
     @classmethod
-    def read(cls, path: Path) -> Session:
+    def read(cls, path: Path) -> SdpSession:
         """`StreamOpenError` for a file without RTP video of H.264 or H.265."""
         try:
             text = plain_text(path, _MOST_BYTES)

@@ -78,9 +78,9 @@ def longer(camera: Camera, factor: float) -> Camera:
 
 
 class FocalCorrection:
-    """What pictures say of the table's error at this zoom: the logarithm of the true focal length
-    over the table's. It is held as unsure as the bound until pictures tell it, and again once the
-    lens has moved on: a table is wrong elsewhere by something else.
+    """The zoom table's error at this zoom as images show it: the logarithm of the true focal length
+    over the table's. Its sigma is the bound until images measure it, and again once the lens has
+    moved, because the table's error differs from zoom to zoom.
     """
 
     def __init__(self, bound: float) -> None:

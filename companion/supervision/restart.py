@@ -24,10 +24,10 @@ _STILL = "does not answer"
 def without_lost_disks(
     config: CompanionConfig, probe: Callable[[Path], str] | None = None
 ) -> tuple[CompanionConfig, str]:
-    """The deployment without the files that have no disk any more, and what is left out, empty for
-    nothing. What a full or failing disk costs is each part's own to tell (`DiskFaultError`).
+    """The deployment without the files whose disk is gone, and what was left out (empty: nothing).
+    A full or failing disk is reported by the component that writes (`DiskFaultError`).
 
-    probe: why a folder cannot be written to; empty if it can.
+    probe: gives the reason why a folder cannot be written to; empty if it can.
     """
     bridge, record, state = config.bridge, config.record, config.state_folder
     beside = None if record is None else record.folder.parent

@@ -9,7 +9,7 @@ import numpy as np
 from localizer.config import LocalizerConfig
 from localizer.features.extractor import FeatureExtractor
 from localizer.forecast.risk import RIGHT_M, WORST_M, Figures, expected_sigma_m, failure_risk
-from localizer.forecast.rivals import AmbiguousPosition, likest_rival
+from localizer.forecast.rivals import AmbiguousPosition, most_similar_rival
 from localizer.forecast.visit import another_visit
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -101,7 +101,7 @@ class Forecaster:
                 origin = local_origin(anchors, view.world_from_camera)
                 problems = level_problems(query, self._camera, anchors, origin)
                 levels = problems[: len(self._optimizer.config.iterations)]
-                rival = likest_rival(
+                rival = most_similar_rival(
                     self._optimizer, levels, origin, view.world_from_camera, _width_m(view)
                 )
         figures = self._figures(found, prior, view)

@@ -29,10 +29,11 @@ class AmbiguousPosition:
     distance_m: float
 
 
-def likest_rival(
+def most_similar_rival(
     optimizer: JNGO, levels: tuple[LevelProblem, ...], origin: Array, truth: Pose, width_m: float
 ) -> AmbiguousPosition:
-    """The best mode that displaced poses run into, away from the true one.
+    """The position that looks most like the true one: poses on rings about it are refined, and the
+    best optimum that is apart from the true pose is taken.
 
     levels: of the query, coarse to fine, the network's; origin: (3,) of their local frame;
     width_m: of the ground in view.

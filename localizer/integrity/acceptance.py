@@ -1,10 +1,10 @@
 """Which estimates may be used.
 
-An estimate is acceptable when the registration succeeded, enough anchors were seen, it shows the
-right place by all its evidence (`localizer.integrity.probability`), and it agrees with the
-prediction (Mahalanobis distance). A wide prior holds more places that look alike, so it asks for
-more evidence. A place on trial is refused where another focal length fits better. What runs of
-acceptances and rejections make of the tracker's state stands in `localizer.tracking.states`.
+An estimate is acceptable if the registration succeeded, enough anchors were seen, all evidence
+together shows the right position (`localizer.integrity.probability`), and it agrees with the
+prediction (Mahalanobis distance). A wide prior contains more positions that look similar, so it
+needs more evidence. A tentative track is refused if another focal length fits better.
+`localizer.tracking.states` derives the tracker's state from runs of acceptances and rejections.
 """
 
 from __future__ import annotations

@@ -36,10 +36,10 @@ class Consistency(Enum):
 
 @dataclass(frozen=True)
 class TentativeTrack:
-    """The first acceptance of a run at a found place. covariance: (6, 6); time_ns: its exposure.
+    """The first acceptance at a position that was found. covariance: (6, 6); time_ns: its exposure.
 
-    independent_prior: the place was proposed by something that owes our own fixes nothing, such as
-    an autopilot with healthy GNSS; agreeing with that is evidence enough.
+    independent_prior: the proposal does not derive from our own fixes, such as an autopilot with
+    healthy GNSS; agreement with it is evidence enough.
     """
 
     world_from_camera: Pose

@@ -1,10 +1,10 @@
-"""How probable it is that a registration shows the right place.
+"""How probable it is that a registration shows the right position.
 
-A wrong place can look right in one respect: low residuals where land of one kind is alike, a few
-patches that agree on equal roofs. It seldom does in all of them. So one logistic regression over
-all the evidence gives the probability. It is fitted on labelled registrations of several maps, each
-with the same weight. `probability.json` holds its numbers, from what they were made and how each
-set fared in a fit without it. ``python -m benchmarks.integrity FOLDER --fit`` makes it.
+A wrong position can look right in one respect: low residuals over uniform land, or a few patches
+that agree on equal roofs. It seldom does in all respects. So one logistic regression over all the
+evidence gives the probability. It is fitted on labelled registrations of several maps, each with
+the same weight. `probability.json` holds its numbers, their data and how each set fared in a fit
+without it. ``python -m benchmarks.integrity FOLDER --fit`` makes it.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class RaisedGround:
         return self.ground.height(east, north) + self.by_m
 
 
-class SoundedGround:
+class RangefinderGround:
     """The ground as a rangefinder met it on the way: a plane at the height of what lay lowest.
 
     One beam meets roofs and crowns, too, and a picture's depth from a roof would be short by it; so

@@ -12,7 +12,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
-from localizer.odometry.ground import FlatGround, RaisedGround, SoundedGround, TerrainModel
+from localizer.odometry.ground import FlatGround, RaisedGround, RangefinderGround, TerrainModel
 from localizer.odometry.growth import carried, scaled
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
 from localizer.odometry.parallax import ParallaxView, align
@@ -64,7 +64,7 @@ class VisualOdometry:
         self.config = config or OdometryConfig()
         self._ground = self._terrain = ground
         self._plane: TerrainModel | None = None
-        self._sounded = SoundedGround()
+        self._sounded = RangefinderGround()
         self._seed = seed
         self._beginning: OdometryStart | None = None
         self._keyframe: Keyframe | None = None

@@ -1,12 +1,12 @@
-"""A keyframe's place on the map's shape, from how the picture moved over it.
+"""Measures a keyframe's position on the map's shape by the image motion after it.
 
-A keyframe whose pose is a little off drapes its picture over the wrong parts of the map's geometry.
-A later picture then moves over it as the true shape does, not as the map's: roofs slide against
-streets, and a picture that is tilted shears. The pose with which both agree best is a measurement
-of the keyframe that needs nothing of the map's own picture, and does not drift (odometry.md).
+If a keyframe's pose is off, its image lies over the wrong parts of the map's geometry. A later
+image then moves over it as the true shape does, not as the map's: roofs slide against streets, and
+a tilted image shears. The pose with which both agree best is a measurement of the keyframe that
+does not use the map's imagery and does not drift (odometry.md).
 
-The cost is no sum of squares that linearises: what tells, tells at roofs' edges. So it is sampled
-about the pose as far as that is uncertain, and a quadratic is fitted to it.
+The cost is no sum of squares that can be linearised: its information lies at the edges of roofs. So
+it is sampled about the pose within its uncertainty, and a quadratic is fitted.
 """
 
 from __future__ import annotations

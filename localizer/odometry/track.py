@@ -45,10 +45,10 @@ class OdometryStart:
 
 @dataclass(frozen=True)
 class OdometryTrack:
-    """The last usable estimate. covariance: without the error of scale. constraint: what other
-    sensors said, less their constant error. relative: (6, 6) what the covariance holds beside the
+    """The last usable estimate. covariance: without the error of scale. constraint: the other
+    sensors' measurements less their constant error. relative: (6, 6) the covariance beyond the
     keyframe's own. best: quality of the keyframe's first registration. unmatched_m2: variance of
-    east and north beside the covariance, which nothing mends.
+    east and north beyond the covariance, which no measurement reduces.
     """
 
     pose: Pose

@@ -1,7 +1,7 @@
-"""Whether a picture shows anything that can be registered: before any feature is computed.
+"""Whether an image can be registered at all, decided before any feature is computed.
 
-It is judged by itself, without a map: a covered lens, cloud, night without gain, a lens that looks
-into the sun, a picture smeared by a fast turn, or a stream that repeats one frame.
+The image alone decides, without a map: a covered lens, cloud, night without gain, a lens against
+the sun, motion blur of a fast turn, or a stream that repeats one frame.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Whether the parts of an image agree on a pose, each by itself (registration.md, section 8a).
+"""Whether the parts of an image agree on a pose (registration.md, section 8a).
 
-At the right pose nearly every part of the image matches best where it lies. A wrong pose is the
-best compromise of parts that each would rather lie elsewhere: its cost may be low, because land of
-one kind is alike, but few parts of it vote for no shift.
+At the right pose nearly every part of the image matches best without a shift. A wrong pose is a
+compromise between parts that would each match better elsewhere: its cost may be low over uniform
+land, but few parts agree with it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What camera model and survey leave unknown, as an uncertainty of the poses that they lead to.
+"""The uncertainty of a pose that camera model and survey cause.
 
-No picture shows it: the residuals are as small with a principal point that is a pixel off, and the
-position is a quarter of a metre beside at 120 m, in every frame alike.
+No image shows it: if the principal point is a pixel off, the residuals are as small, and the
+position is a quarter of a metre off at 120 m, in every frame.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Whether another focal length fits an image better (docs/explanation/registration.md, section 8b).
 
-A camera that zooms 5 % more than is believed seems 5 % closer to what it sees: the registration
-ends metres beside the place, with as good a quality, and most parts of the image agree. What tells
-is depth: but over flat ground seen straight down, a zoom and a shift are not quite the same. So the
-winner is refined once more under a focal length that is longer, one that is shorter and its own.
-Half a step is tolerated by construction: there the two fit alike.
+A camera that zooms 5 % more than assumed seems 5 % closer: the registration ends metres away with
+the same quality, and most parts of the image agree. Depth shows the difference; even over flat
+ground seen straight down, a zoom and a shift differ slightly. So the best pose is refined again
+under a longer, a shorter and its own focal length. By construction an error of half a step is
+tolerated, where two of them fit equally.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Which candidates are rendered and registered, and in which order: the cheap before the dear.
+"""Which candidates are rendered and registered, cheap tests first.
 
-Rendered at half the size, a candidate costs a tenth of a registration, and the place has nearly
-always the best score of all. So all are screened, and only those that can win are registered.
+At half the size a candidate costs a tenth of a registration, and the right position nearly always
+has the best score. So all candidates are screened, and only those that can win are registered.
 """
 
 from __future__ import annotations

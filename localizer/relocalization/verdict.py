@@ -42,7 +42,9 @@ def answer(
     judged: list[VerifiedCandidate],
     stages: dict[str, float],
 ) -> Relocalization | None:
-    """The best of the judged (one at least, best first), if nothing speaks for another place."""
+    """The best of the judged candidates (at least one, best first), unless the evidence for another
+    is comparable.
+    """
     best = judged[0]
     if not best.credible:
         return None

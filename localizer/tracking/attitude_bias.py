@@ -1,14 +1,15 @@
-"""Roll and pitch as other sensors know them, less what their horizon is off by for good.
+"""Estimates the constant bias of the roll and pitch that other sensors measure.
 
-Over some fifty metres of ground a turn of the camera and a shift of its place look nearly alike,
-and where the map is old or shows little the registration takes one for the other. Gravity tells
-them apart, but a gimbal's horizon is off by a degree that no report shows. The registration itself
-is right about that degree in the long run: over other ground it errs another way. So every fix over
-new ground measures it, and the reported rotation, corrected, is a constraint on the next frames
+Over some fifty metres of ground a turn of the camera and a shift of its position look nearly the
+same. Where the map is old or has little structure, the registration confuses them. Gravity
+separates them, but a gimbal's horizon has an unreported bias of about a degree. The registration is
+right about that bias on average: over other ground its error differs. So every fix over new ground
+measures the bias, and the corrected attitude constrains the next frames
 (docs/explanation/registration.md, section 9a).
 
-All is about two horizontal world axes: the camera's right-hand side (pitch) and what lies ahead of
-it (roll). A gimbal's, a mounting's and an autopilot's error stay the same there while it turns.
+All angles are about two horizontal world axes: the camera's right-hand side (pitch) and the
+direction ahead of it (roll). The bias of a gimbal, a mounting or an autopilot stays the same there
+while it turns.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _APART, _LEAST_APART_M = 0.5, 20.0  # of the distance; between two places that s
 
 @dataclass(frozen=True)
 class AttitudePrior:
-    """How well the autopilot's attitude and the gimbal's tell the camera's roll and pitch."""
+    """How accurately the autopilot's and the gimbal's attitude give the camera's roll and pitch."""
 
     tilt_sigma_deg: float = SENSORS.tilt_deg  # smallest error of roll and pitch, without the bias
     alignment_sigma_deg: float = (
@@ -75,7 +76,7 @@ class AttitudeBias:
         return float(pitch), float(roll)
 
     @property
-    def told_deg(self) -> tuple[float, float, float]:
+    def reported_deg(self) -> tuple[float, float, float]:
         """The constant, and the sigma of the rest: for reports."""
         pitch, roll, sigma = (
             round(float(v), 2) for v in (*self.off_deg, np.degrees(self.sigma_rad))
@@ -197,7 +198,9 @@ class AttitudeBiasEstimator:
         return self.bias is not None and is_new_ground(self.bias, place, distance_m)
 
     def pass_by(self, place: Array, time_ns: int) -> None:
-        """What is seen from `place` (3,) tells nothing: the next sight is wanted from another."""
+        """Ground seen from `place` (3,) is uninformative: wait for an observation from another
+        place.
+        """
         if self.bias is not None:
             self.bias = passed(self.bias, place, time_ns)
 

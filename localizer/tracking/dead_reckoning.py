@@ -106,7 +106,7 @@ class DeadReckoning:
         self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array,
         sweep: Sweep | None = None,
     ) -> None:  # fmt: skip
-        """The map has just said where this frame was: whatever was bridged before is over."""
+        """The map has just located this frame: end earlier dead reckoning."""
         camera = followed(self._pinhole, estimate.camera)
         frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
         self._odometry.begin(

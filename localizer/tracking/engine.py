@@ -181,7 +181,7 @@ class DualThreadEngine:
         self._book.set_searching(begun_ns is not None)
 
     def _search_hangs(self) -> bool:
-        """Whether no answer comes any more; told by who would wait for it."""
+        """Whether the search has stopped answering; whoever would wait for it reports that."""
         alive_ns = self._search_alive_ns
         hangs = alive_ns is not None and self._clock() - alive_ns > _SEARCH_HANGS_NS
         self._book.set_search_hangs(hangs)

@@ -57,7 +57,7 @@ class HealthBook:
                 self._health,
                 frames_dropped=frames_dropped,
                 optimizer=optimizer,
-                horizon_off_deg=None if bias is None else bias.told_deg,
+                horizon_off_deg=None if bias is None else bias.reported_deg,
                 last_error=next(iter(self._errors.values()), ""),
             )
 

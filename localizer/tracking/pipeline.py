@@ -1,4 +1,4 @@
-"""One frame's way through the algorithm, without threads: the two halves that the engine runs.
+"""The algorithm for one frame, without threads, in the two halves that the engine runs.
 
 `Localizer.make_reference` is the render thread's half (predict, render, extract, anchors),
 `Localizer.localize` the localization thread's (extract, register, judge, filter).
@@ -36,7 +36,7 @@ from localizer.render.holes import fill_holes
 from localizer.tracking.attitude_bias import AttitudeBias
 from localizer.tracking.dead_reckoning import DeadReckoning
 from localizer.tracking.motion import AuxiliarySensors
-from localizer.tracking.reference import lead_share, still_serves
+from localizer.tracking.reference import is_still_valid, lead_share
 from localizer.tracking.sensor_fusion import SensorFusion, distance_m
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
@@ -330,7 +330,7 @@ class Localizer:
         interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
         if last is None or not steady or shift_px == 0:
             return self.make_reference(prior, wait=wait)
-        if still_serves(last, pose, self.camera, time_ns, shift_px):
+        if is_still_valid(last, pose, self.camera, time_ns, shift_px):
             return last
         later = self.predict(time_ns + _LEAD_NS)
         if later is not None:

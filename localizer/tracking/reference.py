@@ -14,7 +14,7 @@ _LEAD = 0.75  # of the limit
 _LONGEST_NS = 1_000_000_000  # finer tiles may have come, also for a camera that hovers
 
 
-def still_serves(
+def is_still_valid(
     bundle: ReferenceBundle, pose: Pose, camera: Camera, time_ns: int, most_px: float
 ) -> bool:
     """Whether a camera at `pose` sees the reference's anchors within `most_px` of where they are in

@@ -1,9 +1,10 @@
-"""When the map is right and the carried pose is not: the way back that the gate would refuse.
+"""Detects that the propagated pose is wrong although the map's registrations fail the acceptance
+test.
 
-The odometry carries a pose on as exactly as it began. Begun a few metres wrong, it holds that error
-for good, sure of itself, and every right answer of the map fails the gate. So the map's answers
-are followed beside it: those that move as the odometry does, whose motion owes the map nothing,
-over a way on which a wrong match would have changed, count against the place that is carried.
+Odometry keeps the error of its start. If it starts a few metres off, it keeps that error with a
+small covariance, and every right registration is rejected. So rejected registrations are followed
+in parallel. If they move as the odometry does (whose motion is independent of the map) over a
+distance on which a wrong match would have changed, the propagated pose is given up.
 """
 
 from __future__ import annotations

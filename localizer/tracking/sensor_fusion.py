@@ -1,12 +1,12 @@
-"""Attitude and height beside the image: what other sensors add to a registered pose.
+"""Fuses attitude and height of other sensors with a registered pose.
 
-The registration itself uses no other sensor. Its covariance says what the image cannot tell, such
-as a tilt against a shift over flat ground, or a tilt against roofs that the map does not have. So
-one Kalman update with roll, pitch and height, each with its own sigma, gives the pose that all of
-them support (docs/explanation/registration.md, section 9).
+The registration uses no other sensor. Its covariance says what the image cannot determine, such as
+a tilt against a shift over flat ground, or a tilt against roofs that the map lacks. One Kalman
+update with roll, pitch and height, each with its own sigma, then gives the fused pose
+(docs/explanation/registration.md, section 9).
 
-The same registrations teach two things that no sensor reports: the constant error of the reported
-attitude (`attitude_bias`) and how wrong the map's heights are (`localizer.integrity.height_error`).
+The same registrations estimate two errors that no sensor reports: the constant bias of the reported
+attitude (`attitude_bias`) and the map's height error (`localizer.integrity.height_error`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the two halves of the algorithm share: the motion, the standing, a registration's fate."""
+"""State shared by both threads: motion, track status, and the judgement of registrations."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class _Pose:
 
 
 class Tracker:
-    """Judges registrations, follows the motion, and carries the pose on where the map is silent.
+    """Judges registrations, follows the motion, and propagates the pose without the map.
 
     `judge` belongs to the localization thread; the rest may be called from any. bridging: None
     where features are not in host memory.

@@ -1,1 +1,1 @@
-"""Alerts: what the operator is told, as identifiers with values; text is made at the edge."""
+"""Alerts to the operator: identifiers with values. Text is made where they leave the process."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mavlink_bridge.alerts.alert import AlertSpec, Kind, Severity, condition, event
 from mavlink_bridge.alerts.ids import AlertId as A
-from mavlink_bridge.alerts.words import ClickRefusal, Compass, MapOffsetUse, ProcessFault
+from mavlink_bridge.alerts.words import ClickRefusal, Direction, MapOffsetUse, ProcessFault
 
 CRITICAL, ERROR = Severity.CRITICAL, Severity.ERROR
 WARNING, NOTICE, INFO = Severity.WARNING, Severity.NOTICE, Severity.INFO
@@ -76,7 +76,7 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.MAP_UNREADABLE, WARNING, "map unreadable", {}, "parts of the map cannot be read",
               "every part is read", "coarser levels replace them", "check the disk after landing"),
     condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {}, "the record cannot be written",
-              "not in this flight", "part of the flight is not recorded", _RECORD),
+              "not before the next flight", "part of the flight is not recorded", _RECORD),
     event(A.ENDING, NOTICE, "ending, nothing is injected any more", {}, "the process ends",
           "no position is sent", _NONE),
     event(A.COMPANION_RESTARTS, CRITICAL, "companion {how} ({what}), restarting",
@@ -99,7 +99,7 @@ HEALTH: tuple[AlertSpec, ...] = (
               "the zoom is inside the table", "frames are not localized",
               "zoom back into the table"),
     event(A.MAP_OFFSET, NOTICE, "map {metres:.1f} m {direction} of GNSS{applied}",
-          {"metres": "m", "direction": Compass, "applied": MapOffsetUse},
+          {"metres": "m", "direction": Direction, "applied": MapOffsetUse},
           "vision and GNSS differ by a constant offset", "the map or GNSS is displaced",
           "check the map's georeference after landing"),
     event(A.DETECTOR_OFF, WARNING, "the detector is off, see the log", {},

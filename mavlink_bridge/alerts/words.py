@@ -107,7 +107,7 @@ class ChosenSet(int):
 
 
 class GnssDisagreement(Word):
-    """What speaks against a receiver, after the unit of its size."""
+    """Why a GNSS receiver is not accepted, after the unit of the difference."""
 
     OFF_VISION = "m off vision"
     NOISE = "m noise"
@@ -128,7 +128,7 @@ class CalibrationError(Word):
     YAW = "yaw"
 
 
-class Compass(Word):
+class Direction(Word):
     """Eight directions, clockwise."""
 
     NORTH = "north"

@@ -1,8 +1,8 @@
-"""Who flies on vision has seen it agree with GNSS first: the shadow score's word before injection.
+"""The shadow interlock: vision must agree with GNSS before its positions are injected.
 
-A map that lies 20 m off is followed by the EKF without a complaint. While GNSS is there, nothing is
-sent before the shadow score is a go. Where there is none from the start (an indoor vehicle, a
-restart under denial) nothing can be compared: then it begins, and the operator is told so.
+The EKF follows a map that lies 20 m off without a warning. So while GNSS is there, nothing is sent
+before the shadow check has passed. Without GNSS from the start (an indoor vehicle, a restart
+without GNSS) nothing can be compared: injection then begins with an alert.
 """
 
 from __future__ import annotations

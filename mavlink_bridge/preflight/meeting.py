@@ -17,7 +17,7 @@ _FIRMWARES = {
 
 
 @dataclass(frozen=True)
-class Met:
+class MetAutopilot:
     """An autopilot's MAVLink system id, and its firmware's name."""
 
     system_id: int
@@ -31,8 +31,8 @@ class _Greeting(VehicleClient):
         """Nothing else was asked for."""
 
 
-def meet(config: BridgeConfig) -> Met:
+def meet(config: BridgeConfig) -> MetAutopilot:
     """The autopilot at `config.connection`; ConnectionSilentError where none is heard."""
     with _Greeting(config, "meeting", ()) as client:
         number = client.autopilot
-        return Met(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))
+        return MetAutopilot(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))

@@ -87,7 +87,7 @@ class ComputingRates:
     load: float
 
     def complaint(self) -> str | None:
-        """What the computer did not keep up with; None where it did."""
+        """Why the computer was too slow for this flight; None if it was not."""
         limit_ms = min(self.delay_ms, _MAX_LATENCY_MS)
         said = []
         if self.sent_hz < _SLOW * self.wanted_hz:

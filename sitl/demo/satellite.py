@@ -160,7 +160,9 @@ def _block(
 
 
 def _resampled(image: Image, uv: Array, size: tuple[int, int]) -> Image:
-    """An image at places (nodes, nodes, 2) that span a block of so many columns and rows."""
+    """Resample an image. uv: pixel coordinates (nodes, nodes, 2) on a grid over the block; size:
+    columns and rows of the result.
+    """
     (columns, rows), last = size, _GRID - 1
     i = ((np.arange(columns) + 0.5) / columns * last).astype(np.float32)
     j = ((np.arange(rows) + 0.5) / rows * last).astype(np.float32)

@@ -13,8 +13,8 @@ from companion.targets.detections import clicked_name
 from localizer.geometry.pose import Array
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import values_of
-from sitl.operator.operator import Asked
-from sitl.operator.station import GeoReport, Heard
+from sitl.operator.operator import SentWish
+from sitl.operator.station import GeoReport, ReceivedMessages
 from sitl.operator.truth import GroundTruth, Pointed, all_pointed
 
 _CHI2_95, _CHI2_999 = 7.815, 13.816  # of three and of two degrees of freedom
@@ -78,7 +78,11 @@ class ClickVerdict:
 
 
 def judge(
-    witness: GroundTruth, asked: Sequence[Asked], heard: Heard, targets: Path, failure: str = ""
+    witness: GroundTruth,
+    asked: Sequence[SentWish],
+    heard: ReceivedMessages,
+    targets: Path,
+    failure: str = "",
 ) -> ClickVerdict:
     """Hold the record's targets (``targets.csv``) and what came over the link against the truth."""
     pointed = all_pointed(witness, asked)
@@ -169,7 +173,7 @@ def _pixel_error(
 
 def _link(
     witness: GroundTruth,
-    asked: Sequence[Asked],
+    asked: Sequence[SentWish],
     pointed: Mapping[int, Pointed],
     reports: Sequence[GeoReport],
 ) -> tuple[int, int]:
@@ -189,7 +193,7 @@ def _link(
     return foreign, velocities
 
 
-def _alive(asked: Sequence[Asked], time_ns: int) -> tuple[int, ...]:
+def _alive(asked: Sequence[SentWish], time_ns: int) -> tuple[int, ...]:
     """Numbers that may be told at a time: given, and not ended longer than a moment ago."""
     given: list[int] = []
     for a in asked:

@@ -14,9 +14,9 @@ import numpy as np
 
 from sitl.camera.movers import Mover
 from sitl.camera.world_camera import FRAME_COLUMNS
-from sitl.operator.station import Heard, Station
+from sitl.operator.station import ReceivedMessages, Station
 from sitl.operator.wishes import Wish
-from sitl.suite.loop.flight import Cabin
+from sitl.suite.loop.flight import ParticipantContext
 
 _ACCEPTED = 0  # MAV_RESULT
 LATE_S, LATE_SIGMA_S = 0.25, 0.03  # exposure to click, of a link whose delay was measured
@@ -25,7 +25,7 @@ _LAST_LOOK_NS = 8_000_000_000  # after the last wish, so that it is looked at, t
 
 
 @dataclass(frozen=True)
-class Asked:
+class SentWish:
     """A wish as it was sent. sequence, frame_ns: of the picture that he pointed into, its true
     exposure; late_s: the command left so long after it. number: the target's, as it was told;
     result: MAV_RESULT, None without an answer. ended: the numbers that a stop ended. movers: where
@@ -68,15 +68,15 @@ class Frames:
 
 
 class Operator:
-    """A `Passenger`: carries out his wishes on a thread of his own. seed: of how late he clicks."""
+    """A `FlightParticipant` who acts on a thread of his own. seed: of how late he clicks."""
 
     def __init__(self, wishes: Sequence[Wish], seed: int) -> None:
         self._wishes = tuple(wishes)
         self._rng = np.random.default_rng([seed, 89])
         self._stop = threading.Event()
         self._movers: tuple[Mover, ...] = ()
-        self.asked: list[Asked] = []
-        self.heard = Heard()
+        self.asked: list[SentWish] = []
+        self.heard = ReceivedMessages()
         self.failure = ""
 
     def movers(self, _epoch_ns: int) -> tuple[Mover, ...]:
@@ -89,7 +89,7 @@ class Operator:
         return self._wishes[-1].at_s + _LAST_LOOK_NS * 1e-9
 
     @contextmanager
-    def ride(self, cabin: Cabin) -> Iterator[None]:
+    def ride(self, cabin: ParticipantContext) -> Iterator[None]:
         """Click while the flight goes on."""
         self._movers = cabin.movers
         thread = threading.Thread(target=self._run, args=(cabin,), name="operator")
@@ -100,7 +100,7 @@ class Operator:
             self._stop.set()
             thread.join()
 
-    def _run(self, cabin: Cabin) -> None:
+    def _run(self, cabin: ParticipantContext) -> None:
         station = Station(cabin.vehicle.spare_endpoint, cabin.vehicle.check)
         frames = Frames(cabin.frames)
         self.heard = station.heard
@@ -137,7 +137,7 @@ class Operator:
         result, number = station.ask(wish.kind, parameters)
         places = [m.position_at(seen[1]) for m in self._movers]
         self.asked.append(
-            Asked(
+            SentWish(
                 wish, sent_ns, time.monotonic_ns(), *seen, (sent_ns - seen[1]) * 1e-9, number,
                 result, ended, tuple((float(x), float(y), float(z)) for x, y, z in places),
             )

@@ -20,8 +20,8 @@ from sitl.camera.world_camera import FRAME_COLUMNS
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import Chase, make_chase, pursuit
 from sitl.operator.operator import LATE_S
-from sitl.operator.station import Heard, Station
-from sitl.suite.loop.flight import Cabin
+from sitl.operator.station import ReceivedMessages, Station
+from sitl.suite.loop.flight import ParticipantContext
 
 FOLLOWED_S = 60.0
 LEAD_S = 110.0  # from the world's beginning to the click: take-off and shadow flight need 40 to 100
@@ -58,7 +58,7 @@ class _FrameLog:
 
 
 class Pursuer:
-    """A `Passenger`. camera: the true one; seed: of the car and of the operator's hand."""
+    """A `FlightParticipant`. camera: the true one; seed: of the car and of the operator's hand."""
 
     def __init__(self, assets: FlightAssets, camera: Camera, height_m: float, seed: int) -> None:
         self._assets, self._camera, self._height_m = assets, camera, height_m
@@ -67,7 +67,7 @@ class Pursuer:
         self._stop = threading.Event()
         self.chase: Chase | None = None
         self.number = 0
-        self.heard = Heard()
+        self.heard = ReceivedMessages()
         self.failure = ""
         self.end_ns = 0
         self.late_s = 0.0
@@ -78,7 +78,7 @@ class Pursuer:
         return self.chase.movers
 
     @contextmanager
-    def ride(self, cabin: Cabin) -> Iterator[None]:
+    def ride(self, cabin: ParticipantContext) -> Iterator[None]:
         """Fly along and click while the flight goes on."""
         thread = threading.Thread(target=self._run, args=(cabin,), name="pursuer")
         thread.start()
@@ -88,7 +88,7 @@ class Pursuer:
             self._stop.set()
             thread.join()
 
-    def _run(self, cabin: Cabin) -> None:
+    def _run(self, cabin: ParticipantContext) -> None:
         station = Station(cabin.vehicle.spare_endpoint, cabin.vehicle.check)
         self.heard = station.heard
         chase = self.chase
@@ -111,7 +111,9 @@ class Pursuer:
         finally:
             station.close()
 
-    def _fly_along(self, cabin: Cabin, station: Station, chase: Chase, until_ns: int) -> bool:
+    def _fly_along(
+        self, cabin: ParticipantContext, station: Station, chase: Chase, until_ns: int
+    ) -> bool:
         """Steer above the car until a time; True when the flight ended before it."""
         home_m = self._home_up_m()
         while time.monotonic_ns() < until_ns:

@@ -49,7 +49,7 @@ class ImageReport:
 
 
 @dataclass
-class Heard:
+class ReceivedMessages:
     """Everything that came, in its order; texts: (CLOCK_MONOTONIC, text)."""
 
     geo: list[GeoReport] = field(default_factory=list)
@@ -64,7 +64,7 @@ class Station:
     def __init__(self, endpoint: str, alive: Callable[[], None] = lambda: None) -> None:
         self._link = Connection(endpoint)
         self._link.open(time.monotonic() + _CONNECTED_S, alive)
-        self.heard = Heard()
+        self.heard = ReceivedMessages()
         self._ack: Any = None
         self._beat_ns = 0
 

@@ -16,7 +16,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from sitl.camera.true_motion import PoseTrack
 from sitl.demo.assets import FlightAssets
-from sitl.operator.operator import Asked
+from sitl.operator.operator import SentWish
 
 _NEAR_MOVER_M = 4.0  # half a car's length, and what its box casts over the ground
 
@@ -27,7 +27,7 @@ class Pointed:
     camera's, while that row was exposed; pixel: in it; on_mover: something drove or walked there.
     """
 
-    asked: Asked
+    asked: SentWish
     place: Array | None
     pose: Pose
     pixel: tuple[float, float]
@@ -49,7 +49,7 @@ class GroundTruth:
         self._live_from_map = live.frame.ecef_from_enu.inverse @ known.frame.ecef_from_enu
         self._surface = MapSurface(live)
 
-    def pointed(self, asked: Asked) -> Pointed:
+    def pointed(self, asked: SentWish) -> Pointed:
         """What one click pointed at."""
         u, v = np.array(asked.wish.middle) * (self.camera.width, self.camera.height)
         pose = self.pose_of_row(asked.frame_ns, float(v))
@@ -80,6 +80,6 @@ class GroundTruth:
         return pose.translation + distance * ray if np.isfinite(distance) else None
 
 
-def all_pointed(witness: GroundTruth, asked: Sequence[Asked]) -> dict[int, Pointed]:
+def all_pointed(witness: GroundTruth, asked: Sequence[SentWish]) -> dict[int, Pointed]:
     """What every accepted click pointed at, by the number that it was given."""
     return {a.number: witness.pointed(a) for a in asked if a.wish.kind != "stop" and a.result == 0}

@@ -39,7 +39,7 @@ class _Span(_Expectation):
     to_s: float = FOREVER
 
 
-class AsAccurateAs(_Span):
+class AccuracyExpectation(_Span):
     """The median of the horizontal EKF error is the reference's within per cent.
 
     Below the band it counts as reproduced only in the sense of "no worse", and is marked.
@@ -62,7 +62,7 @@ class AsAccurateAs(_Span):
         return ExpectationResult(change <= self.within_percent, what, change < -self.within_percent)
 
 
-class MedianBelow(_Span):
+class MedianExpectation(_Span):
     """The median of the horizontal EKF error stays at or below a limit."""
 
     check: Literal["median_below"]
@@ -77,7 +77,7 @@ class MedianBelow(_Span):
         return ExpectationResult(median <= self.metres, f"median {median:.2f} of {self.metres:g} m")
 
 
-class MaxError(_Span):
+class MaxErrorExpectation(_Span):
     """The largest horizontal EKF error lies between two limits."""
 
     check: Literal["max_error"]
@@ -120,7 +120,7 @@ class JumpExpectation(_Expectation):
         return ExpectationResult(ok, f"{what}, overshoot {beyond:.1f}")
 
 
-class Lags(_Expectation):
+class RefusedJumpExpectation(_Expectation):
     """An unannounced jump is refused for a while: the north error stays below half of north_m until
     after_s and has passed it by before_s (seconds after at_s).
     """
@@ -147,7 +147,7 @@ class Lags(_Expectation):
         )
 
 
-class Says(_Span):
+class TextExpectation(_Span):
     """A status text of the vehicle came (or, with absent, did not) within the span."""
 
     check: Literal["text"]
@@ -167,7 +167,7 @@ class Says(_Span):
         return ExpectationResult(bool(times) != self.absent, f"vehicle: '{self.contains}' {said}")
 
 
-class Reports(_Span):
+class AlertExpectation(_Span):
     """An alert of our bridge came (or, with absent, did not) within the span. values: it must show
     these.
     """
@@ -189,7 +189,7 @@ class Reports(_Span):
         return ExpectationResult(bool(times) != self.absent, f"bridge: {self.alert.words} {said}")
 
 
-class Alerted(_Span):
+class ErrorAlertExpectation(_Span):
     """Our bridge holds output at latest within_s after an EKF error beyond a limit began."""
 
     check: Literal["alerted"]
@@ -215,7 +215,7 @@ class Alerted(_Span):
         return ExpectationResult(ok, f"beyond {self.limit_m:g} m at {beyond[0]:.1f} s, {said}")
 
 
-class Silent(_Span):
+class NoWarningExpectation(_Span):
     """The vehicle says nothing of a severity that an operator would act on: no text contains any
     of the words.
     """
@@ -235,7 +235,7 @@ class Silent(_Span):
         return ExpectationResult(not heard, "; ".join(heard[:3]) or "vehicle: no warning")
 
 
-class InMode(_Expectation):
+class ModeExpectation(_Expectation):
     """The flight mode at a time; at_s None: at the end."""
 
     check: Literal["mode"]
@@ -250,7 +250,7 @@ class InMode(_Expectation):
         return ExpectationResult(mode == self.mode, f"{mode} {when}")
 
 
-class MovedAtMost(_Span):
+class MovementExpectation(_Span):
     """The vehicle truly moved at most this far from where it was at from_s."""
 
     check: Literal["moved"]
@@ -266,7 +266,7 @@ class MovedAtMost(_Span):
         return ExpectationResult(far <= self.at_most, f"moved {far:.2f} of {self.at_most:g} m")
 
 
-class Injected(_Span):
+class InjectionExpectation(_Span):
     """How many messages our bridge injected within the span.
 
     at_least is for a vehicle in real time: one whose clock ran slow gave fewer fixes, and owes as
@@ -294,7 +294,7 @@ class Injected(_Span):
         )
 
 
-class SourceSet(_Expectation):
+class SourceSetExpectation(_Expectation):
     """The EKF source set that the bridge holds active, at a time; by_s: reached by then."""
 
     check: Literal["source_set"]
@@ -313,7 +313,7 @@ class SourceSet(_Expectation):
         return ExpectationResult(ok, f"source set {self.number} at {reached[0]:.1f} s")
 
 
-class Refused(_Expectation):
+class ArmingRefusedExpectation(_Expectation):
     """On the ground: arming is refused, with one of these texts."""
 
     check: Literal["arming_refused"]
@@ -327,7 +327,7 @@ class Refused(_Expectation):
         return ExpectationResult(any(text in told for text in self.any_of), f"refused: {told}")
 
 
-class Diagnosed(_Expectation):
+class DoctorExpectation(_Expectation):
     """`companion doctor` finds exactly these parameters wrong, and nothing after its --fix."""
 
     check: Literal["doctor"]
@@ -346,20 +346,20 @@ class Diagnosed(_Expectation):
 
 
 Check = (
-    AsAccurateAs
-    | MedianBelow
-    | MaxError
+    AccuracyExpectation
+    | MedianExpectation
+    | MaxErrorExpectation
     | JumpExpectation
-    | Lags
-    | Says
-    | Reports
-    | Reports
-    | Alerted
-    | Silent
-    | InMode
-    | MovedAtMost
-    | Injected
-    | SourceSet
-    | Refused
-    | Diagnosed
+    | RefusedJumpExpectation
+    | TextExpectation
+    | AlertExpectation
+    | AlertExpectation
+    | ErrorAlertExpectation
+    | NoWarningExpectation
+    | ModeExpectation
+    | MovementExpectation
+    | InjectionExpectation
+    | SourceSetExpectation
+    | ArmingRefusedExpectation
+    | DoctorExpectation
 )

@@ -17,7 +17,7 @@ import numpy as np
 from mavlink_bridge.alerts.integrity import INTEGRITY
 from sitl.errors import SimulationError
 from sitl.suite.case import Case
-from sitl.suite.checks import AsAccurateAs, ExpectationResult
+from sitl.suite.checks import AccuracyExpectation, ExpectationResult
 from sitl.suite.flight import fly
 from sitl.suite.record import Array, CaseRecord
 from sitl.vehicles.process import VehicleKind
@@ -69,16 +69,16 @@ class ReportRow:
         return tuple(f"{t.at_s:.1f} s: {t.text}" for t in its)
 
     @property
-    def reference(self) -> AsAccurateAs | None:
+    def reference(self) -> AccuracyExpectation | None:
         """The figures to be reproduced, where the case has any."""
-        return next((e for e in self.case.expect if isinstance(e, AsAccurateAs)), None)
+        return next((e for e in self.case.expect if isinstance(e, AccuracyExpectation)), None)
 
     @property
     def measured(self) -> Figures | None:
         """Median, p95 and maximum of the horizontal EKF error over the reference's span."""
         if self.record is None:
             return None
-        span = self.reference or AsAccurateAs(check="reference", median=1.0)
+        span = self.reference or AccuracyExpectation(check="reference", median=1.0)
         return figures(self.record.horizontal(span.from_s, span.to_s))
 
 

@@ -39,7 +39,7 @@ def check_command(
     """Check heights, coverage, holes, texels, detail, seams and shift. Exit code 1: one is bad."""
     from companion.config import load_config
     from localizer.map.cache.cache import TileCache
-    from localizer.map.inspection.check import Use, check_map
+    from localizer.map.inspection.check import MapUse, check_map
     from localizer.map.inspection.inspect import write_picture
     from localizer.tracking.pipeline import working_camera
 
@@ -51,7 +51,7 @@ def check_command(
     opened = TileCache.open(cache)
     made_folder(out, "--out")
     with shown_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
-        made = check_map(opened, Use(height, pixel_rad, half_view_deg))
+        made = check_map(opened, MapUse(height, pixel_rad, half_view_deg))
     for name, rgb in made.pictures.items():
         write_picture(out / f"{name}.png", rgb)
     table = Table(box=SIMPLE_HEAD)

@@ -220,9 +220,9 @@ def _planned(
     source: CatalogueSource, area: Area, resolution: float, most_mb: float, work: Path, role: str
 ) -> _Part:
     from localizer.map.fetch.fetch import make_plan
-    from localizer.map.fetch.polite import Manners, PoliteClient
+    from localizer.map.fetch.polite import PoliteClient, RequestLimits
 
-    client = PoliteClient(Manners(source.rate_per_s, round(most_mb * _MB)))
+    client = PoliteClient(RequestLimits(source.rate_per_s, round(most_mb * _MB)))
     wanted = source.resolution_m if source.has_heights else max(source.resolution_m, resolution)
     plan = make_plan(source, area, wanted, client)
     return _Part(source, plan, client, work / f"{role}-pieces", work / f"{role}.tif")

@@ -60,7 +60,7 @@ class _Thing:
         self.sightings += 1
 
 
-class ThingNames:
+class ObjectNames:
     """Gives each sighting the name of its thing: ``car 1``, ``car 2``. Not thread-safe."""
 
     def __init__(self) -> None:

@@ -18,7 +18,7 @@ from companion.config import DetectorConfig
 from companion.ending import joined
 from companion.targets.detections import DETECTED, Detection
 from companion.targets.detector.boxes import Box
-from companion.targets.detector.names import LocatedBox, ThingNames
+from companion.targets.detector.names import LocatedBox, ObjectNames
 from companion.targets.detector.network import DetectorNetwork
 from companion.targets.pictures import RecentPictures
 from localizer.targets.locate import RayCaster, ray_in_world
@@ -52,7 +52,7 @@ class BoxDetector:
     ) -> None:
         self._config, self._cast = config, cast
         self._on_detection, self._report, self._load = on_detection, report, load
-        self._names = ThingNames()
+        self._names = ObjectNames()
         self._frames = RecentPictures[Frame](_KEPT, lambda frame: frame.image.nbytes)
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._condition = threading.Condition()

@@ -15,7 +15,7 @@ from pathlib import Path
 from localizer.errors import MapCacheError
 
 
-class Hold:
+class CacheLock:
     """Nobody replaces the cache at `path` until `close`; any number of readers hold it."""
 
     def __init__(self, path: Path) -> None:

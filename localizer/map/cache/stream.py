@@ -21,7 +21,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache, read_manifest
 from localizer.map.cache.failed_nodes import FailedNodes
-from localizer.map.cache.hold import Hold
+from localizer.map.cache.hold import CacheLock
 from localizer.map.cache.resident_nodes import ResidentNodes
 from localizer.map.cache.select import DetailLimits, Selection, TileSelector
 from localizer.map.cache.tile import TileMesh
@@ -253,8 +253,8 @@ class TileStreamer:
             self._nodes.add(node, meshes, keep=self._protected, beside=self._arrived_bytes)
 
 
-def _held(cache: TileCache) -> Hold:
-    hold = Hold(cache.path)
+def _held(cache: TileCache) -> CacheLock:
+    hold = CacheLock(cache.path)
     try:
         if read_manifest(cache.path).index_sha256 != cache.manifest.index_sha256:
             raise MapCacheError(f"{cache.path}: was built again since it was opened")

@@ -34,7 +34,7 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
-class Manners:
+class RequestLimits:
     """rate_per_s: requests a second to one host; bytes: that all answers together may have."""
 
     rate_per_s: float = 4.0
@@ -67,11 +67,11 @@ class PoliteClient:
 
     def __init__(
         self,
-        manners: Manners | None = None,
+        manners: RequestLimits | None = None,
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._manners = manners or Manners()
+        self._manners = manners or RequestLimits()
         self._sleep, self._clock = sleep, clock
         self._pool = urllib3.PoolManager(num_pools=8, maxsize=8, headers={"User-Agent": _AGENT})
         self._lock = threading.Lock()

@@ -36,7 +36,7 @@ _GML = (".gml", ".xml", ".citygml")
 
 
 @dataclass(frozen=True)
-class Raised:
+class RaiseResult:
     """What was done. missed: buildings beside the terrain; small: of less than a cell."""
 
     raised: int
@@ -67,7 +67,7 @@ def read_footprints(path: Path, height_property: str | None = None) -> Footprint
     return read_geojson(path, height_property)
 
 
-def raise_buildings(terrain: Path, footprints: Footprints, out: Path) -> Raised:
+def raise_buildings(terrain: Path, footprints: Footprints, out: Path) -> RaiseResult:
     """Write the surface `out`, a GeoTIFF in the terrain's own CRS. `MapSourceError` where no
     building meets the terrain, or its heights are not in metres.
     """
@@ -88,7 +88,7 @@ def raise_buildings(terrain: Path, footprints: Footprints, out: Path) -> Raised:
             _write(data, heights, transform, out)
     except (RasterioError, ProjError) as error:
         raise MapSourceError(f"{terrain}, {footprints.path}: {error}") from error
-    return Raised(
+    return RaiseResult(
         raised, counts.count("missed"), counts.count("small"), footprints.by_storeys,
         footprints.left_out, cell_m,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from localizer.map.cache.tile import facing_fault, vector_area
 from localizer.map.inspection.alignment import ImageryOffset, alignment_of
 from localizer.map.inspection.kind import map_kind
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
-from localizer.map.inspection.usable import Usable, usable_part
+from localizer.map.inspection.usable import UsableArea, usable_part
 from localizer.map.kind import HEIGHTS_HOLD, MapKind
 from localizer.types import Image
 
@@ -53,7 +53,7 @@ class MapFinding:
 
 
 @dataclass(frozen=True)
-class Use:
+class MapUse:
     """What the map is for. height_m: above the ground; pixel_rad: angle of a working pixel;
     half_view_deg: half of the camera's field of view.
     """
@@ -77,7 +77,7 @@ class MapCheck:
     findings: tuple[MapFinding, ...]
     pictures: dict[str, Image]
     size_m: tuple[float, float]
-    usable: Usable | None
+    usable: UsableArea | None
 
     @property
     def ok(self) -> bool:
@@ -101,7 +101,7 @@ class Seam:
         return self.height_m > _SEAM_M or self.grey > _SEAM_GREY
 
 
-def check_map(cache: TileCache, use: Use) -> MapCheck:
+def check_map(cache: TileCache, use: MapUse) -> MapCheck:
     """All questions, with a picture of each."""
     mosaic = mosaic_of(cache)
     gaps, holes = _holes(mosaic)
@@ -189,7 +189,7 @@ def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
     return np.asarray(large[labels])
 
 
-def _without_texels(cache: TileCache, mosaic: Mosaic, use: Use) -> NDArray[np.bool_]:
+def _without_texels(cache: TileCache, mosaic: Mosaic, use: MapUse) -> NDArray[np.bool_]:
     """Surface of flat colours, which has no picture, (h, w)."""
     return np.asarray(~np.isnan(mosaic.height) & (_texel_ratio(cache, mosaic, use) == 0.0))
 
@@ -235,7 +235,7 @@ def _intact(cache: TileCache) -> list[MapFinding]:
 
 
 def _source_finding(cache: TileCache) -> list[MapFinding]:
-    """What the build doubted and did not stop for."""
+    """The warnings of the build."""
     warnings = cache.manifest.warnings
     if not warnings:
         return []
@@ -281,13 +281,13 @@ def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> MapFinding:
     return MapFinding("without picture", found, Grade.GOOD, "as it should be")
 
 
-def _sharpness(cache: TileCache, kind: MapKind, use: Use) -> list[MapFinding]:
+def _sharpness(cache: TileCache, kind: MapKind, use: MapUse) -> list[MapFinding]:
     if not len(_leaf_gsd(cache)) and not cache.manifest.gsd_m:
         return [MapFinding("texel size", "none", Grade.BAD, "no tile has a picture")]
     return [_texels(cache, use), _detail(kind, use)]
 
 
-def _texels(cache: TileCache, use: Use) -> MapFinding:
+def _texels(cache: TileCache, use: MapUse) -> MapFinding:
     gsd = _leaf_gsd(cache)
     typical = float(np.median(gsd)) if len(gsd) else cache.manifest.gsd_m
     ratio = typical / use.pixel_m
@@ -300,14 +300,14 @@ def _texels(cache: TileCache, use: Use) -> MapFinding:
     )
 
 
-def _heights_finding(kind: MapKind, use: Use) -> MapFinding:
+def _heights_finding(kind: MapKind, use: MapUse) -> MapFinding:
     advice = kind.advice(use.half_view_deg, use.height_m)
     grade = Grade.ADVICE if advice else Grade.GOOD
     words = advice or "they tell a tilt from a shift"
     return MapFinding("heights", HEIGHTS_HOLD[kind.heights], grade, words)
 
 
-def _detail(kind: MapKind, use: Use) -> MapFinding:
+def _detail(kind: MapKind, use: MapUse) -> MapFinding:
     ratio = kind.effective_resolution_m / use.pixel_m
     found = f"{kind.effective_resolution_m:.2f} m are resolved, {ratio:.1f} working pixels"
     if ratio <= _COARSE:
@@ -367,7 +367,7 @@ def _painted(
     return picture
 
 
-def _texel_ratio(cache: TileCache, mosaic: Mosaic, use: Use) -> NDArray[np.float32]:
+def _texel_ratio(cache: TileCache, mosaic: Mosaic, use: MapUse) -> NDArray[np.float32]:
     """Texels over working pixels, (h, w)."""
     index = cache.index
     ratio = np.zeros(mosaic.height.shape, np.float32)
@@ -380,7 +380,7 @@ def _texel_ratio(cache: TileCache, mosaic: Mosaic, use: Use) -> NDArray[np.float
     return ratio
 
 
-def _texel_picture(cache: TileCache, mosaic: Mosaic, use: Use) -> Image:
+def _texel_picture(cache: TileCache, mosaic: Mosaic, use: MapUse) -> Image:
     """Texels over working pixels, from green (fine) to red (four and more)."""
     ratio = _texel_ratio(cache, mosaic, use)
     level = np.clip(1 - ratio / _TOO_COARSE, 0, 1)

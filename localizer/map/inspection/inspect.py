@@ -248,6 +248,7 @@ class _Occupancy:
         return float(self._grid.sum(dtype=np.int64)) * self._cell**2
 
     def holes(self) -> list[Hole]:
+        """Enclosed areas without map, largest first."""
         count, labels, stats, centroids = cv2.connectedComponentsWithStats(
             1 - self._grid, connectivity=4
         )

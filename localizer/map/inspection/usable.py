@@ -19,7 +19,7 @@ _RIM = 2  # cells of both sides: a ragged edge is no news
 
 
 @dataclass(frozen=True)
-class Usable:
+class UsableArea:
     """The largest rectangle without faults. south, west, north, east: degrees, inside it; size_m:
     east and north; is_whole: it is the rectangle about the map, but for a rim of a cell.
     """
@@ -42,7 +42,7 @@ class Usable:
 
 def usable_part(
     mosaic: Mosaic, faulty: NDArray[np.bool_], height_m: float, frame: LocalFrame
-) -> Usable | None:
+) -> UsableArea | None:
     """The largest rectangle of cells that are good to nine tenths; None where no cell is.
 
     faulty: (h, w) of the mosaic, where there is nothing to match. height_m: of the flight, by which
@@ -63,7 +63,7 @@ def usable_part(
     north_west, north_east, south_west, south_east = (p.latitude_deg for p in places)
     about = frame.origin.longitude_deg
     beyond = [beside(p.longitude_deg, about) for p in places]  # in the same order
-    return Usable(
+    return UsableArea(
         max(south_west, south_east),
         wrapped(max(beyond[0], beyond[2])),
         min(north_west, north_east),

@@ -88,7 +88,7 @@ class LoopEvent(StrictModel):
     vehicle: dict[str, float] = Field(default_factory=dict)
 
 
-class Wrong(StrictModel):
+class DeploymentErrors(StrictModel):
     """What the deployment has wrong from the start.
 
     map_shift_m: east, north, up of where the map shows the ground. gimbal_deg: roll, pitch, yaw
@@ -160,7 +160,7 @@ class LoopCase(StrictModel):
     gated: bool = False
     deployment: dict[str, Any] = Field(default_factory=dict)
     vehicle: dict[str, float] = Field(default_factory=dict)
-    wrong: Wrong = Wrong()
+    wrong: DeploymentErrors = DeploymentErrors()
     zoom_points: tuple[tuple[float, float], ...] = ()
     timeline: tuple[LoopEvent, ...] = ()
     expect: Expectation = Expectation()
@@ -183,13 +183,13 @@ class LoopCase(StrictModel):
         """Whether injection is earned by the shadow score before GNSS is gone; else, where what is
         wrong would not be flown at all, it is forced. A cold companion has nothing to compare.
         """
-        return self.wrong == Wrong() and not self.cold
+        return self.wrong == DeploymentErrors() and not self.cold
 
     @property
     def is_normal(self) -> bool:
         """Whether nothing is wrong: whatever is told then is a false alarm."""
         told = bool(self.zoom_points) and all(e.zoom is not None for e in self.timeline)
-        return self.wrong == Wrong() and (not self.timeline or told) and not self.cold
+        return self.wrong == DeploymentErrors() and (not self.timeline or told) and not self.cold
 
     @property
     def scenario(self) -> Scenario:

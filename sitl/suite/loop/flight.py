@@ -30,10 +30,10 @@ from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
-from sitl.suite.loop.case import LoopCase, LoopEvent, OperatorHint, Wrong, Zoom
+from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
-from sitl.suite.loop.judge import Back, LoopRecord, LoopSample, LoopText
+from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText, RestartTimes
 from sitl.suite.loop.terrain_file import terrain_file
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
@@ -54,7 +54,7 @@ class LoopAssets:
 
 
 @dataclass(frozen=True)
-class Cabin:
+class ParticipantContext:
     """What a passenger finds. frames: the world camera's log; movers: everything that moves, in
     the map's ENU.
     """
@@ -65,21 +65,21 @@ class Cabin:
     movers: tuple[Mover, ...]
 
 
-class Passenger(Protocol):
+class FlightParticipant(Protocol):
     """Someone who takes part in a flight: an operator, or who flies it by hand."""
 
     def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
         """What is in the world besides its traffic, from that CLOCK_MONOTONIC time on."""
         ...
 
-    def ride(self, cabin: Cabin) -> AbstractContextManager[None]:
+    def ride(self, cabin: ParticipantContext) -> AbstractContextManager[None]:
         """Entered when the recorded part begins, left at its end."""
         ...
 
 
 def fly(
     case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
-    passenger: Passenger | None = None,
+    passenger: FlightParticipant | None = None,
 ) -> LoopRecord:  # fmt: skip
     """Fly a case; `out` receives the records. SimulationError when it could not be flown at all."""
     out.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ class _LoopFlight:
 
     def __init__(
         self, case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
-        stack: ExitStack, passenger: Passenger | None = None,
+        stack: ExitStack, passenger: FlightParticipant | None = None,
     ) -> None:  # fmt: skip
         self._case, self._assets, self._kind = case, assets, kind
         self._passenger = passenger
@@ -156,7 +156,7 @@ class _LoopFlight:
     def _wait_tracking(self) -> None:
         """Wait for a health that is ok; where something is wrong it may never be, or say why."""
         case, link = self._case, self._pilot.link
-        if case.wrong == Wrong() and not case.cold:
+        if case.wrong == DeploymentErrors() and not case.cold:
             link.wait(self._is_tracking, _TRACKING_S, "the localizer to track")
         elif not case.wrong.other_map and not case.cold:
             link.wait_wall(self._is_tracking, _WRONG_S)
@@ -252,7 +252,8 @@ class _LoopFlight:
         if self._passenger is None:
             return nullcontext()
         frames = self._out / "frames.csv"
-        return self._passenger.ride(Cabin(self._vehicle, self._pilot, frames, self._movers))
+        context = ParticipantContext(self._vehicle, self._pilot, frames, self._movers)
+        return self._passenger.ride(context)
 
     @property
     def _now_s(self) -> float:
@@ -361,7 +362,7 @@ class _LoopFlight:
             samples.append(replace(sample, error_m=error_m))
         return tuple(samples)
 
-    def _back(self) -> Back | None:
+    def _back(self) -> RestartTimes | None:
         """What came after the companion's end, by its own record and by what was sent."""
         if self._ended_ns is None:
             return None
@@ -378,7 +379,7 @@ class _LoopFlight:
             for e in read_estimates(path)
             if e.exposure_time_ns > ended_ns
         ]
-        return Back(
+        return RestartTimes(
             _first_s((t for t, accepted, _ in known if accepted), ended_ns),
             _first_s((t for t, accepted, tracks in known if accepted and tracks), ended_ns),
             _first_s(sent, utc_ns),

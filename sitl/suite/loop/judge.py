@@ -69,7 +69,7 @@ class LoopText:
 
 
 @dataclass(frozen=True)
-class Back:
+class RestartTimes:
     """Seconds from the end of a companion to what came of the next; infinite: never.
 
     estimates_s, tracks_s: until its first accepted estimate was known, and the first one of a
@@ -95,7 +95,7 @@ class LoopRecord:
     fix_errors_m: tuple[float, ...]
     pace: float = 1.0
     stall_s: float = 0.0
-    back: Back | None = None
+    back: RestartTimes | None = None
     shadow: Health | None = None
 
 
@@ -199,7 +199,7 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
     if record.shadow is not None:
         held.append(Held("shadow check passed", record.shadow.ready, record.shadow.shadow))
     if expect.back_within_s is not None:
-        back = record.back or Back(math.inf, math.inf, math.inf)
+        back = record.back or RestartTimes(math.inf, math.inf, math.inf)
         ok = back.injects_s <= expect.back_within_s
         found = f"estimate after {back.estimates_s:.1f} s, tracks {back.tracks_s:.1f}"
         found += f", injects {back.injects_s:.1f}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.calibrate.wander import AttitudeWander, Likelihood, Wander
+from companion.calibrate.wander import AttitudeProcess, GaussMarkovProcess, Likelihood
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.pose import Array, matrix_from_euler
 
@@ -38,7 +38,7 @@ def true_covariance(sources: Array) -> Array:
     return np.asarray(made + np.eye(size) * WHITE**2)
 
 
-def said_and_true(wander: Wander | AttitudeWander) -> tuple[Array, Array]:
+def said_and_true(wander: GaussMarkovProcess | AttitudeProcess) -> tuple[Array, Array]:
     """(4,) sigmas of mounting and heading as they are said, and as they are."""
     sources, up = axes()
     size = 3 * len(TIMES_S)
@@ -53,11 +53,13 @@ def said_and_true(wander: Wander | AttitudeWander) -> tuple[Array, Array]:
 def test_what_is_said_of_mounting_and_heading_is_as_unsure_as_it_is():
     """By axis of the camera alone, the heading was said twice as surely as it is."""
     _, up = axes()
-    by_axis = Wander(np.hypot([PITCH, 0.5 * HEADING, ROLL], [0, 0, HEADING]), np.full(3, MEMORY_S))
+    by_axis = GaussMarkovProcess(
+        np.hypot([PITCH, 0.5 * HEADING, ROLL], [0, 0, HEADING]), np.full(3, MEMORY_S)
+    )
     window, true = said_and_true(by_axis)
     assert true[3] > 1.5 * window[3]
     sigmas = np.array([PITCH, 1e-6, ROLL, HEADING, 1e-6])
-    said_better, true_better = said_and_true(AttitudeWander(sigmas, MEMORY_S, up))
+    said_better, true_better = said_and_true(AttitudeProcess(sigmas, MEMORY_S, up))
     assert said_better == pytest.approx(true_better, rel=1e-3)
     assert true_better[2] < 0.75 * true[2]  # of the mounting about the boresight
     assert true_better[3] < 0.9 * true[3]
@@ -72,7 +74,7 @@ def test_errors_about_the_vertical_are_told_from_those_of_the_mounting():
         errors[k] = kept * errors[k - 1] + np.sqrt(1.0 - kept**2) * errors[k]
     left = np.einsum("kip,kp->ki", sources * [ROLL, PITCH, HEADING], errors)
     left = left + rng.normal(0.0, WHITE, left.shape)
-    found = AttitudeWander.of(left, up, TIMES_S, LEAST, WHITE)
+    found = AttitudeProcess.of(left, up, TIMES_S, LEAST, WHITE)
     assert np.hypot(*found.sigma[3:]) == pytest.approx(HEADING, rel=0.5)
     assert found.sigma[[0, 2]] == pytest.approx([PITCH, ROLL], rel=0.35)
     assert found.sigma[1] < 0.5 * HEADING
@@ -109,7 +111,7 @@ def test_an_ekf_that_smooths_does_not_make_its_receiver_better():
     short, told = [], []
     for _ in range(20):
         left = strays(rng, 0.25, 60.0, smooth_s=4.0)
-        wander = Wander.of(left, TIMES_S, 0.08)
+        wander = GaussMarkovProcess.of(left, TIMES_S, 0.08)
         short.append(wander.sigma)
         told.append(wander.over_long_steps(left, TIMES_S).sigma)
     assert np.median(short) < 0.6 * 0.25
@@ -121,7 +123,7 @@ def test_errors_that_nothing_smooths_are_said_as_before():
     ratios = []
     for memory_s in (2.0, 8.0):
         left = strays(rng, 0.25, memory_s, smooth_s=1e-3)
-        wander = Wander.of(left, TIMES_S, 0.08)
+        wander = GaussMarkovProcess.of(left, TIMES_S, 0.08)
         ratios.append(wander.over_long_steps(left, TIMES_S).sigma / wander.sigma)
     assert np.max(ratios) < 1.15
     few = TIMES_S[:20]

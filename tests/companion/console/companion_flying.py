@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from companion.config import TargetConfig
-from companion.live.orders import Helm, Orders
+from companion.live.orders import OrderContext, Orders
 from companion.live.publisher import Publisher
 from companion.live.shown import Instruments, Shown
 from companion.targets.clicks import ClickPolicy
@@ -99,7 +99,7 @@ class Flight:
                 replace(request, time_ns=request.time_ns + late_ns, number=next(numbers))
             )
 
-        helm = Helm(self._report, track, lambda *hint: self.hints.append(hint))
+        helm = OrderContext(self._report, track, lambda *hint: self.hints.append(hint))
         self.publisher = Publisher(self.path, self.shown, Orders(self.control, helm), 10.0)
         self._stop = threading.Event()
         self._streamer = TileStreamer(self.cache)

@@ -27,9 +27,9 @@ from starlette.websockets import WebSocketDisconnect
 from uvicorn.server import ServerState
 
 from companion.console.records import Records
-from companion.console.security import MOST_BODY, Guarded, read_token
+from companion.console.security import MOST_BODY, RequestGuard, read_token
 from companion.console.server import ConsoleSite, make_application
-from companion.console.serving import HurriedProtocol, Server
+from companion.console.serving import RequestTimeoutProtocol, Server
 from companion.console.source import Newest
 from companion.console.tiles import TileName
 from companion.errors import ConfigError
@@ -267,7 +267,7 @@ def test_floods_are_refused_until_they_are_over():
     async def nothing(*_):
         return {}
 
-    guarded = Guarded(app, ConsoleConfig(), None, lambda: now[0])
+    guarded = RequestGuard(app, ConsoleConfig(), None, lambda: now[0])
     scope = {
         "type": "http", "method": "GET", "path": "/", "headers": [(b"host", HOST.encode())],
         "query_string": b"",
@@ -472,8 +472,8 @@ def _connected(*pieces):
         get_extra_info=lambda *_: None, abort=lambda: gone.append(1), is_closing=lambda: False,
         pause_reading=lambda: None, resume_reading=lambda: None,
     )  # fmt: skip
-    config = uvicorn.Config(Mock(), interface="asgi3", http=HurriedProtocol)
-    protocol = HurriedProtocol(config, ServerState(), {}, loop)
+    config = uvicorn.Config(Mock(), interface="asgi3", http=RequestTimeoutProtocol)
+    protocol = RequestTimeoutProtocol(config, ServerState(), {}, loop)
     protocol.connection_made(transport)
     for piece in pieces:
         protocol.data_received(piece)

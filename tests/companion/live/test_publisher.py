@@ -16,7 +16,7 @@ import pytest
 
 from companion.console.flight_source import FlightSource
 from companion.errors import CompanionError
-from companion.live.orders import Helm, OrderError, Orders
+from companion.live.orders import OrderContext, OrderError, Orders
 from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
 from companion.live.publisher import Publisher
 from companion.live.shared import Arrivals
@@ -51,7 +51,7 @@ class Ship:
         self.said: list[Any] = []
         self.tracked: list[Any] = []
         self.hints: list[Any] = []
-        self.helm = Helm(self.said.append, self.tracked.append,
+        self.helm = OrderContext(self.said.append, self.tracked.append,
                          lambda *hint: self.hints.append(hint))  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from companion.errors import StreamOpenError
-from companion.sources.sdp import Session
+from companion.sources.sdp import SdpSession
 
 QGC = (
     "v=0\r\no=- 0 0 IN IP4 192.168.0.10\r\ns=feed\r\nc=IN IP4 192.168.0.10\r\nt=0 0\r\n"
@@ -24,13 +24,15 @@ def path(tmp_path: Path) -> Path:
 def test_address_and_parameter_sets_are_read(path: Path) -> None:
     path.write_text(QGC)
     sets = b"\0\0\0\1\x67\x42\xc0\x1e\0\0\0\1\x68\xce\x3c\x80"
-    assert Session.read(path) == Session("0.0.0.0", 5600, sets)  # another address: the sender's
+    assert SdpSession.read(path) == SdpSession(
+        "0.0.0.0", 5600, sets
+    )  # another address: the sender's
     path.write_text(
         "\ufeff" + QGC.replace("c=IN IP4 192.168.0.10", "c=IN IP4 239.1.1.1/8"), "utf-8"
     )
-    assert Session.read(path).host == "239.1.1.1"
+    assert SdpSession.read(path).host == "239.1.1.1"
     path.write_text(QGC.replace("H264", "H265").replace("sprop-parameter-sets", "sprop-vps"))
-    assert Session.read(path).sets == sets
+    assert SdpSession.read(path).sets == sets
 
 
 @pytest.mark.parametrize(
@@ -44,6 +46,6 @@ def test_address_and_parameter_sets_are_read(path: Path) -> None:
 def test_another_session_is_named(path: Path, change: tuple[str, str], message: str) -> None:
     path.write_text(QGC.replace(*change))
     with pytest.raises(StreamOpenError, match=rf"feed\.sdp: .*{message}"):
-        Session.read(path)
+        SdpSession.read(path)
     with pytest.raises(StreamOpenError, match="cannot be read"):
-        Session.read(path.with_name("missing.sdp"))
+        SdpSession.read(path.with_name("missing.sdp"))

@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 from companion.config import DetectorConfig
 from companion.errors import DetectorError
 from companion.targets.detector.boxes import decode, layout_of
-from companion.targets.detector.names import LocatedBox, ThingNames
+from companion.targets.detector.names import LocatedBox, ObjectNames
 from companion.targets.detector.network import DetectorNetwork
 from companion.targets.detector.worker import BoxDetector
 from localizer.types import Frame
@@ -123,7 +123,7 @@ def _broken(folder):
 
 
 def test_a_thing_keeps_its_name_while_it_drives_and_a_single_sight_has_none():
-    names, told = ThingNames(), []
+    names, told = ObjectNames(), []
     for k in range(8):  # two cars that pass each other, half a second apart
         a = LocatedBox("car", np.array([8.0 * 0.5 * k, 0.0, 0.0]))
         b = LocatedBox("car", np.array([30.0 - 8.0 * 0.5 * k, 4.0, 0.0]))

@@ -19,7 +19,7 @@ from localizer.odometry import (
     VisualOdometry,
     odometry_optimizer,
 )
-from localizer.odometry.ground import SoundedGround
+from localizer.odometry.ground import RangefinderGround
 from localizer.registration import JNGO, attitude_constraint, combine, height_constraint
 from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
 from tests.localizer.registration.conftest import SyntheticPlace
@@ -198,7 +198,7 @@ def test_a_terrain_models_shape_counts_and_not_its_datum():
 
 
 def test_few_readings_are_no_ground():
-    sounded = SoundedGround()
+    sounded = RangefinderGround()
     for k in range(4):
         sounded.add(k * STEP_NS, 5.0)
     assert sounded.at(4 * STEP_NS) is None

@@ -14,7 +14,7 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.tracking.pipeline import Localizer
-from localizer.tracking.reference import lead_share, still_serves
+from localizer.tracking.reference import is_still_valid, lead_share
 from localizer.types import (
     Anchors,
     FeatureLevel,
@@ -64,25 +64,25 @@ def _moved(east_px: float = 0.0, up_m: float = 0.0, yaw_deg: float = 0.0) -> Pos
     ],
 )
 def test_it_serves_while_its_picture_moves_by_less_than_said(pose, serves):
-    assert still_serves(_reference(), pose, CAMERA, SECOND_NS + 1, 8.0) is serves
+    assert is_still_valid(_reference(), pose, CAMERA, SECOND_NS + 1, 8.0) is serves
 
 
 def test_it_does_not_serve_for_longer_than_a_second_nor_backwards_nor_where_it_is_switched_off():
     reference = _reference()
-    assert not still_serves(reference, NADIR, CAMERA, 2 * SECOND_NS + 1, 8.0)
-    assert not still_serves(reference, NADIR, CAMERA, SECOND_NS - 1, 8.0)
-    assert not still_serves(reference, NADIR, CAMERA, SECOND_NS + 1, 0.0)
+    assert not is_still_valid(reference, NADIR, CAMERA, 2 * SECOND_NS + 1, 8.0)
+    assert not is_still_valid(reference, NADIR, CAMERA, SECOND_NS - 1, 8.0)
+    assert not is_still_valid(reference, NADIR, CAMERA, SECOND_NS + 1, 0.0)
 
 
 def test_it_does_not_serve_a_lens_that_has_zoomed_since():
     slightly, far = (replace(CAMERA, fx=CAMERA.fx * f, fy=CAMERA.fy * f) for f in (1.01, 1.2))
-    assert still_serves(_reference(), NADIR, slightly, SECOND_NS + 1, 8.0)
-    assert not still_serves(_reference(), NADIR, far, SECOND_NS + 1, 8.0)
+    assert is_still_valid(_reference(), NADIR, slightly, SECOND_NS + 1, 8.0)
+    assert not is_still_valid(_reference(), NADIR, far, SECOND_NS + 1, 8.0)
 
 
 def test_a_reference_without_anchors_does_not_serve():
     few = Anchors(np.zeros((3, 3)), np.zeros((3, 2), np.float32), (), ())
-    assert not still_serves(replace(_reference(), anchors=few), NADIR, CAMERA, SECOND_NS + 1, 8.0)
+    assert not is_still_valid(replace(_reference(), anchors=few), NADIR, CAMERA, SECOND_NS + 1, 8.0)
 
 
 class _Renderer:

@@ -19,8 +19,8 @@ from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
 from sitl.operator.follow_run import read_fixes
 from sitl.operator.followed import FollowedFix, follow_verdict
 from sitl.operator.judge import judge
-from sitl.operator.operator import Asked, Frames
-from sitl.operator.station import GeoReport, Heard
+from sitl.operator.operator import Frames, SentWish
+from sitl.operator.station import GeoReport, ReceivedMessages
 from sitl.operator.truth import GroundTruth, Pointed, all_pointed
 from sitl.operator.wishes import Wish, draw_wishes
 from tests.companion.targets.scene import CAMERA, DOWN
@@ -51,13 +51,13 @@ def witness(small_assets: FlightAssets, tmp_path: Path) -> GroundTruth:
     return GroundTruth(small_assets, CAMERA, tmp_path / "frames.csv")
 
 
-def clicked(number: int, u: float, v: float, frame: int, ended: tuple[int, ...] = ()) -> Asked:
+def clicked(number: int, u: float, v: float, frame: int, ended: tuple[int, ...] = ()) -> SentWish:
     time_ns = frame * PERIOD_NS
     wish = Wish("point", 0.0, (u, v))
-    return Asked(wish, time_ns, time_ns, frame, time_ns, 0.25, number, 0, ended)
+    return SentWish(wish, time_ns, time_ns, frame, time_ns, 0.25, number, 0, ended)
 
 
-def stopped(*ended: int, frame: int) -> Asked:
+def stopped(*ended: int, frame: int) -> SentWish:
     return replace(clicked(0, 0.5, 0.5, frame), wish=Wish("stop", 0.0), ended=ended)
 
 
@@ -82,22 +82,22 @@ def row(point: Pointed, at_s: float, off: Any = (0.0, 0.0, 0.0), **other: Any) -
 
 
 @pytest.fixture
-def asked() -> list[Asked]:
+def asked() -> list[SentWish]:
     return [clicked(1, 0.3, 0.4, 10), clicked(2, 0.7, 0.6, 40), stopped(1, frame=200)]
 
 
-def heard(witness: GroundTruth, points: dict[int, Pointed], **other: Any) -> Heard:
+def heard(witness: GroundTruth, points: dict[int, Pointed], **other: Any) -> ReceivedMessages:
     """One report over the link, of target 2."""
     place = points[2].place
     assert place is not None
     at = witness.frame.position(place)
     altitude = at.height_m - witness.geoid_m
     geo = GeoReport(50 * PERIOD_NS, at.latitude_deg, at.longitude_deg, altitude, 0.5, 0.3, None)
-    return Heard(geo=[replace(geo, **other)])
+    return ReceivedMessages(geo=[replace(geo, **other)])
 
 
 def test_right_reports_are_no_problem(
-    witness: GroundTruth, asked: list[Asked], tmp_path: Path
+    witness: GroundTruth, asked: list[SentWish], tmp_path: Path
 ) -> None:
     points = all_pointed(witness, asked)
     rows = [row(p, s, (0.2, 0.0, 0.1)) for p in points.values() for s in np.arange(0.0, 12.0, 0.2)]
@@ -120,7 +120,7 @@ def test_right_reports_are_no_problem(
     ],
 )
 def test_each_fault_of_a_report_is_a_problem(
-    fault: Any, problem: str, witness: GroundTruth, asked: list[Asked], tmp_path: Path
+    fault: Any, problem: str, witness: GroundTruth, asked: list[SentWish], tmp_path: Path
 ) -> None:
     points = all_pointed(witness, asked)
     rows = [*fault(points[1], points[2]), row(points[2], 1.0)]
@@ -129,7 +129,7 @@ def test_each_fault_of_a_report_is_a_problem(
 
 
 def test_what_comes_over_the_link_is_judged_too(
-    witness: GroundTruth, asked: list[Asked], tmp_path: Path
+    witness: GroundTruth, asked: list[SentWish], tmp_path: Path
 ) -> None:
     points = all_pointed(witness, asked)
     path = reports(tmp_path / "t.csv", [row(p, 1.0) for p in points.values()])
@@ -139,7 +139,7 @@ def test_what_comes_over_the_link_is_judged_too(
     ):
         verdict = judge(witness, asked, heard(witness, points, **other), path)
         assert any(problem in found for found in verdict.problems)
-    deaf = judge(witness, asked, Heard(), path, "KeyError: 'x'")
+    deaf = judge(witness, asked, ReceivedMessages(), path, "KeyError: 'x'")
     assert "nothing came over the link" in deaf.problems
     assert any("KeyError" in found for found in deaf.problems)
 

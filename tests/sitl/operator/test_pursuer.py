@@ -20,7 +20,7 @@ from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
 from sitl.operator.operator import LATE_S
 from sitl.operator.pursuer import FOLLOWED_S, Pursuer
-from sitl.operator.station import Heard
+from sitl.operator.station import ReceivedMessages
 from tests.companion.targets.scene import CAMERA, DOWN
 
 SECOND = 10**9
@@ -69,7 +69,7 @@ class Flight:
 
     def station(self, _endpoint: str, _alive: Callable[[], None]) -> Any:
         return SimpleNamespace(
-            heard=Heard(), run_until=self._run_until, ask=self._ask, close=self._close
+            heard=ReceivedMessages(), run_until=self._run_until, ask=self._ask, close=self._close
         )
 
     def _run_until(self, done: Callable[[], bool], until_ns: int) -> bool:

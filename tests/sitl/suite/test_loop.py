@@ -15,11 +15,11 @@ from mavlink_bridge.alerts.words import Output
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.case import Expectation, load_loop_cases
 from sitl.suite.loop.judge import (
-    Back,
     Held,
     LoopRecord,
     LoopSample,
     LoopText,
+    RestartTimes,
     false_alarms,
     figures,
     judge,
@@ -78,7 +78,7 @@ def test_every_expectation_can_fail() -> None:
 @pytest.mark.parametrize(("injects_s", "ok"), [(4.9, True), (5.1, False), (float("inf"), False)])
 def test_who_is_back_too_late_or_never_is_missed(injects_s: float, ok: bool) -> None:
     expect = Expectation(back_within_s=5.0)
-    flown = replace(record(flight([0.5] * 4)), back=Back(1.0, 2.0, injects_s))
+    flown = replace(record(flight([0.5] * 4)), back=RestartTimes(1.0, 2.0, injects_s))
     assert judge(flown, expect)[-1].ok is ok
     assert not judge(record(flight([0.5] * 4)), expect)[-1].ok
 

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
-from localizer.map.fetch.polite import Manners, PoliteClient
+from localizer.map.fetch.polite import PoliteClient, RequestLimits
 from localizer.map.fetch.terms import require_allowed
 from tests.localizer.map.fetch.loopback import serving
 
@@ -23,7 +23,7 @@ class Time:
         self.now += seconds
 
     def client(self, **manners: float) -> PoliteClient:
-        return PoliteClient(Manners(**manners), self.sleep, lambda: self.now)
+        return PoliteClient(RequestLimits(**manners), self.sleep, lambda: self.now)
 
 
 @pytest.fixture

@@ -17,12 +17,12 @@ from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.importers.rules import ImportRules
 from localizer.map.inspection.alignment import alignment_of
-from localizer.map.inspection.check import Grade, Use, check_map, seams_of
+from localizer.map.inspection.check import Grade, MapUse, check_map, seams_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
 from localizer.map.inspection.usable import largest_rectangle, usable_part
 from tests.localizer.map.conftest import write_tileset
 
-FINE = Use(120.0, 0.004)
+FINE = MapUse(120.0, 0.004)
 COLOURS = ((170, 60, 40), (120, 120, 130), (60, 110, 50), (190, 170, 120))
 
 
@@ -94,7 +94,7 @@ def test_a_date_that_is_none_is_refused_before_the_build(tmp_path):
 
 def test_texels_are_judged_by_the_height_that_is_flown(cache):
     def grade(height_m):
-        found = check_map(cache, Use(height_m, 0.004)).findings
+        found = check_map(cache, MapUse(height_m, 0.004)).findings
         return next(f.grade for f in found if f.name == "texel size")
 
     gsd = float(np.median(cache.index.gsd[cache.index.child_count == 0]))
