@@ -82,6 +82,11 @@ def _is_covariance(P: Array) -> bool:
     return symmetric and float(np.linalg.eigvalsh(P)[0]) >= -1e-6 * scale
 
 
+def horizontal_sigma_m(P: Array) -> float:
+    """1 sigma along the worst horizontal direction of a covariance, north and east first, m^2."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
+
+
 @dataclass(frozen=True)
 class VisionFix:
     """One position (and attitude) of the vehicle's body, seen by the localizer.
@@ -142,6 +147,16 @@ class VisionFix:
                 f"vision fix: attitude and velocity sigma must be 0 to {_LARGEST_SIGMA:g}, got "
                 f"{sigmas}"
             )
+
+    @property
+    def horizontal_sigma_m(self) -> float:
+        """Along the worst direction."""
+        return horizontal_sigma_m(self.position_covariance_ned)
+
+    @property
+    def vertical_sigma_m(self) -> float:
+        """Of the height."""
+        return math.sqrt(max(float(self.position_covariance_ned[2, 2]), 0.0))
 
     @property
     def yaw_rad(self) -> float | None:

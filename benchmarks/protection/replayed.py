@@ -171,7 +171,6 @@ def _parts(
     none = p.model_copy(
         update={"map_m": 0.0, "map_height_m": 0.0, "calibration_share": 0.0, "time_bias_s": 0.0}
     )
-    sigma = float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))
     north, east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
     height, speed = max(state.altitude_relative_m or 0.0, 0.0), float(np.hypot(north, east))
     alone = (
@@ -180,7 +179,7 @@ def _parts(
         none.model_copy(update={"calibration_share": p.calibration_share}),
         none.model_copy(update={"time_bias_s": p.time_bias_s}),
     )
-    sigmas = (sigma, 0.0, 0.0, 0.0)
+    sigmas = (fix.horizontal_sigma_m, 0.0, 0.0, 0.0)
     return tuple(
         budget((s, 0.0), height, (speed, 0.0), one)[0] for s, one in zip(sigmas, alone, strict=True)
     )

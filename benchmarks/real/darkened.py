@@ -91,7 +91,9 @@ def main() -> None:
     p = Parser(__doc__)
     p.add_argument("folder", type=Path, help="of the maps that are built")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real data")
-    p.add_argument("--sets", nargs="+", choices=(*SETS, "generated"), default=list(SETS))
+    p.add_argument(
+        "--sets", nargs="+", choices=(*SETS, "generated"), default=list(SETS), help="to read"
+    )
     p.add_argument("--images", type=whole(1, 100), default=10, help="of each set")
     args = p.parse_args()
     limit = VideoCheckConfig().low_detail

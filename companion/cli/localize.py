@@ -14,7 +14,13 @@ from rich.markup import escape
 
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
-from companion.offline.localize import LocalizedImage, Sigmas, image_times, localize_images
+from companion.offline.localize import (
+    LocalizedImage,
+    Sigmas,
+    image_times,
+    localize_images,
+    measured,
+)
 from companion.sources.folder_source import list_images
 from companion.terminal.steps import COMPILES, shown_count, tally
 from companion.trajectory import stamped, write_trajectory
@@ -57,6 +63,18 @@ def localize_command(
     prior_sigma_deg: Annotated[
         float, typer.Option(min=0.01, max=180, help="sigma of their attitude, degrees")
     ] = 4.0,
+    attitude_sigma_deg: Annotated[
+        float | None,
+        typer.Option(
+            min=0.05,
+            max=20,
+            help="sigma of the priors' roll and pitch where measured, deg",
+        ),
+    ] = None,
+    height_sigma_m: Annotated[
+        float | None,
+        typer.Option(min=0.05, max=100, help="sigma of the priors' height where it is measured, m"),
+    ] = None,
     out: Annotated[Path, typer.Option(help="folder of the results")] = Path("localized"),
     rate_hz: Annotated[
         float, typer.Option(min=0.001, max=1000, help="frame rate of images without timestamps.txt")
@@ -75,7 +93,9 @@ def localize_command(
     if not images.exists():
         raise ConfigError(f"{images}: no such image or folder")
     paths = list_images(images) if images.is_dir() else [images]
-    TileCache.open(map_cache)  # paths first: what is missing is said before anything is computed
+    cache = TileCache.open(
+        map_cache
+    )  # paths first: what is missing is said before anything is computed
     intrinsics = Camera.from_json(camera)
     if (prior is None) == (priors is None):
         raise ConfigError(
@@ -87,15 +107,18 @@ def localize_command(
     if paths[0].name not in {row.name for row in rows}:
         raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")
     made_folder(out, "--out")
-    config = LocalizerConfig(
-        width=width, model=model, renderer=renderer, device=device, feature_threads=2
+    sigmas = Sigmas(prior_sigma_m, prior_sigma_deg, attitude_sigma_deg, height_sigma_m)
+    config = sigmas.config(
+        LocalizerConfig(
+            width=width, model=model, renderer=renderer, device=device, feature_threads=2
+        )
     )
     times = image_times(paths, rate_hz)
+    known: Mapping[str, Pose] = {row.name: world_from_camera(row, cache.frame) for row in rows}
+    sensors = measured(paths, times, known)
     count = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
-    with open_localizer(map_cache, intrinsics, config) as localizer, count as show:
+    with open_localizer(map_cache, intrinsics, config, sensors) as localizer, count as show:
         frame = localizer.frame
-        known: Mapping[str, Pose] = {row.name: world_from_camera(row, frame) for row in rows}
-        sigmas = Sigmas(prior_sigma_m, prior_sigma_deg)
         more = tally(show, len(paths))
         found = []
         for one in localize_images(localizer, paths, times, intrinsics, known, sigmas):

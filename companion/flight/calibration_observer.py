@@ -39,11 +39,10 @@ class CalibrationObserver:
         self, estimate: PoseEstimate, fix: VisionFix, depth_m: float
     ) -> CalibrationObservation:
         pose, frame = estimate.world_from_camera, self._extrinsics.frame
-        P = fix.position_covariance_ned
         return CalibrationObservation(
             fix.time_ns,
             (fix.latitude_deg, fix.longitude_deg, fix.height_m),
-            float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])),
+            fix.horizontal_sigma_m,
             ned_from_world(frame, frame.position(pose.translation)) @ pose.rotation,
             depth_m,
             estimate.camera.horizontal_fov_deg,

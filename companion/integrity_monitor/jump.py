@@ -7,8 +7,6 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.heading import HeadingChange, HeadingHistory, turn_of
 from companion.integrity_monitor.position_checks import LocalPlace
@@ -236,7 +234,7 @@ class JumpCheck:
                 allowed += math.hypot(*led)
         off = self._off(last.fix, led, fix)
         return PositionStep(
-            fix.time_ns, off, last.velocity, _sigma(fix), allowed, allowed - sigma, dt
+            fix.time_ns, off, last.velocity, fix.horizontal_sigma_m, allowed, allowed - sigma, dt
         )
 
     def _reckoned(self, last: VisionFix, fix: VisionFix) -> Metres | None:
@@ -268,8 +266,4 @@ def _seconds(a: VisionFix, b: VisionFix) -> float:
 
 
 def _sigmas(a: VisionFix, b: VisionFix) -> float:
-    return math.hypot(_sigma(a), _sigma(b))
-
-
-def _sigma(fix: VisionFix) -> float:
-    return float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))
+    return math.hypot(a.horizontal_sigma_m, b.horizontal_sigma_m)

@@ -76,7 +76,8 @@ class MotionCheck:
         if moved is None:
             self._moved = None
             return MotionVerdict(False, 0.0, 0.0, still_s)
-        sigma = max(_sigma(fix), _SIGMA_FLOOR_M)
+        most_m = _BY_ODOMETRY_M if fix.by_odometry else np.inf
+        sigma = float(np.clip(fix.horizontal_sigma_m, _SIGMA_FLOOR_M, most_m))
         last = self._moved
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
         anew = self._restarts != self._track.restarts or gap_s > _GAP_S or leaps
@@ -161,8 +162,3 @@ class StillPosition:
                 self._reference = (self._block_ns, mean)
             self._block = []
         return 0.0 if self._reference is None else (time_ns - self._reference[0]) * 1e-9
-
-
-def _sigma(fix: VisionFix) -> float:
-    sigma = float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))
-    return min(sigma, _BY_ODOMETRY_M) if fix.by_odometry else sigma

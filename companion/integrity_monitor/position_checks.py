@@ -72,7 +72,7 @@ class HeightCheck:
         dt = min(max((fix.time_ns - self._last_ns) * 1e-9, 0.0), 1.0)
         self._last_ns = fix.time_ns
         apart = median - self._zero
-        sigma = math.sqrt(float(fix.position_covariance_ned[2, 2]))
+        sigma = fix.vertical_sigma_m
         climbed_m = altitude - self._altitude_m
         bad = abs(apart) > self._limit_m + _SIGMAS * sigma + SENSORS.climb_share * abs(climbed_m)
         if not bad:

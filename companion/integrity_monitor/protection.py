@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from companion.calibration_watch.ground import UNKNOWN_HEIGHT_M
 from companion.integrity_monitor.config import ProtectionConfig
 from mavlink_bridge.messages import VehicleState, VisionFix
@@ -32,16 +30,13 @@ def protection_level(
     """The level of a fix. known_m: what another watch found to be wrong, added as it is; height_m:
     above the ground, None where it is not known.
     """
-    P = fix.position_covariance_ned
-    horizontal = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
-    vertical = math.sqrt(max(float(P[2, 2]), 0.0))
     velocity = state.local_velocity_ned or fix.velocity_ned
     speeds = _UNKNOWN_MPS
     if velocity is not None:
         speeds = (math.hypot(*velocity[:2]), abs(velocity[2]))
     if height_m is None:
         height_m = UNKNOWN_HEIGHT_M
-    across, up = budget((horizontal, vertical), height_m, speeds, config)
+    across, up = budget((fix.horizontal_sigma_m, fix.vertical_sigma_m), height_m, speeds, config)
     return ProtectionLevel(across + known_m, up + known_m)
 
 

@@ -9,9 +9,12 @@ from pathlib import Path
 from companion.errors import StreamDecodeError, StreamSizeError
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import TIMESTAMPS_NAME, read_image, read_timestamps
+from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
+from localizer.geometry.pose import Array, Pose
+from localizer.tracking.attitude_bias import AttitudePrior
+from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
 
@@ -20,10 +23,34 @@ _PASSES = 3  # of an image that starts from a prior: the view from there shows a
 
 @dataclass(frozen=True)
 class Sigmas:
-    """How well priors are known, standard deviations per axis."""
+    """How well priors are known, standard deviations per axis. attitude_deg, height_m: of roll and
+    pitch and of the height where sensors measured them; None: they only begin the registration.
+    """
 
     position_m: float
     rotation_deg: float
+    attitude_deg: float | None = None
+    height_m: float | None = None
+
+    def config(self, config: LocalizerConfig) -> LocalizerConfig:
+        """The settings with what the sensors are known to."""
+        known = None if self.attitude_deg is None else AttitudePrior.known_to(self.attitude_deg)
+        return config.model_copy(update={"attitude": known, "height_sigma_m": self.height_m})
+
+
+def measured(
+    images: Sequence[Path], times_ns: Sequence[int], priors: Mapping[str, Pose]
+) -> AuxiliarySensors:
+    """The priors' attitude and height as the sensors of their images; times_ns: of the images."""
+    known = {t: priors[i.name] for i, t in zip(images, times_ns, strict=True) if i.name in priors}
+
+    def rotation_at(time_ns: int) -> Array | None:
+        return known[time_ns].rotation if time_ns in known else None
+
+    def height_at(time_ns: int) -> float | None:
+        return float(known[time_ns].translation[2]) if time_ns in known else None
+
+    return AuxiliarySensors(rotation_at=rotation_at, height_at=height_at)
 
 
 @dataclass(frozen=True)

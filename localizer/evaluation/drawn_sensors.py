@@ -18,8 +18,6 @@ from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PosePrior
 
-_LEAST_DEG = 0.05  # of a sigma in `AttitudePrior`
-
 
 @dataclass(frozen=True)
 class DrawnSensors:
@@ -51,7 +49,7 @@ class DrawnSensors:
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
         """The settings with these sigmas."""
         tilt = self.tilt_sigma_deg
-        attitude = None if tilt is None else _attitude_prior(tilt)
+        attitude = None if tilt is None else AttitudePrior.known_to(tilt)
         return config.model_copy(
             update={"attitude": attitude, "height_sigma_m": self.height_sigma_m}
         )
@@ -88,7 +86,3 @@ class DrawnSensors:
 
     def _rng(self, index: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, 5, index if self.by_frame else 0))
-
-
-def _attitude_prior(sigma_deg: float) -> AttitudePrior:
-    return AttitudePrior(tilt_sigma_deg=max(sigma_deg, _LEAST_DEG), alignment_sigma_deg=_LEAST_DEG)

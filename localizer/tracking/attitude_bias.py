@@ -23,6 +23,7 @@ from localizer.registration.priors import PoseConstraint
 from localizer.sensors.error_model import SENSORS
 from localizer.tracking.motion import RotationAt
 
+_LEAST_SIGMA_DEG = 0.05
 _LEAST_LEVEL = 0.3  # of the camera's x axis that is horizontal: rolled further, there is no pitch
 _TAKEN = 4.0  # sigmas: beyond, nothing is learned
 _CAUTIOUS = 2.0  # sigmas from which a measurement counts less: over some ground vision errs
@@ -45,6 +46,11 @@ class AttitudePrior:
     alignment_sigma_deg: float = (
         SENSORS.alignment_deg
     )  # their bias before it is estimated in flight
+
+    @classmethod
+    def known_to(cls, sigma_deg: float) -> AttitudePrior:
+        """Roll and pitch, each with an error of such a sigma that is another in every image."""
+        return cls(max(sigma_deg, _LEAST_SIGMA_DEG), _LEAST_SIGMA_DEG)
 
 
 @dataclass(frozen=True)

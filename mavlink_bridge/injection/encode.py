@@ -15,9 +15,9 @@ from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionMessage
-from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.injection.propagate import RISK_SIGMAS, PropagatedFix
 from mavlink_bridge.link.clock import SteadyUtc
-from mavlink_bridge.messages import Attitude, Origin, VisionFix
+from mavlink_bridge.messages import Attitude, Origin, VisionFix, horizontal_sigma_m
 from mavlink_bridge.vehicle.origin import ned_from_origin, north_east
 from mavlink_bridge.vehicle.profile import CovarianceFormula, FirmwareProfile, covariance_entry
 
@@ -36,7 +36,6 @@ GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
 _METRES_PER_DOP = 2.5
 _LEAST_DOP, _MOST_DOP = 0.5, 99.0
 _BEST_SATELLITES, _ENOUGH_SATELLITES = 12, 6
-_RISK_SIGMAS = 3.7  # of 1e-3, where nobody gives a protection level
 # m/s of ArduPilot's confidence 100 and 0 (EK3_VIS_VERR_MIN, EK3_VIS_VERR_MAX)
 VELOCITY_SIGMA_MPS = (0.1, 2.0)
 _DELTA_NOISE_MPS = 0.3  # of a velocity from two fixes of the odometry
@@ -68,7 +67,7 @@ class EncodedEstimate:
         if self.protection_m is not None:
             return self.protection_m
         p = self.position
-        return _RISK_SIGMAS * p.horizontal_sigma_m, _RISK_SIGMAS * p.vertical_sigma_m
+        return RISK_SIGMAS * p.horizontal_sigma_m, RISK_SIGMAS * p.vertical_sigma_m
 
 
 def claimed_dilution(level_m: float) -> float:
@@ -97,7 +96,7 @@ def pose_covariance(
         entries[0], entries[6], entries[11] = (float(P[i, i]) for i in range(3))
         entries[1], entries[2], entries[7] = float(P[0, 1]), float(P[0, 2]), float(P[1, 2])
     else:
-        error = math.sqrt(float(np.linalg.eigvalsh(P[:2, :2])[-1]))
+        error = horizontal_sigma_m(P)
         for i in DIAGONAL[:3]:
             entries[i] = covariance_entry(error, formula)
     for i in DIAGONAL[3:]:

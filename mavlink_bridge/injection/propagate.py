@@ -12,14 +12,14 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from mavlink_bridge.messages import VisionFix
+from mavlink_bridge.messages import VisionFix, horizontal_sigma_m
 from mavlink_bridge.vehicle.origin import north_east, offset
 
 Array = NDArray[np.float64]
 
 _UNKNOWN_SPEED_MPS = 15.0  # 1 sigma before two fixes were seen
 _FORGET_AFTER_S = 3.0
-_RISK_SIGMAS = 3.7  # of a risk of 1e-3
+RISK_SIGMAS = 3.7  # of a risk of 1e-3
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PropagatedFix:
     @property
     def horizontal_sigma_m(self) -> float:
         """1 sigma along the worst horizontal direction."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_ned[:2, :2])[-1]))
+        return horizontal_sigma_m(self.covariance_ned)
 
     @property
     def vertical_sigma_m(self) -> float:
@@ -54,11 +54,10 @@ def grown_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, flo
     """The fix's protection levels, grown as its sigmas grew on the way to another time."""
     if fix.protection_m is None:
         return None
-    P = fix.position_covariance_ned
-    begun = (float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])), float(np.sqrt(P[2, 2])))
+    begun = (fix.horizontal_sigma_m, fix.vertical_sigma_m)
     now = (carried.horizontal_sigma_m, carried.vertical_sigma_m)
     horizontal, vertical = (
-        level + _RISK_SIGMAS * max(after - before, 0.0)
+        level + RISK_SIGMAS * max(after - before, 0.0)
         for level, before, after in zip(fix.protection_m, begun, now, strict=True)
     )
     return horizontal, vertical

@@ -56,6 +56,23 @@ def test_one_photo_from_a_prior_that_is_off(small_assets, small_sequence, tmp_pa
     assert tum[1:4] == pytest.approx(position, abs=1e-3)
 
 
+def test_a_measured_height_and_attitude_make_the_pose_surer(small_assets, small_sequence, tmp_path):
+    row = read_poses(small_sequence / "poses.txt")[0]
+    p = row.position
+    prior = ",".join(map(str, (p.latitude_deg + 5 / 111e3, p.longitude_deg, p.height_m,
+                               row.roll_deg, row.pitch_deg, row.yaw_deg + 3)))  # fmt: skip
+    sigmas = []
+    for more in ((), ("--attitude-sigma-deg", 0.1, "--height-sigma-m", 0.05)):
+        result = _run(small_sequence / "images" / row.name, *_common(
+            small_assets, small_sequence, tmp_path), "--prior", prior, *more)  # fmt: skip
+        assert result.exit_code == 0, result.output
+        with (tmp_path / "images.csv").open(newline="") as file:
+            (found,) = csv.DictReader(file)
+        sigmas.append([float(found[key]) for key in ("sigma_north_m", "sigma_up_m")])
+    assert sigmas[1][0] < sigmas[0][0]
+    assert sigmas[1][1] < sigmas[0][1]
+
+
 def test_a_folder_goes_on_from_its_first_prior_and_tells_what_it_could_not_use(
     small_assets, small_sequence, tmp_path
 ):
