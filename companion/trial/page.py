@@ -192,7 +192,7 @@ def _estimates(trial: Trial) -> ReportTable:
     )  # fmt: skip
     note = f"By {found.frames} frames, against what was recorded or given."
     if found.focal_percent is None:
-        note += " Over this map the focal length cannot be told from the height."
+        note += " Over this map focal length and height cannot be separated."
     elif abs(found.focal_percent) < 3.0 * found.focal_sigma_percent:
         note += " The focal length is kept as given: it differs by less than three sigmas."
     return ReportTable(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)
