@@ -139,14 +139,14 @@ class GnssReturnCheck:
         sigma = math.hypot(accuracy, float(np.mean([r.sigma_m for r in reports])))
         speed = float(np.mean([r.speed_mps for r in reports]))
         off = np.array([r.off_m for r in reports])
-        apart = float(np.hypot(*off.mean(axis=0)))
+        times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
+        drift, drift_sigma, scatter, now = _motion(times, off)
+        apart = max(float(np.hypot(*off.mean(axis=0))), now)  # what drifts away goes on
         if apart > _SIGMAS * sigma + speed * _LAG_ERROR_S:
             return GnssRefusal(apart, GnssDisagreement.OFF_VISION)
-        times = np.array([(r.time_ns - reports[0].time_ns) * 1e-9 for r in reports])
-        drift, drift_sigma, scatter = _motion(times, off)
         if scatter > _SCATTER_M + sigma / 2:
             return GnssRefusal(scatter, GnssDisagreement.NOISE)
-        slip, slip_sigma, _ = _motion(times, np.array([r.slipped_m for r in reports]))
+        slip, slip_sigma, *_ = _motion(times, np.array([r.slipped_m for r in reports]))
         if drift > _DRIFT_MPS + _SIGMAS * drift_sigma:
             return GnssRefusal(drift, GnssDisagreement.DRIFTS_FROM_VISION)
         if slip > _DRIFT_MPS + _SIGMAS * slip_sigma:
@@ -154,13 +154,14 @@ class GnssReturnCheck:
         return None
 
 
-def _motion(times: _Array, positions: _Array) -> tuple[float, float, float]:
-    """Speed of the straight line through positions (n, 2), its sigma, and the rms distance to it;
-    m/s and m.
+def _motion(times: _Array, positions: _Array) -> tuple[float, float, float, float]:
+    """Speed of the straight line through positions (n, 2), its sigma, the rms distance to it, and
+    the length of its end; m/s and m.
     """
     t = times - times.mean()
     spread = float(t @ t)
     rate = t @ positions / spread
     left = positions - positions.mean(axis=0) - np.outer(t, rate)
     scatter = float(np.sqrt((left**2).sum(axis=1).mean()))
-    return float(np.hypot(*rate)), scatter / math.sqrt(2 * spread), scatter
+    end = float(np.hypot(*(positions.mean(axis=0) + t[-1] * rate)))
+    return float(np.hypot(*rate)), scatter / math.sqrt(2 * spread), scatter, end

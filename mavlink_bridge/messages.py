@@ -118,6 +118,10 @@ class VisionFix:
     protection_m: tuple[float, float] | None = None
     """What the horizontal and the vertical error exceed at the stated risk at most; None where
     nobody says."""
+    by_odometry: bool = False
+    """Carried on from an earlier fix: the errors of two in a row are alike."""
+    position_withheld: bool = False
+    """The position is too uncertain to be sent; its change since the fix before is not."""
 
     def __post_init__(self) -> None:
         _check_position("vision fix", self.latitude_deg, self.longitude_deg, self.height_m)

@@ -30,7 +30,7 @@ from tests.parts import PARTS, SHARED_FOLDER, part_of
 # on; `pytest --hypothesis-profile=explore` draws new ones. No deadlines: a busy machine takes its
 # time over an example or its drawing, and what is slow shows in the suite's durations.
 _PATIENT = {"deadline": None, "suppress_health_check": [hypothesis.HealthCheck.too_slow]}
-hypothesis.settings.register_profile("repeatable", derandomize=True, **_PATIENT)
+hypothesis.settings.register_profile("repeatable", derandomize=True, max_examples=40, **_PATIENT)
 hypothesis.settings.register_profile("explore", **_PATIENT)
 hypothesis.settings.load_profile("repeatable")
 

@@ -1,6 +1,6 @@
 """Where a picture shows points of the map: measured part by part, without a camera's model.
 
-Each part of the picture (24 px of the working width) is shifted by itself until its features lie on
+Each part of the picture (13 of them side by side) is shifted by itself until its features lie on
 the map's, by least squares over the anchors in it. What is left over in one direction, or grows
 from the middle, is the model's error and not the pose's.
 """
@@ -23,10 +23,10 @@ from localizer.render.base import MapRenderer
 from localizer.tracking.pipeline import Undistorter, reference_anchors, working_camera
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32, Frame
 
-_PART_PX = 24.0
+_PART_SHARE = 0.075  # of the working width
 _LEAST_ANCHORS = 12
 _STEPS = 4
-_FARTHEST_PX = 3.0  # from where the pose has it: beyond is another thing's place
+_FARTHEST_SHARE = 0.01  # of the working width, from where the pose has it: beyond is another thing
 _LEAST_CURVATURE = 0.02  # of a part's weakest direction against the picture's median: an edge
 _ANCHORS = 4000
 _LEAST_SCALE = 0.02
@@ -71,9 +71,10 @@ class PictureReader:
     def _measured(self, anchors: Anchors, query: FeaturePyramid, pose: Pose) -> Parts | None:
         uv, seen = self._working.project(pose.inverse.apply(anchors.points_world))
         uv = np.where(seen[:, None], uv, 0.0)
-        across = int(np.ceil(self._working.width / _PART_PX))
-        part = (uv[:, 1] // _PART_PX).astype(np.int64) * across
-        part = np.where(seen, part + (uv[:, 0] // _PART_PX).astype(np.int64), -1)
+        side = _PART_SHARE * self._working.width
+        across = int(np.ceil(self._working.width / side))
+        part = (uv[:, 1] // side).astype(np.int64) * across
+        part = np.where(seen, part + (uv[:, 0] // side).astype(np.int64), -1)
         names = np.unique(part[part >= 0])
         number = np.searchsorted(names, part)
         shift = np.zeros((len(names), 2))
@@ -93,7 +94,7 @@ class PictureReader:
         typical = float(np.median(weakest))
         good = (
             (count >= _LEAST_ANCHORS)
-            & (np.hypot(*shift.T) < _FARTHEST_PX)
+            & (np.hypot(*shift.T) < _FARTHEST_SHARE * self._working.width)
             & (weakest > _LEAST_CURVATURE * max(typical, 1e-12))
             & (fit <= 2.0 * np.median(fit) + _LEAST_SCALE)
         )

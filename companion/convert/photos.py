@@ -92,7 +92,7 @@ def _require_measured(path: Path, photos: dict[str, dict[str, str]]) -> None:
     if zero:
         raise PoseFileError(
             f"{path}: the gimbal's angles are all 0 in {len(zero)} of {len(photos)} photos, first "
-            f"{zero[0]}: this camera did not measure them; where it looked must be told: by "
+            f"{zero[0]}: this camera did not measure them; its direction must be given: by "
             f"{', '.join(_ANGLES)} in NAME.xmp beside each photo, or by a pose file"
         )
 

@@ -64,4 +64,4 @@ class ViewReporter:
             try:
                 self._look(camera_view(estimate, self._frame, self._cast))
             except Exception:  # telemetry must not end the flight
-                _log.exception("the camera's view could not be told")
+                _log.exception("the camera's view could not be reported")

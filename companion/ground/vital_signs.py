@@ -76,4 +76,4 @@ class VitalSigns:
             except Exception:  # telemetry must not end the flight
                 self._failures += 1
                 if self._failures == 1:
-                    _log.exception("the vital signs could not be told")
+                    _log.exception("the vital signs could not be sent")

@@ -129,6 +129,12 @@ class IntegrityChecks:
     def _active(self) -> list[AlertDebouncer]:
         return [debouncer for debouncer in self._debouncers.values() if debouncer.raised]
 
+    @property
+    def _is_only_uncertain(self) -> bool:
+        """Whether the protection level alone holds output: how the position changes is right."""
+        holding = {one.spec.id for one in self._active() if one.spec.action >= OutputAction.HOLD}
+        return holding == {AlertId.HPL_OVER_LIMIT}
+
     def restore(self, found: ActiveAlerts) -> None:
         """Alerts of the process before this one stay active until evidence clears them."""
         for of, (figure, word) in found.items():
@@ -166,7 +172,8 @@ class IntegrityChecks:
         *,
         held: bool = False,
     ) -> VisionFix | None:
-        """The fix, if it may be injected; with another reset count where the last were wrong.
+        """The fix, if it may be injected; with another reset count where the last were wrong. One
+        of the odometry that its protection level alone speaks against is `position_withheld`.
 
         attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
         reason against it.
@@ -190,7 +197,8 @@ class IntegrityChecks:
         self._waiting.append((fix, self._jumps.leaps or leaps))
         if self.action >= OutputAction.HOLD or not admitted:
             self._wrong += self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
-            return None
+            moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
+            return replace(fix, position_withheld=True) if moves_right else None
         if held:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The

@@ -23,6 +23,9 @@ from mavlink_bridge.messages import VisionFix
 
 Array = NDArray[np.float64]
 _SIGMA_FLOOR_M = 0.2
+# Of the odometry's from fix to fix, with what its scale error does in a turn; its sigma would hide
+# a frozen picture.
+_BY_ODOMETRY_M = 0.5
 _SIGMAS = 4.0
 # The noisier the fixes, the longer the filter lives by the IMU alone, and the further an error of
 # tilt that it does not model carries it: honest fixes of sigma 2 m were withheld for 4 m (SITL).
@@ -73,7 +76,8 @@ class MotionCheck:
         if moved is None:
             self._moved = None
             return MotionVerdict(False, 0.0, 0.0, still_s)
-        sigma = max(fix.horizontal_sigma_m, _SIGMA_FLOOR_M)
+        most_m = _BY_ODOMETRY_M if fix.by_odometry else np.inf
+        sigma = float(np.clip(fix.horizontal_sigma_m, _SIGMA_FLOOR_M, most_m))
         last = self._moved
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
         anew = self._restarts != self._track.restarts or gap_s > _GAP_S or leaps

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import StreamDecodeError, StreamSizeError
-from companion.sources.base import fitted_camera
-from companion.sources.folder_source import TIMESTAMPS_NAME, read_image, read_timestamps
+from companion.recorded.flight import RecordedFrame
+from companion.sources.folder_source import written_times
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
@@ -16,7 +16,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.pipeline import Localizer
-from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
+from localizer.types import PoseEstimate, PosePrior, RegistrationStatus
 
 _PASSES = 3  # of an image that starts from a prior: the view from there shows another place
 
@@ -64,14 +64,8 @@ class LocalizedImage:
 
 def image_times(images: Sequence[Path], rate_hz: float) -> tuple[int, ...]:
     """Exposure times in ns, from ``timestamps.txt`` beside the images, else at `rate_hz`."""
-    file = images[0].parent / TIMESTAMPS_NAME
-    if not file.is_file():
-        return tuple(round((k + 1) * 1e9 / rate_hz) for k in range(len(images)))
-    stamps = read_timestamps(file)
-    missing = [path.name for path in images if path.name not in stamps]
-    if missing:
-        raise StreamDecodeError(f"{file}: has no time for {missing[0]}; add it or remove the file")
-    return tuple(stamps[path.name] for path in images)
+    times = written_times(images[0].parent, images)
+    return times or tuple(round((k + 1) * 1e9 / rate_hz) for k in range(len(images)))
 
 
 def localize_images(
@@ -94,7 +88,7 @@ def localize_images(
             around = PosePrior.around(prior, sigmas.position_m, sigmas.rotation_deg, time_ns)
             localizer.set_prior(around)
         try:
-            frame = _frame(path, camera, time_ns, sequence)
+            frame = RecordedFrame(path.name, path, time_ns).load(camera, time_ns, sequence)
             estimate = localizer.track(frame, passes=1 if prior is None else _PASSES)
         except (OutsideMapError, StreamDecodeError, StreamSizeError) as error:
             # The caller names the image, too.
@@ -103,12 +97,6 @@ def localize_images(
             continue
         problem = "" if estimate.accepted else f"not localized: {_why(estimate)}"
         yield LocalizedImage(path.name, estimate, problem)
-
-
-def _frame(path: Path, camera: Camera, time_ns: int, sequence: int) -> Frame:
-    image = read_image(path)
-    fitted = fitted_camera(image.shape[1], image.shape[0], camera, str(path))
-    return Frame(image, time_ns, fitted, sequence)
 
 
 def _why(estimate: PoseEstimate) -> str:

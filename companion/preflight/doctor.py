@@ -204,7 +204,7 @@ def _check_power() -> DoctorFinding:
         governor = _GOVERNOR.read_text().strip()
     except OSError:
         return DoctorFinding(
-            "power mode", "not told by this machine", "performance", "", True, False
+            "power mode", "not reported by this machine", "performance", "", True, False
         )
     good = governor in ("performance", "schedutil")
     why = "slower clocks make late fixes (Jetson: nvpmodel -m 0, jetson_clocks)"

@@ -87,7 +87,7 @@ def _age(day: date, today: date) -> str:
 def _calibration(config: CompanionConfig, today: date) -> SheetRow:
     done = config.camera.calibrated
     if done is None:
-        return SheetRow("calibration", "never by `companion calibrate`, or not told", False)
+        return SheetRow("calibration", "never by `companion calibrate`, or not stated", False)
     c = config.localizer.calibration
     text = f"{done.isoformat()} ({_age(done, today)}), focal length to {c.focal_percent:g} %, "
     text += f"stamps to {c.stamp_ms:g} ms"

@@ -112,7 +112,7 @@ class RecordedFrame:
     name: str
     path: Path
     time_ns: int | None
-    telemetry: Telemetry
+    telemetry: Telemetry = Telemetry()
 
     def with_telemetry(self, telemetry: Telemetry) -> RecordedFrame:
         """The same image with other telemetry."""

@@ -21,6 +21,7 @@ from companion.recorded.flight import (
     LogBeside,
     RecordedFlight,
     RecordedFrame,
+    RecordedPosition,
     Telemetry,
     Track,
 )
@@ -39,6 +40,7 @@ from companion.sources.base import fitted_camera
 from companion.sources.folder_source import list_images
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
+from localizer.geometry.geo import ecef_from_geodetic
 from localizer.plain_files import files_of
 
 _T = TypeVar("_T")
@@ -47,6 +49,7 @@ _VIDEO_FOCAL_PERCENT = 5.0  # a video's crop of the sensor is not told
 _KLV_FOCAL_PERCENT = 3.0
 _FOV_FOCAL_PERCENT = 5.0
 _UTC_REACH_S = 3.0  # of clocks that both claim to be UTC
+_ELSEWHERE_M = 1000.0  # between two records of one flight
 _DAY_NS = 86_400 * 10**9
 _LEAST_STEP_NS, _PAIR_NS = 500_000_000, 1_000_000_000  # between frames of a video
 
@@ -295,6 +298,16 @@ def _with_log(
         raise FootageError(
             f"{file}: says nothing of the time of the images: is it this flight's, and complete?"
         )
+    apart_m = [
+        _apart_m(frame.telemetry.position, said.position)
+        for frame, said in zip(frames, told, strict=True)
+        if said is not None and frame.telemetry.position and said.position
+    ]
+    if apart_m and float(np.median(apart_m)) > _ELSEWHERE_M:
+        raise FootageError(
+            f"{file}: places the images {np.median(apart_m) * 1e-3:.0f} km from where their own "
+            "telemetry has them: is it this flight's?"
+        )
     if covered < len(frames):
         notes.append(f"{file.name} covers {covered} of {len(frames)} images: is it complete?")
     moved = [
@@ -302,6 +315,12 @@ def _with_log(
         for frame, said in zip(frames, told, strict=True)
     ]
     return moved, LogBeside(file, ahead_ns, log.has_gimbal)
+
+
+def _apart_m(a: RecordedPosition, b: RecordedPosition) -> float:
+    """Distance of two places at one height."""
+    ecef = [ecef_from_geodetic(p.latitude_deg, p.longitude_deg, 0.0) for p in (a, b)]
+    return float(np.linalg.norm(ecef[0] - ecef[1]))
 
 
 def _reach_s(

@@ -20,7 +20,7 @@ from companion.recorded.flight import (
     RecordedView,
     Telemetry,
 )
-from companion.sources.folder_source import TIMESTAMPS_NAME, read_timestamps
+from companion.sources.folder_source import TIMESTAMPS_NAME, written_times
 from localizer.errors import SequenceError
 from localizer.evaluation.sequences import Sequence
 from localizer.geometry.camera import Camera
@@ -53,10 +53,12 @@ def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
             f"{images}: {len(missing)} of {len(rows)} images named in {poses.name} are missing, "
             f"first {missing[0]}"
         )
-    times = _times(images / TIMESTAMPS_NAME, rows)
+    times = written_times(images, [images / row.name for row in rows])
+    if times is not None and any(b <= a for a, b in itertools.pairwise(times)):
+        raise SequenceError(f"{images / TIMESTAMPS_NAME}: exposure times must increase")
     frames = tuple(
         RecordedFrame(row.name, images / row.name, time_ns, _telemetry(row, time_ns))
-        for row, time_ns in zip(rows, times, strict=True)
+        for row, time_ns in zip(rows, times or [None] * len(rows), strict=True)
     )
     guess = camera_given(Camera.from_json(camera), camera.name)
     return RecordedFlight(folder.name, "sequence", frames, guess)
@@ -102,20 +104,6 @@ def _pose(said: Telemetry, frame: LocalFrame, geoid_m: float) -> Pose | None:
     p = Geodetic(said.position.latitude_deg, said.position.longitude_deg, heights[Datum.ELLIPSOID])
     centre = np.asarray(frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m))
     return Pose(ned_from_world(frame, p).T @ said.view.ned_from_camera, centre)
-
-
-def _times(file: Path, rows: tuple[PoseRow, ...]) -> list[int] | list[None]:
-    """Exposure times of all images; none without the file."""
-    if not file.is_file():
-        return [None] * len(rows)
-    stamps = read_timestamps(file)
-    missing = [row.name for row in rows if row.name not in stamps]
-    if missing:
-        raise SequenceError(f"{file}: has no time for {missing[0]}; add it or remove the file")
-    times = [stamps[row.name] for row in rows]
-    if any(b <= a for a, b in itertools.pairwise(times)):
-        raise SequenceError(f"{file}: exposure times must increase")
-    return times
 
 
 def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:

@@ -192,7 +192,7 @@ def _verdicts(tables: RecordTables) -> tuple[CriterionResult, ...]:
         verdicts.append(
             CriterionResult(
                 "exposure to estimate p95", f"{p95:.0f} ms", f"<= {limit:.0f} ms", p95 <= limit,
-                "fixes are older than the EKF was told",
+                "fixes are older than delay_ms",
                 "latency by stage; more processor, lower localizer.width, higher delay_ms",
             )
         )  # fmt: skip
@@ -224,8 +224,8 @@ def _untold_targets(counts: Any) -> list[CriterionResult]:
     text = ", ".join(f"{number} {name}" for name, number in named.items())
     return [
         CriterionResult(
-            "clicks and detections not told", text, "none", False,
-            "missed: no map under the pixel; doubted: its place may not be told; refused: more "
+            "clicks and detections not reported", text, "none", False,
+            "missed: no map under the pixel; doubted: position not reportable; refused: more "
             "than 32 at a time; unmatched: of a frame without a position; failed: an error",
             "events at that time; what the detector sends (docs/reference/formats.md)",
         )

@@ -38,7 +38,7 @@ _ADVICE = {
         "latency by stage; lower localizer.width, or raise the camera's rate",
     ),
     "EKF horizontal": Advice(
-        "the autopilot's position is off although vision may be right: late, refused or withheld",
+        "the autopilot's position is off although vision may be right: late, refused or held",
         "events of injection, latency against bridge.injection.delay_ms, `companion doctor`",
     ),
     "fixes in their level": Advice(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -80,6 +80,21 @@ def read_timestamps(path: Path) -> dict[str, int]:
     return times
 
 
+def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | None:
+    """Exposure times, ns, of its images by ``timestamps.txt`` in it; None without that file."""
+    file = folder / TIMESTAMPS_NAME
+    if not file.exists():
+        return None
+    by_name = read_timestamps(file)
+    missing = [path.name for path in images if path.name not in by_name]
+    if missing:
+        raise StreamOpenError(
+            f"{file}: has no time for {len(missing)} of {len(images)} images, first {missing[0]}; "
+            "add them or remove the file"
+        )
+    return tuple(by_name[path.name] for path in images)
+
+
 class FolderSource:
     """Frames from a folder. Times come from ``timestamps.txt`` in it, else from a fixed rate that
     starts now; played in real time the recorded ones start now, too, as a video file's do.
@@ -97,7 +112,7 @@ class FolderSource:
         self._settings = settings or SourceSettings()
         self._on_state = on_state
         self._images = list_images(folder)
-        self._times = self._read_times()
+        self._times = written_times(folder, self._images)
         self._closed = threading.Event()
         self._state = StreamState.IDLE
         self._delivered = 0
@@ -151,19 +166,6 @@ class FolderSource:
         if self._times:
             return self._times[sequence] - first
         return round(sequence * 1e9 / self._settings.rate_hz)
-
-    def _read_times(self) -> list[int]:
-        path = self._folder / TIMESTAMPS_NAME
-        if not path.exists():
-            return []
-        by_name = read_timestamps(path)
-        missing = [p.name for p in self._images if p.name not in by_name]
-        if missing:
-            raise StreamOpenError(
-                f"{path}: has no time for {len(missing)} of {len(self._images)} images, "
-                f"first {missing[0]}; add them or remove the file"
-            )
-        return [by_name[p.name] for p in self._images]
 
     def _report(self, state: StreamState, text: str) -> None:
         self._state = state

@@ -304,13 +304,13 @@ def _do_in_time(name: str, do: Callable[[], None]) -> None:
         try:
             do()
         except Exception:
-            _log.exception("the death could not be told")
+            _log.exception("the death could not be reported")
 
     thread = threading.Thread(target=guarded, name=name, daemon=True)
     thread.start()
     thread.join(_WORDS_S)
     if thread.is_alive():
-        _log.error("the death could not be told: to %s it takes too long", name)
+        _log.error("the death could not be reported: to %s it takes too long", name)
 
 
 def described(code: int) -> str:

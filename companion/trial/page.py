@@ -174,7 +174,9 @@ def _estimates(trial: Trial) -> ReportTable:
          f"{found.mount_sigma_deg[0]:.1f}", "deg"),
     ]  # fmt: skip
     if found.focal_percent is None:
-        rows.append(("focal length", "as given", f"{trial.flight.camera.focal_percent:.0f}", "%"))
+        rows.append(
+            ("focal length", "not observable", f"{trial.flight.camera.focal_percent:.0f}", "%")
+        )
     else:
         rows.append(("focal length", f"{found.focal_percent:+.2f}",
                      f"{found.focal_sigma_percent:.2f}", "%"))  # fmt: skip
@@ -188,11 +190,11 @@ def _estimates(trial: Trial) -> ReportTable:
     limits = (_TILT_DEG, _TILT_DEG, 3 * _TILT_DEG, _FOCAL_PERCENT, _SHIFT_M, _SHIFT_M, _SHIFT_M)
     bad = frozenset(
         i for i, (row, limit) in enumerate(zip(rows, limits, strict=False))
-        if row[1] != "as given" and abs(float(row[1])) > limit
+        if row[1] != "not observable" and abs(float(row[1])) > limit
     )  # fmt: skip
     note = f"By {found.frames} frames, against what was recorded or given."
     if found.focal_percent is None:
-        note += " Over this map the focal length cannot be told from the height."
+        note += " Over this map focal length and height cannot be separated; the given one is kept."
     elif abs(found.focal_percent) < 3.0 * found.focal_sigma_percent:
         note += " The focal length is kept as given: it differs by less than three sigmas."
     return ReportTable(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)

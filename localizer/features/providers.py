@@ -62,7 +62,7 @@ def start_session(
             except Exception as error:
                 if not _removed(kept):
                     raise
-                _log.warning("features: TensorRT builds its engine anew: %s", _line(error))
+                _log.warning("features: TensorRT builds its engine again: %s", _line(error))
                 return _started(model, options, expected, names[k:], check)
         except Exception as error:  # onnxruntime raises its own untyped exceptions
             if k + 1 == len(names):

@@ -40,7 +40,8 @@ class OdometryConfig:
     new_below_quality: float = 0.6  # quality, as a share of the keyframe's first, likewise
     new_beyond_turn_deg: float = 25.0  # turn since the keyframe that starts a new one
     longest_gap_s: float = 3.0  # time without a usable frame until it is lost
-    longest_sigma_m: float = 15.0  # largest sigma of a propagated position
+    longest_sigma_m: float = 15.0  # largest sigma of a propagated position with a map in view
+    off_map_sigma_m: float = 100.0  # the same where there is no map to be found again
     acceleration_sigma: float = 2.0  # m/s², of the motion without usable frames
     turn_sigma_deg: float = SENSORS.tilt_change_deg  # autopilot's tilt since the keyframe, per axis
     heading_turn_sigma_deg: float = SENSORS.heading_change_deg  # its heading since the keyframe

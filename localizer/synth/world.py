@@ -91,7 +91,7 @@ class WorldInfo:
             heights = np.load(Path(folder) / _HEIGHTS)
             if data["format"] != _FORMAT:
                 raise MapSourceError(
-                    f"{path}: format {data['format']}, expected {_FORMAT}; build the world anew"
+                    f"{path}: format {data['format']}, expected {_FORMAT}; build the world again"
                 )
             none = River(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
             return cls(

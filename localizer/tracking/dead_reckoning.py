@@ -55,12 +55,15 @@ class PropagationResult(Enum):
 
 @dataclass(frozen=True)
 class PropagatedPose:
-    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED."""
+    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED; noise
+    (6, 6): for the motion model.
+    """
 
     status: PropagationResult
     world_from_camera: Pose | None = None
     covariance: Array | None = None
     quality: float = 0.0
+    noise: Array | None = None
 
 
 _NOTHING = PropagatedPose(PropagationResult.NONE)
@@ -69,6 +72,11 @@ _NOTHING = PropagatedPose(PropagationResult.NONE)
 # Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
+
+# Off the map the frames share a large error. Taken for noise, it had them followed metres late in a
+# turn, until nothing registered (ArduPilot).
+_FOLLOWED_M = 0.5
+_TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
 
 class DeadReckoning:
@@ -86,6 +94,8 @@ class DeadReckoning:
         registration = odometry_optimizer(optimizer, threads)
         self._odometry = VisualOdometry(camera, registration, config, terrain)
         self._longest_sigma_m = config.longest_sigma_m
+        self._off_map_sigma_m = config.off_map_sigma_m
+        self._in_view_ns: int | None = None
 
     @property
     def is_ready(self) -> bool:
@@ -135,15 +145,19 @@ class DeadReckoning:
             return PropagatedPose(PropagationResult.BROKEN)
         if not estimate.usable:
             return PropagatedPose(PropagationResult.GAP)
-        if np.sqrt(estimate.covariance.diagonal()[:3].max()) > self._longest_sigma_m:
+        P, now_ns = estimate.covariance, frame.exposure_time_ns
+        sigma_m, longest_m = float(np.sqrt(P.diagonal()[:3].max())), self._longest_sigma_m
+        self._in_view_ns = None if anchors is None else self._in_view_ns or now_ns
+        is_tried = self._in_view_ns is not None and now_ns - self._in_view_ns > _TRIED_NS
+        if sigma_m > (longest_m if is_tried else self._off_map_sigma_m):
             self._odometry.forget()
             return PropagatedPose(PropagationResult.BROKEN)
+        share = min(_FOLLOWED_M / sigma_m, 1.0) if anchors is None else 1.0
+        less = np.diag([share] * 3 + [1.0] * 3)
         return PropagatedPose(
-            PropagationResult.CARRIED,
-            estimate.world_from_camera,
-            estimate.covariance,
-            estimate.quality,
-        )
+            PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality,
+            less @ P @ less,
+        )  # fmt: skip
 
     def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
         """about: where the camera is, to some metres."""

@@ -49,7 +49,7 @@ INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.POSITION_STEP, WARNING, "position step",
               "position step {metres:.0f} m, unexplained", {"metres": "m"},
               "a step that is smaller than a jump and larger than the covariance explains",
-              "the position is confirmed, or found anew",
+              "the position is confirmed, or found again",
               "the position may be off by so much; the protection level includes it",
               "keep the distance to obstacles larger by it", repeat_s=60.0),
     AlertSpec(A.TILT_MISMATCH, WARNING, "tilt mismatch", "tilt {degrees:.0f} deg off autopilot",

@@ -32,7 +32,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "no heartbeat since the start", "the first heartbeat", "nothing is injected",
               _CHECK_ARMING),
     event(A.FC_REBOOTED, WARNING, "flight controller rebooted", {}, "its boot time ran back",
-          "the EKF starts anew; its origin is asked again", "check the source set"),
+          "the EKF restarts; its origin is requested again", "check the source set"),
     condition(A.GNSS_LOST, WARNING, "GNSS lost, {output}", {"output": Output},
               "no 3D fix for 1 s on balance", "a 3D fix for 5 s",
               "the position is vision's, or nobody's", "without injection: STABILIZE or ALT_HOLD"),

@@ -18,7 +18,7 @@ from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.propagate import RISK_SIGMAS, PropagatedFix
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix, horizontal_sigma_m
-from mavlink_bridge.vehicle.origin import ned_from_origin
+from mavlink_bridge.vehicle.origin import ned_from_origin, north_east
 from mavlink_bridge.vehicle.profile import CovarianceFormula, FirmwareProfile, covariance_entry
 
 NAN = math.nan
@@ -36,6 +36,10 @@ GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
 _METRES_PER_DOP = 2.5
 _LEAST_DOP, _MOST_DOP = 0.5, 99.0
 _BEST_SATELLITES, _ENOUGH_SATELLITES = 12, 6
+# m/s of ArduPilot's confidence 100 and 0 (EK3_VIS_VERR_MIN, EK3_VIS_VERR_MAX)
+VELOCITY_SIGMA_MPS = (0.1, 2.0)
+_DELTA_NOISE_MPS = 0.3  # of a velocity from two fixes of the odometry
+_DELTA_SCALE = 0.1  # its scale error over ground taken as level, the largest (odometry.md)
 _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 
@@ -147,6 +151,34 @@ def odometry(
         e.reset_counter,
         mavlink.MAV_ESTIMATOR_TYPE_VISION,
         e.quality,
+    )
+
+
+def vision_position_delta(
+    before: tuple[VisionFix, Attitude], now: tuple[VisionFix, Attitude]
+) -> Any | None:
+    """VISION_POSITION_DELTA (11011): how the vehicle moved and turned between two fixes, in body
+    axes at the second; None where its velocity is less certain than ArduPilot can be told.
+
+    ArduPilot dates it VISO_DELAY_MS before its arrival.
+    """
+    (first, then), (last, at) = before, now
+    seconds = (last.time_ns - first.time_ns) * 1e-9
+    place = (last.latitude_deg, last.longitude_deg)
+    north, east = north_east(first.latitude_deg, first.longitude_deg, *place)
+    back = quat.conjugate(at.quaternion)
+    moved = quat.rotate(back, (north, east, first.height_m - last.height_m))
+    w, *axis = quat.multiply(quat.conjugate(then.quaternion), at.quaternion)
+    sigma = math.hypot(_DELTA_NOISE_MPS, _DELTA_SCALE * math.hypot(*moved) / seconds)
+    least, most = VELOCITY_SIGMA_MPS
+    if sigma > most:
+        return None
+    return mavlink.MAVLink_vision_position_delta_message(
+        last.time_ns // 1000,
+        round(seconds * 1e6),
+        [math.copysign(2.0, w) * part for part in axis],
+        list(moved),
+        100.0 * (most - sigma) / (most - least),
     )
 
 

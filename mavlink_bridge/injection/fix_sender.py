@@ -145,6 +145,9 @@ class FixSender:
         if injection is not None:
             self.vision = injection.estimate.position
             self._deliver(link, state, mode, injection, now_ns)
+        delta = self.injector.motion.take()
+        if delta is not None and mode == "inject" and link.send(delta, self._component):
+            self._counters["injected_deltas"] += 1
         reason = self.injector.reason
         command = self._command if mode == "inject" else None
         if reason is None and command is not None and not command.flows(now_ns):

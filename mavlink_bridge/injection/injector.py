@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter, deque
+from typing import Any
 
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
@@ -26,6 +27,7 @@ from mavlink_bridge.injection.encode import (
     InjectionContext,
     MessageMaker,
     attitude_of,
+    vision_position_delta,
 )
 from mavlink_bridge.injection.propagate import FixPropagator, grown_protection
 from mavlink_bridge.injection.yaw_guard import YawGuard
@@ -36,6 +38,7 @@ _QUEUE = 32
 _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
+_DELTA_NS = 500_000_000  # between two fixes that give a velocity
 _AGES = 50
 
 
@@ -96,6 +99,29 @@ class _FixRate:
         return statistics.median(self._intervals_ns)
 
 
+class WithheldMotion:
+    """How the vehicle moves while its position is withheld, from fix to fix."""
+
+    def __init__(self) -> None:
+        self._before: VisionFix | None = None
+        self._message: Any | None = None
+
+    def note(self, fix: VisionFix, now_ns: int, context: InjectionContext) -> None:
+        """A fix came of age whose position is withheld."""
+        before, self._before = self._before, fix
+        late = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
+        if before is None or late or not context.profile.position_delta:
+            return
+        then, now = context.attitude_at(before.time_ns), context.attitude_at(fix.time_ns)
+        if then is not None and now is not None and fix.time_ns - before.time_ns <= _DELTA_NS:
+            self._message = vision_position_delta((before, then), (fix, now))
+
+    def take(self) -> Any | None:
+        """The message that is due, once."""
+        message, self._message = self._message, None
+        return message
+
+
 class Injector:
     """Turns fixes into a steady stream of injections. One thread calls `submit` and `step`."""
 
@@ -117,6 +143,7 @@ class Injector:
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
         self._last_was_fill = False
+        self.motion = WithheldMotion()
         self._pace = _FixRate(config.overdue_intervals)
         self._sent_fix_ns = 0
         self.yaw_difference_rad: float | None = None
@@ -209,6 +236,9 @@ class Injector:
                 self.yaw_difference_rad = verdict.difference_rad
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
+                continue
+            if fix.position_withheld:
+                self.motion.note(fix, now_ns, context)
                 continue
             last = self._propagator.fix
             self._pace.note(fix.time_ns, None if last is None else last.time_ns, now_ns)

@@ -95,7 +95,7 @@ class ReplayWindow:
             return {}
         except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
             _log.warning(
-                "%s: unreadable (%s): begun anew, messages from before can be repeated once",
+                "%s: unreadable (%s): restarted, messages from before can be repeated once",
                 self._path, error,
             )  # fmt: skip
             return {}

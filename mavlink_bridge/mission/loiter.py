@@ -37,5 +37,5 @@ def circle_of(item: MissionItem, vehicle: MissionVehicle) -> tuple[LoiterCircle 
     if rounds > _MOST_ROUNDS:
         notes.append(f"{item.named}: {_MOST_ROUNDS} of its {rounds} rounds are counted.")
     elif item.command in (mavlink.MAV_CMD_NAV_LOITER_TIME, mavlink.MAV_CMD_NAV_LOITER_UNLIM):
-        notes.append(f"{item.named}: one round of its circle is judged, all are alike.")
+        notes.append(f"{item.named}: one round of its circle is judged, all are equal.")
     return LoiterCircle(radius, min(rounds, _MOST_ROUNDS), vehicle.is_multirotor), notes

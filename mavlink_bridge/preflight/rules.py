@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.injection.encode import GLOBAL_SENSOR_ID
+from mavlink_bridge.injection.encode import GLOBAL_SENSOR_ID, VELOCITY_SIGMA_MPS
 
 _SOURCE_SETS = (1, 2, 3)
 _PX4_LATE_MS = 50.0
@@ -122,13 +122,16 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
     prefix = f"EK3_SRC{number}_"
     injection = config.injection
     odometry = injection.message == "odometry"
-    velocity = (6.0, 0.0) if odometry else (0.0,)
+    climb = (6.0, 0.0) if odometry else (0.0,)
     why = "the message carries velocity" if odometry else "the message carries no velocity"
+    delta = "3 refuses to arm ('require GPS'); with 0 the vehicle lands 8 s after the position"
+    delta += " is withheld, with 6 odometry holds it (VISION_POSITION_DELTA)"
     rules = [
         ParameterRule(("VISO_TYPE",), (1.0,), "MAVLink vision is ignored otherwise", reboot=True),
         ParameterRule((prefix + "POSXY",), (6.0,), "horizontal position from external navigation"),
-        ParameterRule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
-        ParameterRule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
+        ParameterRule((prefix + "VELXY",), (6.0, 0.0), delta),
+        ParameterRule((prefix + "VELXY",), (6.0,), delta, required=False),
+        ParameterRule((prefix + "VELZ",), climb, why + " (3: refuses to arm, 'require GPS')"),
         ParameterRule(
             (prefix + "POSZ",),
             (1.0,),
@@ -152,6 +155,12 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
             (f"VISO_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False
         )
         for axis in "XYZ"
+    ]
+    rules += [
+        ParameterRule(
+            (f"EK3_VIS_VERR_{end}",), (sigma,), "m/s that a confidence means", False, tolerance=1e-3
+        )
+        for end, sigma in zip(("MIN", "MAX"), VELOCITY_SIGMA_MPS, strict=True)
     ]
     if odometry:
         rules.append(

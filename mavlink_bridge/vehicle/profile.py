@@ -26,7 +26,8 @@ class FirmwareProfile:
     max_delay_ms: age beyond which a measurement cannot be fused any more.
     messages: the injections it accepts. odometry_frame: MAV_FRAME it accepts for position.
     least_lag: the delay parameter stands for the least lag of its last messages; it maps the others
-    by their stamps (ArduPilot's AP_HAL JitterCorrection, over 100 messages).
+    by their stamps (ArduPilot's AP_HAL JitterCorrection, over 100 messages). position_delta: it
+    holds a relative position by VISION_POSITION_DELTA alone.
     """
 
     name: str
@@ -38,6 +39,7 @@ class FirmwareProfile:
     delay_parameter: str
     gps_delay_parameter: str  # {n}: the receiver, gps_id + 1
     least_lag: bool = False
+    position_delta: bool = False
     known: bool = True
 
 
@@ -58,6 +60,7 @@ ARDUPILOT = FirmwareProfile(
     delay_parameter="VISO_DELAY_MS",
     gps_delay_parameter="GPS{n}_DELAY_MS",
     least_lag=True,
+    position_delta=True,
 )
 # Pull request 32084 (merged February 2026) replaced the cube root.
 ARDUPILOT_SQRT = FirmwareProfile(
@@ -70,6 +73,7 @@ ARDUPILOT_SQRT = FirmwareProfile(
     delay_parameter="VISO_DELAY_MS",
     gps_delay_parameter="GPS{n}_DELAY_MS",
     least_lag=True,
+    position_delta=True,
 )
 PX4 = FirmwareProfile(
     name="PX4 1.15+",

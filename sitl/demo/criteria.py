@@ -119,6 +119,6 @@ def latency_warning(latency_ms: Spread, delay_ms: float) -> str | None:
     return (
         f"exposure to estimate takes {p95:.0f} ms at p95, above {limit:.0f} ms "
         f"(bridge.injection.delay_ms {delay_ms:.0f}, ArduPilot's limit {_MAX_LATENCY_MS:.0f}): "
-        "later fixes are older than the EKF was told, and beyond its limit only extrapolated ones "
+        "later fixes are older than delay_ms, and beyond its limit only extrapolated ones "
         "are sent; give the companion more processor, lower localizer.width or raise the delay"
     )

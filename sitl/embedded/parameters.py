@@ -30,6 +30,8 @@ _DEFAULTS: dict[str, tuple[float, int]] = {
     "EK3_HGT_I_GATE": (500, INT16),
     "EK3_YAW_I_GATE": (300, INT16),
     "EK3_GLITCH_RAD": (25, INT8),
+    "EK3_VIS_VERR_MIN": (0.1, REAL32),
+    "EK3_VIS_VERR_MAX": (0.9, REAL32),
     "EK3_SRC1_POSXY": (3, INT8),
     "EK3_SRC1_VELXY": (3, INT8),
     "EK3_SRC1_POSZ": (1, INT8),

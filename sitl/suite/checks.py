@@ -208,7 +208,7 @@ class ErrorAlertExpectation(_Span):
             for t in record.texts
             if t.alert is not None and CATALOGUE[t.alert].action and t.at_s >= self.from_s
         ]
-        said = f"told at {told[0]:.1f} s" if told else "never told"
+        said = f"reported at {told[0]:.1f} s" if told else "never reported"
         if not beyond:
             return ExpectationResult(True, f"never beyond {self.limit_m:g} m; {said}")
         ok = bool(told) and told[0] <= beyond[0] + self.within_s

@@ -58,7 +58,7 @@ def summary(rows: Iterable[ReportRow]) -> str:
     honest = [row for row in rows if row.case.is_honest and row.record is not None]
     spoke = sum(bool(row.guardian_lines) for row in honest)
     return (
-        f"{len(verdicts)} flights: {', '.join(counts)}; the guardian spoke in {spoke} of "
+        f"{len(verdicts)} flights: {', '.join(counts)}; the monitor raised alerts in {spoke} of "
         f"{len(honest)} with honest fixes"
     )
 

@@ -31,6 +31,7 @@ _COMPONENT = 197
 _GPS_EPOCH_S = 1.4e9  # an arbitrary GPS time at boot
 _LOCAL_FRD, _BODY_FRD = 20, 12
 _IGNORE_VELOCITY = 8 | 16 | 32
+_ODOMETRY_SCALE = 0.1  # that the odometry claims
 _FROZEN_SHARE = 0.2  # of sigma_m
 _HALF_TICK_S = 0.005  # truth comes in whole ticks: what is due within half of one is due
 
@@ -44,7 +45,7 @@ class FixModel(BaseModel):
     frame (positions and yaw) about turns_about_m (north, east of home), yaw_error_deg the yaw
     alone. frozen: the truth of the moment it began, again and again under fresh time stamps, as
     from a picture that hangs; it is registered to a fifth of `sigma_m`, since its errors are always
-    the same.
+    the same. odometry_scale: odometry carries the position on, with such a scale error (a share).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -61,6 +62,7 @@ class FixModel(BaseModel):
     offset_north_m: float = 0.0
     silent: bool = False
     frozen: bool = False
+    odometry_scale: float | None = Field(None, gt=-0.5, lt=1.0)
 
 
 class RawMessage(BaseModel):
@@ -144,6 +146,7 @@ class BridgeFeed:
         self._sink, self._home, self._geoid_m = sink, home, geoid_m
         self._model, self._resets = model, 0
         self._hung: Truth | None = None
+        self._left: Vector | None = None  # where the map ended
         self._observer = Observer(seed)
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -182,7 +185,13 @@ class BridgeFeed:
             shown = self._hung
             seen_as = model.model_copy(update={"sigma_m": _FROZEN_SHARE * model.sigma_m})
         seen = self._observer.observe(shown, self._home, seen_as)
-        where = self._home.offset(*seen.position_ned)
+        place, variance = np.array(seen.position_ned), model.sigma_m**2
+        self._left = None if model.odometry_scale is None else self._left or seen.position_ned
+        if self._left is not None:
+            way = (place - self._left) * (1.0, 1.0, 0.0)
+            place = place + (model.odometry_scale or 0.0) * way
+            variance += (_ODOMETRY_SCALE * float(np.hypot(*way[:2]))) ** 2
+        where = self._home.offset(*_three(place))
         measured = model.velocity_sigma_mps
         return VisionFix(
             truth.time_ns,
@@ -190,11 +199,12 @@ class BridgeFeed:
             where.longitude_deg,
             where.altitude_m + self._geoid_m,
             quat.from_euler(*seen.roll_pitch_yaw),
-            np.eye(3) * model.sigma_m**2,
+            np.eye(3) * variance,
             math.radians(model.attitude_sigma_deg),
             reset_count=resets,
             velocity_ned=None if measured is None else seen.velocity_ned,
             velocity_sigma_mps=measured or 0.3,
+            by_odometry=self._left is not None,
         )
 
 

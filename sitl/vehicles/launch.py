@@ -50,7 +50,8 @@ def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[
         "VISO_POS_M_NSE": sigma_m,
         "VISO_DELAY_MS": delay_ms,
         **_sources(1, position=3, velocity=3, climb=3),
-        **_sources(2, position=6, velocity=0, climb=0),
+        **_sources(2, position=6, velocity=6, climb=0),
+        "EK3_VIS_VERR_MAX": 2.0,
         "ARMING_CHECK": _CHECK_ALL_BUT_VISION,
     }
 

@@ -81,7 +81,7 @@ def test_a_replay_window_that_names_no_stamps_is_begun_anew_and_told(
     replace_file(path, text)
     window = ReplayWindow(path)
     assert (window.streams, window.newest) == ({}, 0)
-    assert "begun anew" in caplog.text
+    assert "restarted, messages" in caplog.text
     window.note((1, 1, 1), 77)
     window.close()
     again = ReplayWindow(path)

@@ -303,7 +303,7 @@ def test_a_damaged_state_is_told_and_begun_anew(
     path.write_text(content)
     with caplog.at_level(logging.WARNING):
         process = Process(path)
-    assert "begun anew" in caplog.text
+    assert "restarted, messages" in caplog.text
     assert process.takes(signed(STAMP))
     process.end()
     again = Process(path)

@@ -56,7 +56,7 @@ class CatalogueSource(BaseModel):
     tile_px: int = Field(256, ge=64, le=4096, description="side of a tile, of xyz and tms")
     piece_px: int = Field(1024, ge=64, le=8192, description="side of what is asked for at once")
     vertical_datum: VerticalDatum | None = Field(None, description="of heights")
-    nodata: float | None = Field(None, description="what missing heights are, if it is not told")
+    nodata: float | None = Field(None, description="what missing heights are, if it does not say")
     date: str | None = Field(None, description="of the pictures: 2024, 2024-06 or 2024-06-30")
     rate_per_s: float = Field(4.0, gt=0, le=50, description="requests a second, at most")
     parallel: int = Field(4, ge=1, le=8, description="requests under way at once, at most")

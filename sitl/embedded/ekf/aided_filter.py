@@ -58,8 +58,7 @@ class AidedFilter:
         self.armed = False
         self._last_known_ne = (0.0, 0.0)
         self.aligned = False
-        self._last_position_source = -1
-        self._last_yaw_source = -1
+        self._last_position_source = self._last_yaw_source = -1
 
     def set_origin(self, origin: Location) -> bool:
         """Set the origin once; a second one is refused, silently, as EKF3 does."""
@@ -220,8 +219,9 @@ class AidedFilter:
         if self.source("VELXY") != EXTERNAL or self.aiding is Aiding.NONE:
             return
         vertical = observed.velocity[2] if self.source("VELZ") == EXTERNAL else None
-        horizontal = (observed.velocity[0], observed.velocity[1])
-        self.gated.fuse_velocity(horizontal, vertical, observed.sigma, observed.sigma)
+        if observed.is_delta:
+            self.gated.clock.position_delta = self.gated.now_ms
+        self.gated.fuse_velocity(observed.velocity[:2], vertical, observed.sigma, observed.sigma)
 
     def _fuse_baro(self, height: float) -> None:
         source = self.source("POSZ")

@@ -25,6 +25,7 @@ from sitl.geodesy import Location
 _MAX_HORIZON_MS = 250
 _BASE_HORIZON_MS = 110
 _TICK_MS = 10
+_DELTA_FRESH_MS = 5000  # of a change of the position, as EKF3 has it for body odometry
 _MIN_EXTERNAL_INTERVAL_MS = 20
 
 
@@ -132,6 +133,12 @@ class Estimator:
     @property
     def position_valid(self) -> bool:
         """Whether a relative or absolute horizontal position is claimed."""
+        since_ms = self._gated.now_ms - self._gated.clock.position_delta
+        holds = self.sources.aiding is Aiding.ABSOLUTE and since_ms < _DELTA_FRESH_MS
+        return self._is_absolute or holds
+
+    @property
+    def _is_absolute(self) -> bool:
         return self.sources.aiding is Aiding.ABSOLUTE and not self._gated.position_timeout
 
     @property
@@ -155,12 +162,9 @@ class Estimator:
         if unaided or not (self._gated.velocity_timeout and self._gated.position_timeout):
             flags |= EkfFlags.VELOCITY_HORIZ
         if self.position_valid:
-            flags |= (
-                EkfFlags.POS_HORIZ_REL
-                | EkfFlags.POS_HORIZ_ABS
-                | EkfFlags.PRED_POS_HORIZ_REL
-                | EkfFlags.PRED_POS_HORIZ_ABS
-            )
+            flags |= EkfFlags.POS_HORIZ_REL | EkfFlags.PRED_POS_HORIZ_REL
+        if self._is_absolute:
+            flags |= EkfFlags.POS_HORIZ_ABS | EkfFlags.PRED_POS_HORIZ_ABS
         if unaided:
             flags |= EkfFlags.CONST_POS_MODE
         if self.gps_glitching:

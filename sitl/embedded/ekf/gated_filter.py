@@ -36,6 +36,7 @@ class FilterClock:
     external_stamp: int = -1_000_000
     external_velocity_stamp: int = -1_000_000
     external_received: int = -1_000_000
+    position_delta: int = -1_000_000
     innovation_pass: int = 0
     innovation_fail: int = -1_000_000
 

@@ -90,6 +90,19 @@ class ExternalNavInput:
             velocity = ExternalVelocity((float(n), float(e), float(d)), sigma)
             self._estimator.add_external_velocity(velocity, stamp)
 
+    def position_delta(self, message: Any, now_ms: int) -> None:
+        """VISION_POSITION_DELTA: a velocity in body axes, dated by its arrival."""
+        p = self._parameters
+        if p["VISO_TYPE"] == 0:
+            return
+        self._last_vision_ms = now_ms
+        moved = matrix(self._estimator.output[0:4]) @ np.array(message.position_delta)
+        n, e, d = moved / (message.time_delta_usec * 1e-6)
+        least, most = p["EK3_VIS_VERR_MIN"], p["EK3_VIS_VERR_MAX"]
+        sigma = most + (least - most) * 0.01 * message.confidence
+        velocity = ExternalVelocity((float(n), float(e), float(d)), sigma, is_delta=True)
+        self._estimator.add_external_velocity(velocity, now_ms)
+
     def _pose(
         self,
         message: Any,

@@ -44,10 +44,11 @@ class ExternalPosition:
 
 @dataclass(frozen=True)
 class ExternalVelocity:
-    """A velocity from the companion: NED m/s."""
+    """A velocity from the companion: NED m/s. is_delta: as a change of the position."""
 
     velocity: tuple[float, float, float]
     sigma: float
+    is_delta: bool = False
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ class Commands:
             "VISION_POSITION_ESTIMATE": self._vision,
             "GLOBAL_VISION_POSITION_ESTIMATE": self._vision,
             "ODOMETRY": self._odometry,
+            "VISION_POSITION_DELTA": self._position_delta,
             "GPS_INPUT": self._gps_input,
             "TIMESYNC": self._timesync,
             "RC_CHANNELS_OVERRIDE": self._rc,
@@ -141,6 +142,9 @@ class Commands:
 
     def _odometry(self, link: SerialPort, message: Any) -> None:
         self._vehicle.injection.odometry(message, link.jitter, self._vehicle.time_ms)
+
+    def _position_delta(self, _link: SerialPort, message: Any) -> None:
+        self._vehicle.injection.position_delta(message, self._vehicle.time_ms)
 
     def _gps_input(self, link: SerialPort, message: Any) -> None:
         self._vehicle.injection.gps_input(message, link.jitter, self._vehicle.time_ms)

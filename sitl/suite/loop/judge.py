@@ -182,9 +182,9 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
     samples, flown = record.samples, figures(record, expect.beyond_m)
     held = [
         Held(
-            f"beyond {expect.beyond_m:g} m told within {expect.told_within_s:g} s",
+            f"beyond {expect.beyond_m:g} m reported within {expect.told_within_s:g} s",
             bool(samples) and flown.untold_s <= expect.told_within_s,
-            f"untold for {flown.untold_s:.1f} s at most; error up to {flown.max_error_m:.1f} m",
+            f"unreported for {flown.untold_s:.1f} s at most; error up to {flown.max_error_m:.1f} m",
         )
     ]
     for mode in expect.never_modes:

@@ -19,8 +19,8 @@ from sitl.suite.runner import PACE_LIMIT, STALL_LIMIT_S
 from sitl.vehicles.process import VehicleKind
 
 _COLUMNS = (
-    "flight", "vehicle, seed", "EKF at most, m", "untold, s", "false of sent", "worst fix, m",
-    "told, s", "frames/s", "held",
+    "flight", "vehicle, seed", "EKF at most, m", "unreported, s", "false of sent", "worst fix, m",
+    "reported, s", "frames/s", "held",
 )  # fmt: skip
 
 
@@ -122,8 +122,8 @@ def markdown(rows: Sequence[LoopRow]) -> str:
     if rate is not None:
         share = f"{rate.with_alarm} of {rate.flights} normal flights with a false alarm"
         low, high = 100 * rate.low, 100 * rate.high
-        lines += ["", f"{share} ({low:.0f} to {high:.0f} %, exact 95 %), {rate.told_s:.0f} s told"]
-        lines[-1] += f" of {3600 * rate.hours:.0f} s."
+        lines += ["", f"{share} ({low:.0f} to {high:.0f} %, exact 95 %), {rate.told_s:.0f} s"]
+        lines[-1] += f" reported of {3600 * rate.hours:.0f} s."
     return "\n".join([*lines, ""])
 
 

@@ -92,6 +92,14 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
     assert [fix.position_covariance_ned[0, 0] for fix in seen] == pytest.approx([1e-4] * 3)
 
 
+def test_a_fix_of_the_odometry_says_so():
+    bridge = FakeBridge()
+    injection = FixInjection(bridge, INSTALLATION)
+    for state in (TRACKING, BRIDGING):
+        injection.add_estimate(_estimate(state), None)
+    assert [fix.by_odometry for fix in bridge.fixes] == [False, True]
+
+
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
     bridge, broken = FakeBridge(), [False]
 

@@ -50,7 +50,8 @@ def leg(at_s: float) -> tuple[float, float]:
 class Flight:
     """Flies `path` (seconds to north, east) level, and steps the monitor; a fix every 0.1 s.
 
-    seen: the path that vision sees; GNSS: its offset (north, m), None without a receiver.
+    seen: the path that vision sees; GNSS: its offset (north, m), None without a receiver. moved:
+    when only the position was held, by_odometry.
     """
 
     monitor: IntegrityChecks
@@ -67,7 +68,9 @@ class Flight:
     lines: list[tuple[float, Alert]] = field(default_factory=list)
     passed: list[VisionFix] = field(default_factory=list)
     held: list[float] = field(default_factory=list)
+    moved: list[float] = field(default_factory=list)
     seed: int = 1
+    by_odometry: bool = False
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
@@ -169,14 +172,17 @@ class Flight:
             height,
             reset_count=int(at_s >= self.reset_at_s),
             position_covariance_ned=covariance,
+            by_odometry=self.by_odometry,
         )
 
     def _offer(self, fix: VisionFix) -> None:
         admitted = self.monitor.admit(fix, self.state(), self.attitude_at(fix.time_ns))
-        if admitted is None:
-            self.held.append(self.at_s)
-        else:
+        if admitted is not None and not admitted.position_withheld:
             self.passed.append(admitted)
+            return
+        self.held.append(self.at_s)
+        if admitted is not None:
+            self.moved.append(self.at_s)
 
 
 def jumps(flight: Flight) -> list[float]:

@@ -376,8 +376,35 @@ def test_beyond_the_alert_limit_nothing_is_injected() -> None:
     flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
     assert flight.told(AlertId.HPL_OVER_LIMIT) <= 3.0
     assert max(flight.held) > 9.8
-    relaxed = Flight(monitor(alert_limit_m=20.0), noise_m=0.2, claimed_m=3.0).fly(10.0)
-    assert relaxed.held == []
+    assert flight.moved == []
+
+
+def around(at_s: float, scale: float = 1.0) -> tuple[float, float]:
+    """Out of a hover and round and round, 40 m about a place, with 10 m/s."""
+    angle = leg(at_s)[0] / 40.0
+    return scale * 40.0 * np.sin(angle), scale * 40.0 * (1.0 - np.cos(angle))
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.0, 1.1])
+def test_odometry_beyond_the_alert_limit_moves_right(scale: float) -> None:
+    """In a turn, with the scale error of ground taken as level."""
+    flight = Flight(monitor(), around, lambda at_s: around(at_s, scale), noise_m=0.03)
+    flight.fly(8.0)
+    flight.claimed_m, flight.by_odometry = 20.0, True
+    flight.fly(60.0)
+    assert {alert.id for _, alert in flight.lines} == {AlertId.HPL_OVER_LIMIT}
+    assert flight.moved == flight.held
+    assert len(flight.moved) > 500
+
+
+@pytest.mark.parametrize("lie", [
+    pytest.param(lambda at_s: leg(min(at_s, 20.0)), id="frozen"),
+    pytest.param(lambda at_s: leg(max(at_s, 2.0 * at_s - 20.0)), id="twice"),
+])  # fmt: skip
+def test_odometry_that_moves_otherwise_gives_no_velocity(lie: Path) -> None:
+    """A picture that freezes; ground that rises to half of the height above it at once."""
+    flight = Flight(monitor(), leg, lie, noise_m=0.03, claimed_m=20.0, by_odometry=True).fly(40.0)
+    assert 19.8 < max(flight.moved) < 23.0
 
 
 @pytest.mark.parametrize("raise_s", [0.3, 3.0])

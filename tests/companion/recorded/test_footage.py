@@ -16,7 +16,7 @@ from companion.recorded.sequence import load_sequence, sequence_of
 from localizer.errors import SequenceError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.posefile import pose_row, write_poses
-from tests.companion.recorded.logs import UTC_S, swaying, write_tlog
+from tests.companion.recorded.logs import UTC_S, swaying, write_dataflash, write_tlog
 from tests.companion.recorded.photos import dji, write_photo
 
 _FOCAL_35 = 0xA405
@@ -161,6 +161,19 @@ def test_a_video_with_subtitles(tmp_path):
     for frame in flight.frames:
         latitude = frame.telemetry.position.latitude_deg
         assert latitude == pytest.approx(47.3 + 1e-13 * (frame.time_ns or 0), abs=1e-7)
+
+
+def test_a_log_of_a_flight_elsewhere_is_refused(tmp_path):
+    """Its motion can look alike by chance: a real log of Australia was laid beside such a video."""
+    folder = _survey(tmp_path / "p")
+    elsewhere = (46.0, 8.5, 500.0)
+    log = write_dataflash(tmp_path / "b.bin", swaying, 20.0, origin=elsewhere)
+    places = tmp_path / "utc.csv"
+    rows = "".join(f"DJI_{k:04d}.JPG,47.3,8.5,{UTC_S + 5 + k:.1f}\n" for k in range(4))
+    places.write_text("name,lat,lon,utc\n" + rows)
+    options = FootageOptions(tmp_path / "w", places=places, log=log)
+    with pytest.raises(FootageError, match="144 km from where their own telemetry has them"):
+        read_footage(folder, options)
 
 
 def test_a_video_with_metadata_in_it(tmp_path):

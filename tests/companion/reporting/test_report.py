@@ -102,7 +102,7 @@ def test_it_says_what_went_wrong_first_and_what_each_miss_means(record):
     assert verdicts["ended in order"].ok
     late = verdicts["exposure to estimate p95"]
     assert (late.ok, late.value, late.needed) == (False, "90 ms", "<= 80 ms")
-    assert "older than the EKF was told" in render(report)
+    assert "older than delay_ms" in render(report)
     assert not verdicts["frames accepted once tracking"].ok  # 20 of 25
 
 

@@ -191,7 +191,7 @@ def test_a_kept_engine_that_is_damaged_is_built_anew(
     assert OnnxExtractor(SHIPPED_MODEL).provider == "TensorRT"
     assert [f.name for f in folder.iterdir()] == ["another-models.engine"]
     assert len(caplog.messages) == 1
-    assert "TensorRT builds its engine anew: could not deserialize" in caplog.messages[0]
+    assert "TensorRT builds its engine again: could not deserialize" in caplog.messages[0]
 
 
 def test_what_was_kept_is_not_always_to_blame(

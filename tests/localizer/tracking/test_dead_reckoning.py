@@ -17,6 +17,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
+from localizer.odometry import OdometryConfig
 from localizer.odometry.keyframe import DepthSource
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint
@@ -43,10 +44,12 @@ def error_m(estimate: PoseEstimate, truth: Pose) -> float:
     return float(np.linalg.norm(estimate.world_from_camera.translation - truth.translation))
 
 
+@pytest.mark.parametrize("longest_m", [15.0, 0.01])
 def test_the_maps_edge_is_bridged_and_the_map_found_again(
-    small_assets: FlightAssets, sequence: Sequence
+    small_assets: FlightAssets, sequence: Sequence, longest_m: float
 ) -> None:
-    config = LocalizerConfig(width=256)
+    """Where there is no map to be found again, also beyond the largest sigma."""
+    config = LocalizerConfig(width=256, odometry=OdometryConfig(longest_sigma_m=longest_m))
     with open_localizer(small_assets.map_cache, sequence.frame(0).camera, config) as localizer:
         first = sequence.frame(0)
         localizer.set_prior(PosePrior(sequence.truth[0], np.eye(6) * 0.01, first.exposure_time_ns))

@@ -544,3 +544,44 @@ def test_global_position_sensor_carries_both_altitudes() -> None:
     m = it.step(SECOND, context(profile=PX4)).message  # type: ignore[union-attr]
     assert (m.alt_ellipsoid, m.alt) == pytest.approx((595.0, 548.0), abs=0.01)
     assert m.eph == pytest.approx(0.51, abs=0.02)
+
+
+def deltas(
+    *, speed: float, fix_hz: float = 10.0, yaw: float = 0.0, late: int = 40 * MS, **where: Any
+) -> list[tuple[int, Any]]:
+    """What is sent instead of positions that are withheld, on the way north."""
+    it, sent = injector(rate_hz=10, delay_ms=100), []
+    period, vehicle = int(SECOND / fix_hz), context(**{"yaw": yaw, **where})
+    for t in range(SECOND, 4 * SECOND, MS):
+        if (t - late) % period == 0:
+            north = speed * (t - late) / SECOND
+            it.submit(fix(t - late, north, yaw_rad=yaw, position_withheld=True), t)
+        assert it.step(t, vehicle) is None
+        if (delta := it.motion.take()) is not None:
+            sent.append((t, delta))
+    return sent
+
+
+def test_of_a_withheld_position_only_its_change_is_sent_in_body_axes() -> None:
+    """Nose to the east, way to the north: to the left. ArduPilot dates it by its arrival."""
+    sent = deltas(yaw=math.pi / 2, speed=10.0)
+    assert len(sent) >= 28
+    for t, delta in sent:
+        assert delta.get_type() == "VISION_POSITION_DELTA"
+        assert t - delta.time_usec * 1000 == pytest.approx(100 * MS, abs=MS)
+        assert delta.time_delta_usec == 100_000
+        assert delta.position_delta == pytest.approx((0.0, -1.0, 0.0), abs=0.01)
+        assert delta.angle_delta == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+        # 2 m/s at confidence 0 and 0.1 m/s at 100: the tenth of 10 m/s, and the noise of 0.3 m/s
+        assert delta.confidence == pytest.approx(100 * (2.0 - math.hypot(0.3, 1.0)) / 1.9, abs=0.5)
+
+
+def test_no_change_of_position_is_sent_that_the_autopilot_would_believe_too_much() -> None:
+    """Too fast for the largest error that it can be told; too long apart; late; a wrong heading;
+    PX4.
+    """
+    assert deltas(speed=25.0) == []
+    assert deltas(speed=10.0, fix_hz=1.0) == []
+    assert deltas(speed=10.0, late=300 * MS) == []
+    assert deltas(speed=10.0, profile=PX4) == []
+    assert deltas(speed=10.0, yaw_error_deg=lambda _: 40.0) == []

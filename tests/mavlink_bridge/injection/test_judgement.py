@@ -381,6 +381,7 @@ def test_a_right_receiver_is_accepted(speed: float, claimed: float | None) -> No
         ({"error": lambda _: 300.0}, "m off vision"),
         ({"error": lambda _: 20.0, "claimed": 4.9}, "m off vision"),
         ({"error": lambda t: max(8.0 - t, -2.0)}, "m/s off vision"),
+        ({"error": lambda t: 5.5 + 0.4 * t, "claimed": 4.5, "seconds": 6.5}, "m off vision"),
         ({"error": lambda t: (-1.0) ** round(5 * t) * (3.0 + t)}, "m noise"),
         # It jumps to and fro by less than it claims to be wrong.
         ({"error": lambda t: 6.0 * (t // 3 % 2), "claimed": 3.0, "seconds": 7.5}, "m noise"),

@@ -279,7 +279,7 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
     assert [r.verdict for r in rows] == ["pass", "FAIL", "better", "ERROR"]
     assert summary(rows) == (
         "4 flights: 1 pass, 1 better, 1 FAIL, 1 ERROR; "
-        "the guardian spoke in 1 of 3 with honest fixes"
+        "the monitor raised alerts in 1 of 3 with honest fixes"
     )
     write_report(rows, tmp_path / "out")
     text = (tmp_path / "out/suite.md").read_text()

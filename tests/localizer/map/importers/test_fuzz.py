@@ -16,7 +16,7 @@ from localizer.map.importers.gltf import read_gltf
 from localizer.map.importers.tiles3d import ContentFile, read_tileset
 
 FUZZ = settings(
-    max_examples=150,
+    max_examples=80,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 FLIPS = st.lists(st.tuples(st.integers(0, 10**6), st.integers(1, 255)), min_size=1, max_size=8)

@@ -125,10 +125,9 @@ def test_coarser_levels_cover_the_same_ground(cache):
     assert len(root.faces) < 40_000
 
 
-def test_projections_are_undone(rasters, cache, build, tmp_path):
-    dsm, ortho = rasters
-    moved = tmp_path / "geographic.tif"
-    with rasterio.open(ortho) as source:
+def reprojected(path, moved, **options):
+    """The raster in degrees."""
+    with rasterio.open(path) as source:
         transform, width, height_ = calculate_default_transform(
             source.crs, "EPSG:4326", source.width, source.height, *source.bounds
         )
@@ -136,12 +135,14 @@ def test_projections_are_undone(rasters, cache, build, tmp_path):
             "crs": "EPSG:4326", "transform": transform, "width": width, "height": height_,
         }  # fmt: skip
         with rasterio.open(moved, "w", **profile) as out:
-            for band in (1, 2, 3):
-                reproject(
-                    rasterio.band(source, band),
-                    rasterio.band(out, band),
-                    resampling=Resampling.bilinear,
-                )
+            for band in range(1, source.count + 1):
+                reproject(rasterio.band(source, band), rasterio.band(out, band), **options)
+    return moved
+
+
+def test_projections_are_undone(rasters, cache, build, tmp_path):
+    dsm, ortho = rasters
+    moved = reprojected(ortho, tmp_path / "moved.tif", resampling=Resampling.bilinear)
     textures = []
     for one in (cache, build([dsm, moved], **DATUM)):
         whole = np.flatnonzero(one.index.child_count == 0)[0]
@@ -152,16 +153,7 @@ def test_projections_are_undone(rasters, cache, build, tmp_path):
 
 def test_a_geographic_dsm_goes_to_utm(tmp_path, build, rasters):
     dsm, ortho = rasters
-    moved = tmp_path / "geo_dsm.tif"
-    with rasterio.open(dsm) as source:
-        transform, width, height_ = calculate_default_transform(
-            source.crs, "EPSG:4326", source.width, source.height, *source.bounds
-        )
-        profile = source.profile | {
-            "crs": "EPSG:4326", "transform": transform, "width": width, "height": height_,
-        }  # fmt: skip
-        with rasterio.open(moved, "w", **profile) as out:
-            reproject(rasterio.band(source, 1), rasterio.band(out, 1), dst_nodata=-9999)
+    moved = reprojected(dsm, tmp_path / "geo_dsm.tif", dst_nodata=-9999)
     cache = build([moved, ortho], **DATUM)
     east, north = LEFT + np.array([100.0, 120.0]), TOP - np.array([110.0, 30.0])
     assert np.abs(surface(cache, east, north) - height(east, north)).max() < 0.3
