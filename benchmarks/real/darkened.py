@@ -98,9 +98,8 @@ def main() -> None:
     args = p.parse_args()
     limit = VideoCheckConfig().low_detail
     bins = list(itertools.pairwise(_EDGES))
-    print(
-        f"| set | {' | '.join(f'{a:g} to {b:g}' for a, b in bins)} | as they are, below {limit} |"
-    )
+    names = " | ".join(f"{low:g} to {high:g}" for low, high in bins)
+    print(f"| set | {names} | original below {limit:g} |\n{'|---' * (len(bins) + 2)}|")
     for name in args.sets:
         if name == "generated":
             made = load_views(name, args.folder, args.data, 40)

@@ -31,6 +31,7 @@ _GOOD_NS = 1_000_000_000
 _FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
 _ASK_NS = 1_000_000_000
 _ANSWERED_NS = 2_000_000_000
+_AIDING = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_GPS_GLITCHING
 
 
 class PositionCommand:
@@ -66,7 +67,7 @@ class PositionCommand:
             self._held_since_ns = now_ns
         self._held_ns = now_ns
         if self._fuses is None:
-            aided = bool(state.ekf_flags & mavlink.EKF_POS_HORIZ_ABS)
+            aided = state.ekf_flags & _AIDING == mavlink.EKF_POS_HORIZ_ABS
             may_ask = aided and gnss_healthy(state, now_ns)
         else:
             may_ask = self._fuses

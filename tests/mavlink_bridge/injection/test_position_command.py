@@ -37,11 +37,12 @@ class Vehicle(Flight):
         super().__init__(monkeypatch, injection=INJECTION)
         self.result = result
         self.gnss_north_m = 0.0
+        self.flags = 831
 
     def _vehicle(self, step: int) -> None:
         super()._vehicle(step)
         if step % 100 == 50:
-            self.say(mavlink.MAVLink_ekf_status_report_message(831, 0.1, 0.1, 0.1, 0.1, 0.0))
+            self.say(mavlink.MAVLink_ekf_status_report_message(self.flags, 0.1, 0.1, 0.1, 0.1, 0.0))
 
     def _answer(self, m: Any) -> None:
         if getattr(m, "command", 0) == COMMAND and self.result is not None:
@@ -105,12 +106,16 @@ def test_a_vehicle_that_refuses_it_beside_gnss_is_sent_none_though_it_takes_a_re
     assert len(vehicle.commands()) > 50  # another firmware, perhaps: it is asked again
 
 
-@pytest.mark.parametrize("gnss", [True, False])
+@pytest.mark.parametrize(
+    ("gnss_north_m", "flags"),
+    [(0.0, 831), (None, 831), (0.0, 831 | mavlink.EKF_GPS_GLITCHING), (0.0, 167)],
+)
 def test_a_vehicle_that_does_not_answer_is_asked_once_a_second_and_only_on_gnss(
-    monkeypatch: pytest.MonkeyPatch, gnss: bool
+    monkeypatch: pytest.MonkeyPatch, gnss_north_m: float | None, flags: int
 ) -> None:
     vehicle = Vehicle(monkeypatch, None)
-    vehicle.gnss_north_m = 0.0 if gnss else None
+    vehicle.gnss_north_m, vehicle.flags = gnss_north_m, flags
+    gnss = gnss_north_m is not None and flags == 831  # that aids the EKF
     vehicle.run(PASSED_S + 10.0)
     times = [t for t, _ in vehicle.commands()]
     assert (15 <= len(times) <= 21) if gnss else times == []
