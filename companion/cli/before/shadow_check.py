@@ -54,13 +54,18 @@ def shadow_check_command(
     TileCache.open(map_cache)  # what is missing is said before anything is computed
     console = Console(stderr=True)
     with tempfile.TemporaryDirectory(prefix="shadow-check-") as work:
+        told = None if config is None else load_config(config)
+        if told is not None and camera is None and fov is None:
+            camera = Path(work) / "camera.json"
+            model = told.camera.model.camera()
+            camera.write_text(json.dumps(model.to_dict()), encoding="utf-8")
         options = FootageOptions(Path(work), 60, None, log, camera, fov, mount_pitch)
         with shown_count(console, "reading footage") as count:
             flight = read_footage(video, options, count)
-        if config is None:
+        if told is None:
             deployment = _deployment(flight, map_cache, mount_pitch)
         else:
-            deployment = load_config(config).model_copy(update={"map": map_cache})
+            deployment = told.model_copy(update={"map": map_cache})
         playing = shown_count(console, "playing the flight, s", begins=COMPILES)
         with playing as count, _quiet("mavlink_bridge.status"):
             found = shadow_check(

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
+from companion.trial.deployment import footage_settings
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
@@ -51,7 +52,7 @@ def flight(small_assets, tmp_path_factory):
     return folder
 
 
-def _check(flight, map_cache, north_m=0.0):
+def _check(flight, map_cache, north_m=0.0, camera=("--fov", "65")):
     """The command's result and figures, for a log whose GNSS lies so far north."""
     manifest = TileCache.open(map_cache).manifest
     origin = (manifest.origin.latitude_deg + north_m / 111_195.0, manifest.origin.longitude_deg,
@@ -61,7 +62,7 @@ def _check(flight, map_cache, north_m=0.0):
     figures.unlink(missing_ok=True)
     result = CliRunner().invoke(app, [
         "shadow-check", str(log), "--video", str(flight / "flight.mp4"), "--map", str(map_cache),
-        "--fov", "65", "--json", str(figures),
+        *camera, "--json", str(figures),
     ])  # fmt: skip
     assert figures.exists(), result.output
     return result, json.loads(figures.read_text())
@@ -77,7 +78,11 @@ def test_a_flight_over_its_own_map_is_a_go(small_assets, flight):
 
 
 def test_a_map_that_lies_20_m_off_is_no_go(small_assets, flight):
-    result, figures = _check(flight, small_assets.map_cache, north_m=20.0)
+    down = np.array([0.0, -90.0, 0.0])
+    settings = footage_settings(small_assets.map_cache, _CAMERA, down, fixed=True)
+    (flight / "deployment.yaml").write_text(json.dumps(settings))
+    told = ("--config", str(flight / "deployment.yaml"))  # the video itself says no focal length
+    result, figures = _check(flight, small_assets.map_cache, 20.0, told)
     assert result.exit_code == 1, result.output
     assert figures["score"]["bias_ne_m"] == pytest.approx([-20.0, 0.0], abs=0.5)
     assert "shadow verdict: not ready: median error " in result.output
