@@ -55,15 +55,12 @@ class PropagationResult(Enum):
 
 @dataclass(frozen=True)
 class PropagatedPose:
-    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED; noise
-    (6, 6): for the motion model.
-    """
+    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED."""
 
     status: PropagationResult
     world_from_camera: Pose | None = None
     covariance: Array | None = None
     quality: float = 0.0
-    noise: Array | None = None
 
 
 _NOTHING = PropagatedPose(PropagationResult.NONE)
@@ -72,10 +69,6 @@ _NOTHING = PropagatedPose(PropagationResult.NONE)
 # Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
-
-# Off the map the frames share a large error. Taken for noise, it had them followed metres late in a
-# turn, until nothing registered (ArduPilot).
-_FOLLOWED_M = 0.5
 _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
 
@@ -152,12 +145,9 @@ class DeadReckoning:
         if sigma_m > (longest_m if is_tried else self._off_map_sigma_m):
             self._odometry.forget()
             return PropagatedPose(PropagationResult.BROKEN)
-        share = min(_FOLLOWED_M / sigma_m, 1.0) if anchors is None else 1.0
-        less = np.diag([share] * 3 + [1.0] * 3)
         return PropagatedPose(
-            PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality,
-            less @ P @ less,
-        )  # fmt: skip
+            PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality
+        )
 
     def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
         """about: where the camera is, to some metres."""

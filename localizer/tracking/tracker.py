@@ -213,8 +213,8 @@ class Tracker:
         if use_map and result is not None:
             noise = result.covariance if result.noise is None else result.noise
             return motion.update(ahead, result.world_from_camera, noise)
-        if carried.world_from_camera is not None and carried.noise is not None:
-            return motion.update(ahead, carried.world_from_camera, carried.noise)
+        if carried.world_from_camera is not None and carried.covariance is not None:
+            return motion.update(ahead, carried.world_from_camera, carried.covariance)
         if result is not None and is_acceptable(self._config.integrity, result, 0.0):
             return motion.inflated(ahead, self._config.motion)
         if lost:  # its velocity is of long ago, and would carry the search out of the map
