@@ -247,8 +247,9 @@ def load_record(
         RecordedFrame(file.name, file, e.exposure_time_ns, Telemetry(e.exposure_time_ns))
         for file, e in zip(files, estimates, strict=True)
     )
-    has_gimbal = config.bridge.camera.mount != "fixed"
-    log = LogBeside(tlog, tables.utc_ns - tables.start_ns, has_gimbal)
+    mounted = config.bridge.camera
+    fixed_pitch_deg = mounted.mount_pitch_deg if mounted.mount == "fixed" else None
+    log = LogBeside(tlog, tables.utc_ns - tables.start_ns, fixed_pitch_deg)
     camera = camera_given(config.camera.model.camera(), MANIFEST_NAME)
     flight = RecordedFlight(folder.name, "video", frames, camera, tables.notes, log)
     if map_cache is not None:

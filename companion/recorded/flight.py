@@ -138,13 +138,13 @@ class CameraGuess:
 
 @dataclass(frozen=True)
 class LogBeside:
-    """The autopilot's log of the flight. ahead_ns: its clock less that of the images; has_gimbal:
-    whether a gimbal's angles are in it.
+    """The autopilot's log of the flight. ahead_ns: its clock less that of the images;
+    fixed_pitch_deg: of the camera on the airframe, None where a gimbal's angles are in the log.
     """
 
     path: Path
     ahead_ns: int
-    has_gimbal: bool
+    fixed_pitch_deg: float | None
 
 
 @dataclass(frozen=True)

@@ -314,7 +314,8 @@ def _with_log(
         frame if said is None else frame.with_telemetry(said)
         for frame, said in zip(frames, told, strict=True)
     ]
-    return moved, LogBeside(file, ahead_ns, log.has_gimbal)
+    fixed_pitch_deg = None if log.has_gimbal else options.fixed_pitch_deg
+    return moved, LogBeside(file, ahead_ns, fixed_pitch_deg)
 
 
 def _apart_m(a: RecordedPosition, b: RecordedPosition) -> float:

@@ -28,7 +28,8 @@ def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
 def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
     found = trial.estimated
     camera = found.camera if found is not None else trial.flight.camera.camera
-    settings = footage_settings(map_cache, camera, _mount_deg(trial), fixed=not _is_measured(trial))
+    fixed = _fixed_pitch_deg(trial) is not None
+    settings = footage_settings(map_cache, camera, _mount_deg(trial), fixed=fixed)
     return settings | {"record": {"folder": str(Path("flights/flight").resolve())}}
 
 
@@ -58,15 +59,19 @@ def _model(camera: Camera) -> dict[str, Any]:
     return model | rounded | {"distortion": [round(k, 5) for k in model["distortion"]]}
 
 
-def _is_measured(trial: Trial) -> bool:
-    return sum(p.measured for p in trial.priors) > len(trial.priors) / 2
+def _fixed_pitch_deg(trial: Trial) -> float | None:
+    """Of a camera on the airframe; None for a gimbal. Without angles it looks down."""
+    if trial.flight.log is not None:
+        return trial.flight.log.fixed_pitch_deg
+    is_measured = sum(p.measured for p in trial.priors) > len(trial.priors) / 2
+    return None if is_measured else -90.0
 
 
 def _mount_deg(trial: Trial) -> Array:
     """Roll, pitch, yaw of the mounting: the gimbal's bias, or a fixed camera's direction."""
     turn = np.zeros(3) if trial.estimated is None else np.radians(trial.estimated.mount_deg)
-    down = np.eye(3) if _is_measured(trial) else matrix_from_euler(0.0, -np.pi / 2, 0.0)
-    return np.degrees(euler_from_matrix(down @ so3_exp(turn)))
+    pitch = np.radians(_fixed_pitch_deg(trial) or 0.0)
+    return np.degrees(euler_from_matrix(matrix_from_euler(0.0, pitch, 0.0) @ so3_exp(turn)))
 
 
 def _notes(trial: Trial) -> list[str]:
@@ -75,7 +80,7 @@ def _notes(trial: Trial) -> list[str]:
         "CHECK camera.source and bridge.connection: the footage does not tell them.",
         f"Focal length: {trial.flight.camera.source}.",
     ]
-    if not _is_measured(trial):
+    if _fixed_pitch_deg(trial) is not None:
         notes.append(
             "The footage has no gimbal angles: the camera is written as fixed to the airframe. "
             "With a gimbal set bridge.camera.mount: gimbal and its three angles to 0."

@@ -93,9 +93,7 @@ def write_record(
     if config.record is None:
         raise ValueError("a desk flight's deployment names its record")
     start_ns, offset_ns = clocks
-    autopilot = RecordedAutopilot(
-        config.bridge, LogBeside(tlog, offset_ns, has_gimbal=True), start_ns
-    )
+    autopilot = RecordedAutopilot(config.bridge, LogBeside(tlog, offset_ns, None), start_ns)
     stack = MapStack(config.map, config.localizer)
     recorder = Recorder(config.record, stack.cache.frame) if keep else None
     told = config.camera.model.camera()

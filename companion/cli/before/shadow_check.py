@@ -63,7 +63,7 @@ def shadow_check_command(
         with shown_count(console, "reading footage") as count:
             flight = read_footage(video, options, count)
         if told is None:
-            deployment = _deployment(flight, map_cache, mount_pitch)
+            deployment = _deployment(flight, map_cache)
         else:
             deployment = told.model_copy(update={"map": map_cache})
         playing = shown_count(console, "playing the flight, s", begins=COMPILES)
@@ -89,14 +89,15 @@ def _quiet(name: str) -> Iterator[None]:
         logger.setLevel(before)
 
 
-def _deployment(flight: RecordedFlight, map_cache: Path, mount_pitch: float) -> CompanionConfig:
+def _deployment(flight: RecordedFlight, map_cache: Path) -> CompanionConfig:
     import numpy as np
 
     from companion.config import parse_config
     from companion.trial.deployment import footage_settings
 
-    fixed = flight.log is None or not flight.log.has_gimbal
-    mount_deg = np.array([0.0, mount_pitch if fixed else 0.0, 0.0])
+    pitch_deg = None if flight.log is None else flight.log.fixed_pitch_deg
+    mount_deg = np.array([0.0, pitch_deg or 0.0, 0.0])
+    fixed = pitch_deg is not None
     settings = footage_settings(map_cache, flight.camera.camera, mount_deg, fixed=fixed)
     return parse_config(settings, flight.name)
 

@@ -11,9 +11,12 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.convert.angles import gimbal_of_pose
+from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
+from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer
 from companion.trial.priors import priors_of
+from companion.trial.result import Trial
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -73,6 +76,18 @@ def test_photos_tell_what_is_wrong_with_their_tags(small_assets, small_sequence,
     config = load_config(report / "deployment.yaml")
     assert config.bridge.camera.mount == "gimbal"
     assert config.bridge.camera.mount_pitch_deg == pytest.approx(_UP_DEG, abs=1.0)
+
+
+@pytest.mark.parametrize(("pitch_deg", "mount"), [(-60.0, "fixed"), (None, "gimbal")])
+def test_a_camera_without_a_gimbal_is_written_as_fixed(small_assets, tmp_path, pitch_deg, mount):
+    """With the log's attitude its view is as good as measured: the file said gimbal."""
+    log = LogBeside(tmp_path / "a.bin", 0, pitch_deg)
+    guess = CameraGuess(Camera.from_fov(320, 240, 65.0), 1.0, "--fov")
+    trial = Trial(RecordedFlight("a", "video", (), guess, (), log), (), (), (), {}, None, (), ())
+    file = write_trial_deployment(tmp_path / "deployment.yaml", trial, small_assets.map_cache)
+    camera = load_config(file).bridge.camera
+    assert camera.mount == mount
+    assert camera.mount_pitch_deg == pytest.approx(pitch_deg or 0.0)
 
 
 def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequence, tmp_path):
