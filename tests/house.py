@@ -64,16 +64,6 @@ def sources(root: Path) -> dict[str, str]:
     }
 
 
-def _parsed(text: str) -> ast.Module:
-    """Its tree. CPython miscounts its recursion where another thread compiles meanwhile (gh-106905,
-    seen once in the suite): then once more.
-    """
-    try:
-        return ast.parse(text)
-    except SystemError:
-        return ast.parse(text)
-
-
 def crowded_folders(files: Mapping[str, str]) -> list[str]:
     """Folders of packages with too many modules."""
     paths = [PurePosixPath(path) for path in files]
@@ -91,7 +81,7 @@ def large_classes(files: Mapping[str, str]) -> list[str]:
         if path.split("/")[0] in PACKAGES
         for match in _CLASS.finditer(text)
         if _may_be_large(match.group())
-        for node in ast.walk(_parsed(match.group()))
+        for node in ast.walk(ast.parse(match.group()))
         if isinstance(node, ast.ClassDef) and (problem := _too_large(node))
     ]
 
@@ -122,7 +112,7 @@ def long_signatures(files: Mapping[str, str]) -> list[str]:
         for path, text in files.items()
         if path.split("/")[0] in PACKAGES
         and any(m.group(1).count(",") >= MOST_PARAMETERS for m in _SIGNATURE.finditer(text))
-        for node in ast.walk(_parsed(text))
+        for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         and (count := _parameters(node)) > MOST_PARAMETERS
         and not _is_kernel_or_command(node)
@@ -221,7 +211,7 @@ def private_reaches(files: Mapping[str, str]) -> list[str]:
         f"{path}:{line}: {what}"
         for path, text in files.items()
         if any(m.group(1) not in ("self", "cls") for m in _REACHES.finditer(text))
-        for line, what in _reaches(_parsed(text))
+        for line, what in _reaches(ast.parse(text))
     ]
 
 
