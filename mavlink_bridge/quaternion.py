@@ -23,7 +23,7 @@ def normalise(q: tuple[float, ...] | list[float]) -> Quaternion:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product: the rotation b, then a."""
+    """Hamilton product: rotates by b first, then by a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (

@@ -188,7 +188,7 @@ class HealthMonitor:
         if _is_lost(estimate):  # the error stands in health.json; this is what to act on
             status = HealthStatus(HealthLevel.FAILED, self._lost(estimate, engine))
         elif is_old:
-            failed = alert(AlertId.LOCALIZATION_FAILED) if engine.last_error else None
+            failed = alert(_error(engine)) if engine.last_error else None
             news = failed or self._overload(engine) or alert(AlertId.NO_FRAME)
             status = HealthStatus(HealthLevel.DEGRADED, (news,))
         else:
@@ -315,12 +315,16 @@ def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
     }
 
 
+def _error(engine: EngineHealth) -> AlertId:
+    return AlertId.MAP_LOADING if engine.map_loading else AlertId.LOCALIZATION_FAILED
+
+
 def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
     """What is missing before the first estimate. lacks: for a search of the map."""
     if engine.searching or (lacks is not None and engine.searches):
         return lacks or AlertId.SEARCHING
     if engine.last_error:
-        return AlertId.LOCALIZATION_FAILED
+        return _error(engine)
     return AlertId.WAITING_FOR_PRIOR if engine.frames_in > 0 else AlertId.WAITING_FOR_VIDEO
 
 

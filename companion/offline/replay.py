@@ -50,8 +50,9 @@ class ReplaySummary:
     rotation_deg: Array
 
     def agrees(self, tolerance_m: float) -> bool:
-        """Whether at least 95 per cent of what was accepted in flight is accepted again, and 95 per
-        cent of that within `tolerance_m` of where it was.
+        """Whether 95 % of the frames that were accepted in flight are accepted again, and the 95th
+        percentile of their position difference is at most `tolerance_m`. If none was accepted in
+        flight, none may be accepted now.
         """
         if self.accepted_recorded == 0:
             return self.accepted_replayed == 0

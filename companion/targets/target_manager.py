@@ -17,9 +17,9 @@ from companion.targets.pictures import RecentPictures
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.follow import FollowedPosition, Gray, ImageFollower
-from localizer.targets.limits import UNCONFIRMED
+from localizer.targets.limits import RefusalReason
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.targets.track import NO_MAP, TargetSettings, TargetTrack, projected
+from localizer.targets.track import TargetSettings, TargetTrack, projected
 from localizer.types import PoseEstimate, TargetFix, Visibility
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
@@ -185,7 +185,7 @@ class TargetManager:
         if fix is None:
             self.missed += 1
             self._report_alert(
-                alert(AlertId.TARGET_REFUSED, number=click.number, why=Name(track.refusal))
+                alert(AlertId.TARGET_REFUSED, number=click.number, why=Name(str(track.refusal)))
             )
             self._gone(name)
             return
@@ -216,7 +216,7 @@ class TargetManager:
             track = TargetTrack(name, self._settings, self._cast)
             life = _TargetState(track, 0, False, time_ns)
         fix = life.track.see(estimate, pixel)
-        if life.track.refusal != NO_MAP:
+        if _reason(life.track) is not RefusalReason.NO_MAP:
             self._lives[name] = life
         life.seen_ns = time_ns
         if fix is None:
@@ -311,7 +311,9 @@ class TargetManager:
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
             self._report_alert(
-                alert(AlertId.TARGET_NOT_LOCATED, number=_number(name), why=Name(track.refusal))
+                alert(
+                    AlertId.TARGET_NOT_LOCATED, number=_number(name), why=Name(str(track.refusal))
+                )
             )
             self.end((name,))
 
@@ -531,20 +533,21 @@ class TargetManager:
 
     def _doubt(self, name: str, life: _TargetState, time_ns: int) -> None:
         """Count what is not told, and why; the operator hears of one that he was told before."""
-        if life.track.refusal == NO_MAP:
+        reason = _reason(life.track)
+        if reason is RefusalReason.NO_MAP:
             self.missed += 1
-        if life.track.refusal in (NO_MAP, UNCONFIRMED):
+        if reason in (RefusalReason.NO_MAP, RefusalReason.UNCONFIRMED):
             return
         self.doubted += 1
         life.refusals += 1
         if life.refusals == 1:
-            _log.warning("target %s is not told: %s", name, life.track.refusal)
+            _log.warning("target %s is not reported: %s", name, life.track.refusal)
         life.refused_ns = life.refused_ns or time_ns
         is_silent = life.told_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
         if is_silent and time_ns - self._silence_said_ns >= _SAID_NS:
             self._silence_said_ns = time_ns
             self._report_alert(
-                alert(AlertId.TARGET_SILENT, name=Name(name), why=Name(life.track.refusal))
+                alert(AlertId.TARGET_SILENT, name=Name(name), why=Name(str(life.track.refusal)))
             )
 
     def _drift(self, click: Click) -> tuple[float, float]:
@@ -574,3 +577,8 @@ class TargetManager:
         if self.refused == 1:
             _log.warning("more than %d targets at a time: the newest are left out", _MAX_DETECTED)
         return False
+
+
+def _reason(track: TargetTrack) -> RefusalReason | None:
+    """Why the last sighting gave no fix; None where it gave one."""
+    return None if track.refusal is None else track.refusal.reason

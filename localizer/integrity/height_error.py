@@ -24,7 +24,7 @@ CANDIDATES_M = np.array([0.0, 0.3, 0.6, 1.2, 2.5, 5.0, 10.0])
 _NOISE_PX = np.array([0.1, 0.2, 0.4, 0.8, 1.2, 1.8, 2.6])  # of a patch, profiled
 _TEMPERED = 0.5  # of the log likelihood: patches are not wholly independent
 _KEPT = 0.9  # of what older ground said, at each new one: a village follows on fields
-_SURE_M = 0.05  # of a surface model: its prior falls by e at each
+_SURE_M = 0.065  # of a surface model: its prior falls by e at each
 
 
 def height_likelihood(

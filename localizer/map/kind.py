@@ -65,7 +65,7 @@ class MapKind:
         return self.heights == "surface"
 
     def line(self) -> str:
-        """What it is, in words."""
+        """One line: heights, resolution of the imagery, date and sensor."""
         parts = [
             HEIGHTS_HOLD[self.heights],
             f"imagery resolves {self.effective_resolution_m:.2f} m",

@@ -23,6 +23,7 @@ from localizer.relocalization.align import FrameShift, moved
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.patch import turned
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
+from localizer.relocalization.verdict import CREDIBLE
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking.sensor_fusion import (
@@ -202,7 +203,7 @@ class Verifier:
             reach = self.config.heading_reach * query.heading_sigma_rad
             if abs(heading) > reach + 3 * _HEADING_SIGMA_RAD:
                 return False
-        return log_odds(result) >= self.integrity.min_log_odds
+        return log_odds(result) >= CREDIBLE
 
 
 def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseConstraint]:

@@ -7,6 +7,7 @@ where the target was before, and in what the same rays met then.
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +26,33 @@ _ABOUT_M = 25.0  # around a place: what the map shows there tells a hole from a 
 _HOLE, _HOLE_M = 1.5, 20.0  # so much farther than all of it: no courtyard is, from a flying height
 _NEAR_M = 2.5
 _RING = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
-UNCONFIRMED = "not confirmed yet"
 _ASIDE = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
+
+
+class RefusalReason(enum.Enum):
+    """Why a sighting gives no fix."""
+
+    NO_MAP = "no map under it"
+    TOO_FAR = "{metres:.0f} m away"
+    HOLE = "the map has a hole there"
+    UNCERTAIN = "known to {metres:.0f} m only"
+    NOT_UNDER_PIXEL = "its place is not under its pixel"
+    OFF_MAP = "no map at its place"
+    OTHER_DEPTH = "not at the depth that is seen"
+    ELSEWHERE = "elsewhere than before"
+    MOVED = "moved {metres:.0f} m"
+    UNCONFIRMED = "not confirmed yet"
+
+
+@dataclass(frozen=True)
+class TargetRefusal:
+    """metres: the distance of `TOO_FAR` and `MOVED`, the sigma of `UNCERTAIN`."""
+
+    reason: RefusalReason
+    metres: float = 0.0
+
+    def __str__(self) -> str:
+        return self.reason.value.format(metres=self.metres)
 
 
 @dataclass
@@ -48,8 +74,8 @@ class LastPlace:
         self._leap: _Leap | None = None
         self._begun_ns = 0
 
-    def objection(self, fix: TargetFix, *, moves: bool) -> str:
-        """Why a place is not believed; empty for one that is, which is the last one from then on.
+    def objection(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
+        """Why a place is not believed; None for one that is, which is the last one from then on.
 
         A detector may give its name to another object: then the new place is told once it has been
         seen for as long as the old one was, 3 s at the most.
@@ -59,7 +85,7 @@ class LastPlace:
             return self._first(fix)
         if _reachable(last, fix, moves=moves):
             self.fix, self._leap = fix, None
-            return ""
+            return None
         leap = self._leap
         follows = (
             leap is not None
@@ -71,11 +97,11 @@ class LastPlace:
         self._leap = _Leap(leap.since_ns, fix)
         if time_ns - leap.since_ns >= min(_LEAP_NS, last.exposure_time_ns - self._begun_ns):
             self.fix, self._leap, self._begun_ns = fix, None, leap.since_ns
-            return ""
+            return None
         moved = float(np.linalg.norm(fix.position_world - last.position_world))
-        return f"moved {moved:.0f} m"
+        return TargetRefusal(RefusalReason.MOVED, moved)
 
-    def _first(self, fix: TargetFix) -> str:
+    def _first(self, fix: TargetFix) -> TargetRefusal | None:
         """Nothing was told yet: the first place is believed once sightings have agreed on it."""
         begun, time_ns = self._leap, fix.exposure_time_ns
         if begun is None:
@@ -83,12 +109,12 @@ class LastPlace:
         elif not _reachable(
             begun.newest, fix, moves=time_ns - begun.newest.exposure_time_ns <= _LEAP_NS
         ):
-            return "elsewhere than before"
+            return TargetRefusal(RefusalReason.ELSEWHERE)
         self._leap = _Leap(begun.since_ns, fix)
         if time_ns - begun.since_ns < self._confirm_ns:
-            return UNCONFIRMED
+            return TargetRefusal(RefusalReason.UNCONFIRMED)
         self.fix, self._leap, self._begun_ns = fix, None, begun.since_ns
-        return ""
+        return None
 
 
 def is_by_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:

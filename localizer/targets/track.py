@@ -15,8 +15,9 @@ from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import (
-    UNCONFIRMED,
     LastPlace,
+    RefusalReason,
+    TargetRefusal,
     is_at_seen_depth,
     is_by_hole,
     is_on_map,
@@ -39,7 +40,6 @@ _OUTLIERS = 3
 _REPROJECTED = 5.0  # sigmas of pixel and pose between a fix and the pixel that it was seen at
 _ENTERS_S = 0.5
 _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
-NO_MAP = "no map under it"
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class TargetSettings:
 
 
 class TargetTrack:
-    """One target over time; not thread-safe. refusal: why the last `see` told nothing."""
+    """One target over time; not thread-safe. refusal: why the last `see` gave no fix."""
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id = target_id
@@ -74,7 +74,7 @@ class TargetTrack:
         self._last = LastPlace(round(settings.confirm_s * 1e9))
         self._seen_ns = 0
         self._aim: Array = np.zeros((3, 3))
-        self.refusal = ""
+        self.refusal: TargetRefusal | None = None
 
     @property
     def moves(self) -> bool:
@@ -96,20 +96,20 @@ class TargetTrack:
     ) -> TargetFix | None:
         """Add the pixel of an accepted frame; None, and `refusal`, where nothing may be told."""
         settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
-        time_ns, self.refusal = estimate.exposure_time_ns, ""
+        time_ns, self.refusal = estimate.exposure_time_ns, None
         eye, d = ray_in_world(estimate, pixel)
         surfaces = locate(
             estimate, pixel, self._cast, sigma, settings.map_sigma_m, drift,
             settings.outline_sigma_m,
         )  # fmt: skip
         if not surfaces:
-            return self._refuse(NO_MAP)
+            return self._refuse(TargetRefusal(RefusalReason.NO_MAP))
         distance = float(np.linalg.norm(surfaces[0].position - eye))
         if distance > settings.max_range_m:
-            return self._refuse(f"{distance:.0f} m away")
+            return self._refuse(TargetRefusal(RefusalReason.TOO_FAR, distance))
         if self._last.fix is None and is_by_hole(eye, d, distance, self._cast):
             self._begin_anew()
-            return self._refuse("the map has a hole there")
+            return self._refuse(TargetRefusal(RefusalReason.HOLE))
         if any(drift):
             self._aim = _aim(estimate, pixel, sigma, drift, surfaces[0])
         if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
@@ -129,12 +129,12 @@ class TargetTrack:
             self._moves = velocity is None or float(np.hypot(*velocity[:2])) > _STANDS_MPS
         fix = moving if self._moves else self._standing(estimate, pixel) if fits else None
         if fix is None:
-            return self._refuse("elsewhere than before")
+            return self._refuse(TargetRefusal(RefusalReason.ELSEWHERE))
         if self._moves:
             bias = settings.bias.covariance(fix.position_world - eye)
             fix = replace(fix, covariance=fix.covariance + bias + self._aim)
         why = self._objection(fix, ray, surfaces)
-        if why and self._last.fix is None and why != UNCONFIRMED:
+        if why and self._last.fix is None and why.reason is not RefusalReason.UNCONFIRMED:
             # Nothing was told yet, so nothing speaks for what was seen before rather than for this.
             self._begin_anew()
             self._static.update(ray, surfaces)
@@ -232,8 +232,8 @@ class TargetTrack:
 
     def _objection(
         self, fix: TargetFix, ray: SightedRay, surfaces: tuple[TargetSurface, ...]
-    ) -> str:
-        """Why this may not be told; empty if it may.
+    ) -> TargetRefusal | None:
+        """Why this may not be reported; None if it may.
 
         A fix lies under the pixel that it was seen at, at a depth that its frame shows, on the map,
         is known to some metres, and is no farther from the last one than both errors and a
@@ -241,21 +241,21 @@ class TargetTrack:
         """
         P, sigma = fix.covariance, float(np.sqrt(np.trace(fix.covariance)))
         if not np.isfinite(sigma) or sigma > self._settings.max_sigma_m:
-            return f"known to {sigma:.0f} m only"
+            return TargetRefusal(RefusalReason.UNCERTAIN, sigma)
         away = fix.position_world - ray.eye
         distance = float(np.linalg.norm(away))
         S = ray.spread.sideways
         r = S @ (away / distance - ray.direction)
         C = ray.spread.covariance + S @ P @ S.T / distance**2
         if float(r @ np.linalg.solve(C, r)) > _REPROJECTED**2:
-            return "its place is not under its pixel"
+            return TargetRefusal(RefusalReason.NOT_UNDER_PIXEL)
         if not is_on_map(fix, self._cast):
-            return "no map at its place"
+            return TargetRefusal(RefusalReason.OFF_MAP)
         if not is_at_seen_depth(fix, ray.eye, ray.direction, surfaces):
-            return "not at the depth that is seen"
+            return TargetRefusal(RefusalReason.OTHER_DEPTH)
         return self._last.objection(fix, moves=self._moves)
 
-    def _refuse(self, why: str) -> TargetFix | None:
+    def _refuse(self, why: TargetRefusal) -> TargetFix | None:
         self.refusal = why
         return None
 

@@ -152,10 +152,10 @@ class DualThreadEngine:
             try:
                 once()
             except LocalizerError as error:
-                self._book.report(str(error))
+                self._book.report(error)
             except Exception as error:  # the flight goes on: degrade, report, try the next frame
                 _log.exception("unexpected error on the %s thread", threading.current_thread().name)
-                self._book.report(f"unexpected {type(error).__name__}: {error}")
+                self._book.report(error)
 
     def _search_once(self) -> None:
         """Search for the newest frame's place, as long as nobody knows it."""

@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
+from localizer.errors import LocalizerError, MapLoadingError
 from localizer.tracking.attitude_bias import AttitudeBias
 
 _log = logging.getLogger(__name__)
@@ -16,7 +17,8 @@ _REPORT_EVERY_S = 5.0
 @dataclass(frozen=True)
 class EngineHealth:
     """Counters since the start, the text of the error that stands ("" when none does), and which
-    renderer, feature network and optimizer serve. searches, found: of places without a prior;
+    renderer, feature network and optimizer serve. map_loading: that error is that tiles are still
+    being read. searches, found: of places without a prior;
     searching: whether one is under way; search_hangs: for so long that none will answer.
     horizon_off_deg: what autopilot and gimbal are off by in pitch and roll, and the sigma of their
     attitude once that is taken out; None where it is not used.
@@ -33,6 +35,7 @@ class EngineHealth:
     searching: bool = False
     search_hangs: bool = False
     last_error: str = ""
+    map_loading: bool = False
     renderer: str = ""
     features: str = ""
     optimizer: str = ""
@@ -44,7 +47,7 @@ class HealthBook:
 
     def __init__(self, renderer: str, features: str) -> None:
         self._health = EngineHealth(renderer=renderer, features=features)
-        self._errors: dict[str, str] = {}  # by thread
+        self._errors: dict[str, Exception] = {}  # by thread
         self._reported_s = -_REPORT_EVERY_S
         self._lock = threading.Lock()
 
@@ -53,12 +56,14 @@ class HealthBook:
     ) -> EngineHealth:
         """A snapshot, with what only the engine knows."""
         with self._lock:
+            error = next(iter(self._errors.values()), None)
             return replace(
                 self._health,
                 frames_dropped=frames_dropped,
                 optimizer=optimizer,
                 horizon_off_deg=None if bias is None else bias.reported_deg,
-                last_error=next(iter(self._errors.values()), ""),
+                last_error="" if error is None else _text(error),
+                map_loading=isinstance(error, MapLoadingError),
             )
 
     def count(self, **increments: int) -> None:
@@ -80,17 +85,22 @@ class HealthBook:
         if news:
             _log.error("the search for a place does not answer: the flight goes on without it")
 
-    def report(self, text: str) -> None:
+    def report(self, error: Exception) -> None:
         """An error of this thread: it stands until the thread has done its work again."""
         with self._lock:
-            self._errors[threading.current_thread().name] = text
+            self._errors[threading.current_thread().name] = error
         self.count(errors=1)
         now = time.monotonic()
         if now - self._reported_s > _REPORT_EVERY_S:
             self._reported_s = now
-            _log.warning("%s", text)
+            _log.warning("%s", _text(error))
 
     def clear_error(self) -> None:
         """This thread has done its work: an error of its own is over, another thread's is not."""
         with self._lock:
             self._errors.pop(threading.current_thread().name, None)
+
+
+def _text(error: Exception) -> str:
+    known = isinstance(error, LocalizerError)
+    return str(error) if known else f"unexpected {type(error).__name__}: {error}"

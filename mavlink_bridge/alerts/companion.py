@@ -57,6 +57,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "the search ends", "a lost position is not found again", _SEARCH),
     condition(A.SEARCHING, INFO, "searching the map", {}, "no position is known yet",
               "the first fix", "the map is searched", _SEARCH),
+    condition(A.MAP_LOADING, INFO, "map being loaded", {}, "tiles in view are being read",
+              "an estimate comes", "there is no new position", "wait"),
     condition(A.WAITING_FOR_PRIOR, INFO, "waiting for a pose prior", {},
               "video comes and no position is known", "a pose prior comes",
               "localization has not started", _SEARCH),
@@ -107,7 +109,8 @@ HEALTH: tuple[AlertSpec, ...] = (
 )  # fmt: skip
 TARGETS: tuple[AlertSpec, ...] = (
     event(A.TARGET_FOUND, INFO, "target {number}: +-{metres:.1f} m", {"number": "", "metres": "m"},
-          "a click is located", "metres: one sigma", _NONE),
+          "a click is located",
+          "metres: horizontal error, one sigma (root of the sum of both axes)", _NONE),
     event(A.TARGET_REFUSED, WARNING, "target {number} refused: {why}", _NUMBER_WHY,
           "a click cannot be located", "no target begins", _CLICK),
     event(A.TARGET_UNREADABLE, WARNING, "target {number} refused: map unreadable?", _NUMBER,

@@ -30,7 +30,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "choose another bridge.injection.message", lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {}, "no GPS_GLOBAL_ORIGIN came",
               "GPS_GLOBAL_ORIGIN comes", "positions have no reference",
-              "set bridge.injection.origin", lead=_NOT_SENT),
+              "set the origin from the ground station; bridge.injection.origin is sent while "
+              "injecting", lead=_NOT_SENT),
     condition(A.EKF_ORIGIN_FAR, WARNING, "EKF origin {kilometres:.0f} km away",
               {"kilometres": "km"}, "the origin is over 100 km from the position",
               "the origin is within 100 km", "one of the two is wrong",

@@ -13,7 +13,8 @@ _STABILIZE = "fly in STABILIZE or ALT_HOLD until it clears; land if it lasts and
 INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VIDEO_FROZEN, ERROR, "video frozen", "video frozen {seconds:.0f} s",
               {"seconds": "s"},
-              "identical frames for 1.5 s, or no image motion while the vehicle moves",
+              "in flight: identical frames for 1.5 s, no image motion while the vehicle moves, or "
+              "none at all for some seconds of a hover",
               "frames change for 2 s",
               "the camera or its link shows an old frame; a position from it stands still",
               _STABILIZE, action=OutputAction.EXCLUDE_AND_RESET, clear_s=2.0),
@@ -23,10 +24,11 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               _STABILIZE, action=OutputAction.EXCLUDE_AND_RESET, clear_s=5.0),
     AlertSpec(A.LOW_CONTRAST, WARNING, "low image contrast",
               "low image contrast {gray:.1f}: dark or haze", {"gray": "gray levels"},
-              "local contrast of the frames is below 2.0 gray levels of 255 for 2 s",
+              "in flight: local contrast of the frames is below 2.0 gray levels of 255 for 2 s",
               "it is above for 5 s",
               "darkness, haze or ground without structure; frames will be refused if it gets worse",
-              "fly home, or select GNSS while it is good; let the camera expose longer",
+              "fly home, or switch the EKF source set to GNSS while it is good; let the camera "
+              "expose longer",
               raise_s=2.0, clear_s=5.0, repeat_s=60.0),
     AlertSpec(A.VISION_IMU_MISMATCH, ERROR, "vision/IMU mismatch",
               "vision/IMU mismatch {metres:.0f} m", {"metres": "m"},

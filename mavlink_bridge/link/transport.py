@@ -188,7 +188,7 @@ class UdpTransport:
         return silent_s >= patience_s
 
     def write(self, data: bytes) -> int:
-        """One datagram to the peer."""
+        """One datagram to the peer: its bytes; 0 where there is no peer or the socket refuses."""
         if self._remote is None:
             return 0
         try:

@@ -180,7 +180,7 @@ def plan_world(config: WorldConfig) -> WorldPlan:
     fields: dict[tuple[int, int, int], int] = {}
     for (i, j), zone in zones.items():
         _plan_cell(planner, config.rng(20, i + 500, j + 500), i, j, zone, zones, fields)
-    park_along_streets(planner, config.rng(14), zones)
+    park_along_streets(planner, config.rng(14))
     plant_street_trees(planner, config.rng(15))
     return _finish(planner)
 

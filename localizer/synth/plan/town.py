@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import Kind, rectangle
 from localizer.synth.paint.ground_plan import Material
-from localizer.synth.plan.plan import Zone
 from localizer.synth.plan.planner import (
     LAYER_GARDEN,
     LAYER_PATH,
@@ -279,10 +278,8 @@ def plan_park(planner: Planner, rng: np.random.Generator, i: int, j: int, outlin
     scatter_trees(planner, rng, outline, 95, 1.2)
 
 
-def park_along_streets(
-    planner: Planner, rng: np.random.Generator, zones: dict[tuple[int, int], Zone]
-) -> None:
-    """Parking places along the kerbs of main streets of the second rank."""
+def park_along_streets(planner: Planner, rng: np.random.Generator) -> None:
+    """Parking slots along one kerb of each side street (rank 1)."""
     for street in planner.net.streets:
         if street.rank != 1:
             continue

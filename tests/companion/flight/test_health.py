@@ -51,12 +51,12 @@ class FakeBridge:
 
 
 def _one_report(
-    folder, state, connected, tracking=None, frames_in=0, injection_fault=None, **options
+    folder, state, connected, tracking=None, injection_fault=None, engine=None, **options
 ):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
     bridge, events = FakeBridge(connected, injection_fault), []
     monitor = HealthMonitor(
-        lambda: EngineHealth(frames_in=frames_in), bridge, lambda: state,
+        lambda: engine or EngineHealth(), bridge, lambda: state,
         lambda *e: events.append(e), folder, HealthInputs(**options),
     )  # fmt: skip
     if tracking is not None:
@@ -97,10 +97,18 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, of):
     assert time.monotonic_ns() - written["time_ns"] < 60e9
 
 
-def test_what_is_waited_for_is_told(tmp_path):
+@pytest.mark.parametrize(
+    ("engine", "of"),
+    [
+        (EngineHealth(frames_in=3), AlertId.WAITING_FOR_PRIOR),
+        (EngineHealth(frames_in=3, last_error="x"), AlertId.LOCALIZATION_FAILED),
+        (EngineHealth(frames_in=3, last_error="x", map_loading=True), AlertId.MAP_LOADING),
+    ],
+)
+def test_what_is_waited_for_is_told(tmp_path, engine, of):
     """With pictures and no estimate it is the autopilot's position or attitude that is missing."""
-    told, _ = _one_report(tmp_path, StreamState.LIVE, True, frames_in=3)
-    assert told[-1] == (HealthLevel.STARTING, AlertId.WAITING_FOR_PRIOR)
+    told, _ = _one_report(tmp_path, StreamState.LIVE, True, engine=engine)
+    assert told[-1] == (HealthLevel.STARTING, of)
 
 
 def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):

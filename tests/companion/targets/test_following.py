@@ -8,6 +8,7 @@ from companion.targets import target_manager
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.targets.follow import FollowedPosition
+from localizer.targets.limits import RefusalReason, TargetRefusal
 from localizer.targets.track import TargetTrack, projected
 from localizer.types import Visibility
 from mavlink_bridge.alerts.catalogue import alert
@@ -364,7 +365,7 @@ def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeyp
 
     def refuses(track, estimate, pixel, **known):
         if 2_300 <= estimate.exposure_time_ns // MS < 2_300 + 1_000 * refused_s:
-            track.refusal = "no map at its place"
+            track.refusal = TargetRefusal(RefusalReason.OFF_MAP)
             return None
         return see(track, estimate, pixel, **known)
 

@@ -13,7 +13,13 @@ from companion.targets.target_manager import Click, TargetEstimate, TargetManage
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits
-from localizer.targets.limits import LastPlace, is_at_seen_depth, is_on_map
+from localizer.targets.limits import (
+    LastPlace,
+    RefusalReason,
+    TargetRefusal,
+    is_at_seen_depth,
+    is_on_map,
+)
 from localizer.targets.track import TargetSettings, TargetTrack, projected
 from localizer.types import (
     PoseEstimate,
@@ -168,14 +174,16 @@ def _fix(place, time_ns, sigma=1.0):
 def test_another_object_under_the_same_name_is_told_once_it_was_seen_for_as_long():
     last = LastPlace()
     for k in range(100):
-        assert last.objection(_fix([0, 0, 0], k * SECOND // 10), moves=False) == ""
+        assert last.objection(_fix([0, 0, 0], k * SECOND // 10), moves=False) is None
     refused = [
         k
         for k in range(100, 150)
         if last.objection(_fix([300, 0, 0], k * SECOND // 10), moves=False)
     ]
     assert refused == list(range(100, 130))
-    assert last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False) == "moved 300 m"
+    assert last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False) == TargetRefusal(
+        RefusalReason.MOVED, 300.0
+    )
 
 
 def test_what_is_in_the_air_or_beyond_the_map_is_on_no_map():

@@ -3,6 +3,7 @@
 import numpy as np
 
 from localizer.targets.filter import TargetFilter
+from localizer.targets.limits import RefusalReason, TargetRefusal
 from localizer.targets.track import TargetSettings, TargetTrack, projected
 from localizer.types import TargetSighting, TargetSurface
 from tests.companion.targets.scene import MS, cast, estimate, pose_at
@@ -61,7 +62,7 @@ def test_a_lone_sighting_elsewhere_is_refused_with_a_word():
         assert (fix is not None) == (k >= 3)  # at first it is not confirmed
         if k == 15:
             assert track.see(frame, (600.0, 20.0)) is None
-            assert "elsewhere" in track.refusal
+            assert track.refusal == TargetRefusal(RefusalReason.ELSEWHERE)
     np.testing.assert_allclose(fix.position_world, [-30.0, 20.0, 0.0], atol=0.1)
     assert fix.velocity is None
 
@@ -71,4 +72,4 @@ def test_what_is_known_to_tens_of_metres_only_is_refused():
     frame = estimate(pose_at(0.0), 0)
     track = TargetTrack("a", settings, cast)
     assert track.see(frame, (320.0, 240.0)) is None
-    assert "known to" in track.refusal
+    assert track.refusal.reason is RefusalReason.UNCERTAIN
