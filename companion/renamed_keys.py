@@ -31,6 +31,7 @@ REMOVED = {
     "bridge.signing.state_file": "state_dir is the folder of all that a restart reads",
     "bridge.ground_signing.state_file": "state_dir is the folder of all that a restart reads",
     "prior.state_file": "state_dir is the folder of all that a restart reads",
+    "bridge.switch.good_after_s": "a returning receiver is checked against vision",
     "bridge.camera.width_px": "it is camera.model.width",
     "bridge.camera.height_px": "it is camera.model.height",
     "bridge.camera.horizontal_fov_deg": "it follows from camera.model",

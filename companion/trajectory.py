@@ -17,6 +17,8 @@ from localizer.geometry.trajectory import (
 )
 from localizer.types import PoseEstimate
 
+TRAJECTORY_NAMES = ("poses.txt", "trajectory.tum", "covariances.csv")
+
 
 def stamped(name: str, estimate: PoseEstimate) -> StampedPose:
     """An estimate as a trajectory's pose."""
@@ -41,7 +43,7 @@ class TrajectoryFiles:
         with contextlib.ExitStack() as stack:
             self._poses, self._tum, self._covariances = (
                 stack.enter_context((folder / name).open("w", newline="", encoding="utf-8"))
-                for name in ("poses.txt", "trajectory.tum", "covariances.csv")
+                for name in TRAJECTORY_NAMES
             )
             self._rows = csv.writer(self._covariances)
             self._rows.writerow(COVARIANCE_COLUMNS)

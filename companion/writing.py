@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from companion.errors import ReportError
+from localizer.map.cache.cache import MANIFEST_NAME
 from mavlink_bridge.atomic_file import replace_file
 
 _BY_UMASK = 0o666
@@ -31,6 +32,25 @@ def made_folder(path: Path, option: str = "") -> Path:
     with writing(path, option):
         path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def result_file(path: Path, option: str, suffixes: tuple[str, ...], *inputs: Path | None) -> Path:
+    """A file that may be written, or replaced, with a result. `ReportError` where it has another
+    suffix, is one of the inputs, or lies in a tile cache.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise ReportError(f"{option} {path}: give a file that ends in {' or '.join(suffixes)}")
+    refuse_input(path, option, *inputs)
+    if (path.parent / MANIFEST_NAME).is_file():
+        raise ReportError(f"{option} {path}: lies in a tile cache; give a file beside it")
+    return path
+
+
+def refuse_input(path: Path, option: str, *inputs: Path | None) -> None:
+    """`ReportError` where a file to be written is one that was given to be read."""
+    for given in inputs:
+        if given is not None and path.exists() and given.exists() and path.samefile(given):
+            raise ReportError(f"{option}: would replace {given}, which is read; give another one")
 
 
 class NewestFile:

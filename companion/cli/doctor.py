@@ -21,6 +21,7 @@ from rich.text import Text
 from companion.config import load_config
 from companion.terminal.steps import shown_steps, shown_work
 from companion.versions import made_by
+from companion.writing import result_file
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 
@@ -42,6 +43,8 @@ def doctor_command(
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
     settings = load_config(config)
+    if page is not None:
+        result_file(page, "--page", (".html",), config, plan)
     vehicle, feed = vehicle and not beside_flight, not beside_flight
     console = Console()
     with shown_steps(Console(stderr=True)) as say:

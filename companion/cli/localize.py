@@ -23,8 +23,8 @@ from companion.offline.localize import (
 )
 from companion.sources.folder_source import list_images
 from companion.terminal.steps import COMPILES, shown_count, tally
-from companion.trajectory import stamped, write_trajectory
-from companion.writing import made_folder, writing
+from companion.trajectory import TRAJECTORY_NAMES, stamped, write_trajectory
+from companion.writing import made_folder, refuse_input, writing
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -107,6 +107,8 @@ def localize_command(
     if paths[0].name not in {row.name for row in rows}:
         raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")
     made_folder(out, "--out")
+    for name in (*TRAJECTORY_NAMES, "images.csv"):
+        refuse_input(out / name, "--out", priors, camera, *paths)
     sigmas = Sigmas(prior_sigma_m, prior_sigma_deg, attitude_sigma_deg, height_sigma_m)
     config = sigmas.config(
         LocalizerConfig(

@@ -15,7 +15,7 @@ from rich.table import Table
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
 from companion.terminal.steps import READING, shown_count, shown_work
-from companion.writing import writing
+from companion.writing import result_file, writing
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -159,8 +159,11 @@ def info(
     kml: Annotated[Path | None, typer.Option(help="file for the map's outline")] = None,
 ) -> None:
     """Coverage, heights, texel size, levels and sizes."""
-    outlines = [file for file in (geojson, kml) if file is not None]
-    _require_place(*outlines)
+    _require_place(*(file for file in (geojson, kml) if file is not None))
+    if geojson is not None:
+        result_file(geojson, "--geojson", (".geojson", ".json"))
+    if kml is not None:
+        result_file(kml, "--kml", (".kml",))
     from localizer.geometry.antimeridian import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache

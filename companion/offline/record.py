@@ -226,6 +226,11 @@ def load_record(
     the record's own.
     """
     tables = read_record(folder)
+    if not tables.manifest:
+        raise RecordError(
+            f"{folder / MANIFEST_NAME}: is missing or damaged; copy the record whole from the "
+            "companion's disk"
+        )
     try:
         config = parse_config(tables.settings, str(folder / MANIFEST_NAME))
     except ConfigError as error:
@@ -301,6 +306,8 @@ def _table(path: Path, text: tuple[str, ...]) -> Columns:
     if path.name != "estimates.csv" and not path.exists():
         return {}
     columns = read_columns(path, text)
+    if path.name == "estimates.csv" and path.stat().st_size == 0:
+        raise RecordError(f"{path}: is empty, without its header; copy the record again")
     missing = [name for name in _NEEDED[path.name] if name not in columns]
     if columns and missing:
         raise RecordError(f"{path}: not a table of a record: no column {missing[0]}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,6 +14,7 @@ from typing import Any
 from pymavlink import DFReader
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.errors import FootageError
 from companion.recorded.log_messages import (
     Dated,
     autopilot,
@@ -24,6 +27,7 @@ from companion.recorded.log_messages import (
     receiver_message,
 )
 
+_HEAD = b"\xa3\x95"  # of every message
 _SECOND_NS = 1_000_000_000
 _ARMED, _DISARMED = 10, 11  # EV
 _ARMED_FLAG = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
@@ -31,12 +35,20 @@ _KINDS = {"ArduCopter": 2, "ArduPlane": 1, "ArduRover": 10, "ArduSub": 12}  # MA
 
 
 def dataflash_messages(path: Path) -> Iterator[Dated]:
-    """Of a .bin or .log. Errors are those of pymavlink's reader, which has none of its own."""
-    reader: Any = (
-        DFReader.DFReader_text(str(path))
-        if path.suffix.lower() == ".log"
-        else DFReader.DFReader_binary(str(path))
-    )
+    """Of a .bin or .log. `FootageError` where it is none; other errors are those of pymavlink's
+    reader, which has none of its own.
+    """
+    is_text = path.suffix.lower() == ".log"
+    with path.open("rb") as file:
+        head = file.read(2)
+    if not is_text and head != _HEAD:
+        begins = f"begins with {head.hex(' ')}" if head else "is empty"
+        raise FootageError(f"{path}: {begins}, no DataFlash log; copy it from the card again")
+    # The reader prints a line for each byte that it skips.
+    with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stderr(nowhere):
+        reader: Any = (
+            DFReader.DFReader_text(str(path)) if is_text else DFReader.DFReader_binary(str(path))
+        )
     log = _Dataflash()
     while (row := reader.recv_match(type=list(_ROWS))) is not None:
         # The clock's base is UTC by the log's own GPS messages, or 0: seconds since boot.

@@ -286,8 +286,8 @@ def _with_log(
     notes.extend(log.notes)
     if any(f.time_ns is None for f in frames):
         raise FootageError(
-            f"{file}: the images have no times, so the log cannot be laid beside them; give "
-            "--places FILE with a column utc"
+            f"{file}: the images have no times, so the log cannot be laid beside them; use "
+            "photos whose tags say when they were taken, or a video"
         )
     reach = _reach_s(frames, log, file, utc=utc)
     found = find_offset(frames, camera, log.track, reach)
@@ -458,6 +458,6 @@ def _video_camera(
             camera, _VIDEO_FOCAL_PERCENT, f"35 mm equivalent in the subtitles, {focal_35mm:g} mm"
         )
     raise FootageError(
-        f"{path}: nothing says the focal length; give the camera's model as --camera FILE or its "
-        "horizontal field of view as --fov DEGREES"
+        f"{path}: nothing says the focal length; give the camera's model (--camera FILE, or "
+        "camera.json beside it) or its horizontal field of view (--fov DEGREES)"
     )

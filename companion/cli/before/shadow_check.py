@@ -18,6 +18,7 @@ from rich.table import Table
 
 from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.steps import COMPILES, shown_count
+from companion.writing import result_file, writing
 
 if TYPE_CHECKING:
     from companion.config import CompanionConfig
@@ -52,6 +53,8 @@ def shadow_check_command(
     from localizer.map.cache.cache import TileCache
 
     TileCache.open(map_cache)  # what is missing is said before anything is computed
+    if report is not None:
+        result_file(report, "--json", (".json",), log, video, config, camera)
     console = Console(stderr=True)
     with tempfile.TemporaryDirectory(prefix="shadow-check-") as work:
         told = None if config is None else load_config(config)
@@ -72,7 +75,9 @@ def shadow_check_command(
                 flight, video, deployment, rate_hz, lambda s, total: count(round(s), round(total))
             )
     if report is not None:
-        report.write_text(json.dumps(asdict(found) | {"go": found.go}, indent=1), encoding="utf-8")
+        with writing(report, "--json"):
+            text = json.dumps(asdict(found) | {"go": found.go}, indent=1)
+            report.write_text(text, encoding="utf-8")
     _show(found)
     raise typer.Exit(0 if found.go else 1)
 

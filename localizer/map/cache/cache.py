@@ -277,6 +277,11 @@ def _decode_image(data: NDArray[np.uint8]) -> Image:
 def read_manifest(path: Path) -> Manifest:
     """What the cache folder `path` says about itself; `MapCacheError` as `TileCache.open`."""
     where = path / MANIFEST_NAME
+    if path.is_file():
+        raise MapCacheError(
+            f"{path}: is a file and no tile cache; build one from it with `companion map build "
+            f"{path} --out FOLDER`"
+        )
     if not where.is_file():
         raise MapCacheError(
             f"{path}: no tile cache here ({MANIFEST_NAME} is missing); make one with "
