@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tarfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
-from localizer.plain_files import plain_text
+from companion.offline.record import document
 
 MANIFEST = "record.json"
 _MOST = 200  # newest first
@@ -42,8 +41,8 @@ class Records:
         for path in self._folder.iterdir():
             if path.is_symlink() or not path.is_dir() or not (path / MANIFEST).is_file():
                 continue
-            started = _document(path / MANIFEST).get("utc_ns")
-            health = _document(path / "health.json")
+            started = document(path / MANIFEST).get("utc_ns")
+            health = document(path / "health.json")
             ended = str(health.get("text", "")) if health.get("level") == "ended" else "not ended"
             when = started if isinstance(started, int) else None
             found.append(RecordFolder(path.name, path, when, ended[:200]))
@@ -99,11 +98,3 @@ def _plain_files(folder: Path) -> Iterator[Path]:
             if count > _MOST_FILES:
                 return
             yield path
-
-
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(plain_text(path))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}

@@ -175,8 +175,7 @@ class RecordedEstimate:
 @dataclass(frozen=True)
 class FlightRecord:
     """A record that can be localized again. flight: its localized pictures, one for each of
-    `estimates`, on CLOCK_MONOTONIC, and its log;
-    a picture may be missing on the disk.
+    `estimates`, on CLOCK_MONOTONIC, and its log; a picture may be missing on the disk.
     """
 
     tables: RecordTables
@@ -206,7 +205,7 @@ def read_record(folder: Path) -> RecordTables:
         f"{name} is missing" for name in ("targets.csv", "events.csv")
         if not (folder / name).exists()
     ]  # fmt: skip
-    manifest, health = _document(folder / MANIFEST_NAME), _document(folder / "health.json")
+    manifest, health = document(folder / MANIFEST_NAME), document(folder / "health.json")
     if not manifest:
         notes.append(f"{MANIFEST_NAME} cannot be read: no settings, no map")
     if not estimates:
@@ -293,12 +292,12 @@ def _estimates(columns: Columns, path: Path) -> Iterator[RecordedEstimate]:
         )  # fmt: skip
 
 
-def _document(path: Path) -> dict[str, Any]:
+def document(path: Path) -> dict[str, Any]:
+    """A JSON file of a record; {} where it is missing or damaged."""
     try:
-        value = json.loads(plain_text(path))
+        return mapping(json.loads(plain_text(path)))
     except (OSError, ValueError, RecursionError):
         return {}
-    return value if isinstance(value, dict) else {}
 
 
 def _table(path: Path, text: tuple[str, ...]) -> Columns:
