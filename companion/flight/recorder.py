@@ -1,4 +1,4 @@
-"""The flight's record: estimates, targets and events as CSV, written on a thread of its own."""
+"""The flight's record: estimates, targets and events as CSV, written on its own thread."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ _COLUMNS = {"estimates": ESTIMATE_COLUMNS, "targets": TARGET_COLUMNS, "events": 
 
 
 def fresh_folder(folder: Path) -> Path:
-    """`folder`, or with a number behind it if it holds a record already: a restart in the air must
-    not overwrite the flight's first half.
+    """`folder`, or `folder` with a number if it already holds a record, so that a restart in flight
+    does not overwrite it.
     """
     candidate, number = folder, 2
     while (candidate / "estimates.csv").exists():
@@ -67,10 +67,10 @@ def fresh_folder(folder: Path) -> Path:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove the record of a start that failed: at most column names stand in it.
+    """Remove the record of a failed start, whose files hold at most column names.
 
     The start may have ended between any two of its steps, so none of this need exist.
-    """
+"""
     tables = [folder / name for name in ("estimates.csv", "targets.csv", "events.csv")]
     snapshots = folder / "snapshots"
     with contextlib.suppress(OSError):
@@ -84,10 +84,10 @@ def remove_empty(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, config: CompanionConfig) -> None:
-    """``record.json``: settings, the map's hash, versions and what time it was, on both clocks.
+    """Write ``record.json``: settings, the map's hash, versions, and the time on both clocks.
 
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
-    """
+"""
     monotonic_ns = time.monotonic_ns()
     document = {
         "monotonic_ns": monotonic_ns,
@@ -116,7 +116,7 @@ def _unwritable(folder: Path, error: OSError) -> ReportError:
 def _estimate_row(
     estimate: PoseEstimate, levels: tuple[float, float] | None, frame: LocalFrame
 ) -> tuple[Any, ...]:
-    """What stands in `ESTIMATE_COLUMNS` for an estimate."""
+    """The values of `ESTIMATE_COLUMNS` for an estimate."""
     pose = estimate.world_from_camera
     position = frame.position(pose.translation)
     sigma = estimate.covariance.diagonal() ** 0.5
@@ -137,7 +137,7 @@ def _estimate_row(
 
 
 def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
-    """What stands in `TARGET_COLUMNS` for a target's fix."""
+    """The values of `TARGET_COLUMNS` for a target's fix."""
     position = frame.position(fix.position_world)
     horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
     return (
@@ -152,7 +152,7 @@ def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
 
 
 class RecordStream(Protocol):
-    """A second form of the record, written along with the tables (`companion.export`)."""
+    """A second format of the record, written beside the tables (`companion.export`)."""
 
     def row(self, table: str, row: Mapping[str, Any]) -> None:
         """A row of that table, by its columns."""
@@ -167,7 +167,7 @@ class RecordStream(Protocol):
         ...
 
     def flush(self) -> None:
-        """Hand what is written to the operating system."""
+        """Flush to the operating system."""
         ...
 
     def close(self) -> None:
@@ -235,20 +235,20 @@ class Recorder:
         self._put("targets", lambda: _target_row(fix, self._frame))
 
     def event(self, level: str, text: str, alert: str = "") -> None:
-        """Record something that happened, at the current time. alert: its identifier, if any."""
+        """Record an event at the current time. alert: its identifier, if any."""
         row = (time.monotonic_ns(), level, text, alert)
         self._put("events", lambda: row)
 
     def text(self, severity: int, text: str, sender: str) -> None:
-        """Record a line of MAVLink text, now; the tables have the companion's own as events, the
-        stream takes all of them.
+        """Record a MAVLink text, now. The tables hold the companion's own texts as events; the
+        stream holds all texts.
         """
         if self._stream is not None:
             row = (text, severity, sender, time.monotonic_ns())
             self._put("text", lambda: row)
 
     def snapshot(self, frame: Frame) -> None:
-        """Keep the frame's image, named by its exposure time, if it is time for one."""
+        """Keep the frame's image, named by its exposure time, if the interval has passed."""
         if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
             self._next_snapshot_ns = frame.exposure_time_ns + self._interval_ns
             with self._pictures_lock:
@@ -261,8 +261,8 @@ class Recorder:
                 self._written(frame)
 
     def close(self) -> bool:
-        """Write what is queued and close the files. False: the disk stands still, and is left
-        behind.
+        """Write the queue and close the files. Returns False if the disk hangs; it is not waited
+        for.
         """
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
@@ -282,7 +282,7 @@ class Recorder:
         return writer
 
     def _put(self, name: str, row: Callable[[], Iterable[Any]]) -> bool:
-        """Queue what makes a row: its coordinates and figures are the recorder's thread's work."""
+        """Queue the data of a row; the recorder's thread computes coordinates and figures."""
         try:
             self._rows.put_nowait((name, row))
         except queue.Full:
@@ -354,7 +354,9 @@ class Recorder:
 
 
 def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | None:
-    """Open ``record.mcap``. None, with a warning, if that fails: the tables hold the record."""
+    """Open ``record.mcap``. Returns None, with a warning, if that fails: the tables are still
+    written.
+    """
     try:
         from companion.export.mcap_file import McapFile
 
@@ -369,10 +371,10 @@ def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | 
 
 
 class RecordKeeper:
-    """The record of one process, if the disk takes one (this may be a restart in the air).
+    """The record of one process, if the disk allows one. A start may be a restart in flight.
 
     say_incomplete: tells the operator why something is missing in it; from any thread.
-    """
+"""
 
     def __init__(self, frame: LocalFrame, say_incomplete: Callable[[str], None]) -> None:
         self._frame = frame
@@ -385,7 +387,7 @@ class RecordKeeper:
     def open(
         self, config: CompanionConfig, record: RecordConfig, claim: Callable[[Path], None]
     ) -> None:
-        """Begin a record in a folder of its own. claim: called with it before it is made."""
+        """Create a record in its own folder. claim: called with the folder before it is created."""
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
@@ -400,7 +402,7 @@ class RecordKeeper:
             raise
 
     def link(self) -> None:
-        """Let ``latest`` beside the record point to it, unless a record itself has that name."""
+        """Point the link ``latest`` beside the record to it, unless a record has that name."""
         if self.folder is None or self.folder.name.startswith(LATEST_NAME):
             return
         link = self.folder.parent / LATEST_NAME
@@ -415,7 +417,7 @@ class RecordKeeper:
             _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
-        """Write what is queued, close the files, and put the targets on maps."""
+        """Write the queue, close the files, and write the targets' map files."""
         answers = self.recorder is None or self.recorder.close()
         if self.folder is not None and answers:
             try:
@@ -424,6 +426,6 @@ class RecordKeeper:
                 _log.warning("no maps of the targets: %s", error)
 
     def failed(self, why: str) -> None:
-        """Something is missing in the record from now on."""
+        """Mark the record as incomplete."""
         self.is_complete = False
         self._say_incomplete(why)
