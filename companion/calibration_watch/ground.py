@@ -35,7 +35,7 @@ class GroundView:
         """Height above the ground, the largest of the known ones; None if none is known.
 
         now_ns: of what it is asked for; ground that was seen long before says nothing of it.
-"""
+        """
         relative_m, newest = state.altitude_relative_m, self._newest
         known = [] if relative_m is None or relative_m < _BELOW_M else [max(relative_m, 0.0)]
         if newest is not None and now_ns - newest.time_ns < _LONG_AGO_NS:

@@ -80,7 +80,7 @@ def estimate(blocks: Array, bias_m: float) -> MapOffset:
 
     Blocks beyond three robust sigmas of the median are left out. bias_m: sigma of GNSS's own
     error, per axis, which no averaging takes away.
-"""
+    """
     middle = np.median(blocks, axis=0)
     spread = 1.4826 * np.median(np.abs(blocks - middle), axis=0)
     kept = np.all(np.abs(blocks - middle) <= _OUTLIER * np.maximum(spread, 0.2), axis=1)
@@ -99,7 +99,7 @@ class MapOffsetEstimator:
     It comes before the other judges, so that they compare with GNSS what is injected. It keeps its
     estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the vehicle's receiver
     is our own GPS_INPUT, which shows nothing.
-"""
+    """
 
     def __init__(
         self,

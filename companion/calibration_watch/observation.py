@@ -17,7 +17,7 @@ class CalibrationObservation:
     place: latitude, longitude (degrees) and height above the ellipsoid (m) of the vehicle;
     sigma_m: horizontal, 1 sigma. ned_from_camera: (3, 3), OpenCV axes. depth_m: of the ground along
     the optical axis, as the map is seen from there. horizontal_fov_deg: of this picture's zoom.
-"""
+    """
 
     time_ns: int
     place: tuple[float, float, float]
@@ -34,7 +34,7 @@ class AutopilotObservation:
     ned_from_camera: (3, 3) by gimbal and attitude; turn: its rotation vector (3,) over a second,
     NED, rad. north_east_m: of the EKF on GNSS, from the sighting's place. gnss_height_m,
     pressure_height_m: only their changes count.
-"""
+    """
 
     ned_from_camera: Array | None
     turn: Array | None

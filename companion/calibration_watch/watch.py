@@ -137,7 +137,7 @@ class CalibrationWatch:
 
         A gimbal's angles may be late themselves. A camera without gimbal turns with the autopilot's
         own attitude: there the surer account counts, if the other does not speak against it.
-"""
+        """
         if self._doubted_ns is not None:
             return CalibrationEstimate(0.0, math.inf)
         way, turns = self._position.late_s, self._attitude.late_s
@@ -251,7 +251,8 @@ def _camera(gimbal: GimbalAttitude | None) -> Array | None:
 def _gnss_offset(
     seen: CalibrationObservation, state: VehicleState, place: tuple[float, ...] | None
 ) -> tuple[float, float] | None:
-    """North and east offset of the EKF from the observation, if the EKF agrees with the receiver.
+    """North and east offset of the EKF from the observation, if the EKF agrees with the
+    receiver.
     """
     if place is None or state.gps_latitude_deg is None or state.gps_longitude_deg is None:
         return None

@@ -78,7 +78,7 @@ class Companion:
 
         Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
         behind would keep the process from ending.
-"""
+        """
         sys.setswitchinterval(_SWITCH_S)
         self._parts.channels.events.subscribe(_log_event)
         lost = ""
@@ -132,7 +132,7 @@ class Companion:
         """End `run` soon, in order. Returns False during the start, which continues.
 
         For a signal handler: it takes no lock, since what it interrupts may hold that one.
-"""
+        """
         self._is_stopping = True
         return self._is_up
 

@@ -24,7 +24,7 @@ class Component(Generic[T]):
 
     close and stop are called only for what was made and started. What a part needs is looked up by
     its class in `BuildContext`, and nothing else is found there.
-"""
+    """
 
     name: str
     kind: type[T]
@@ -113,7 +113,7 @@ class Assembly:
         """Build every component that is not built yet; `up` closes them in reverse.
 
         ahead: only what a standby makes.
-"""
+        """
         for part in self._parts:
             if part.kind in self._made or (ahead and not part.ahead):
                 continue

@@ -83,7 +83,7 @@ class HealthMonitor:
     """Assesses all components, reports changes, and writes ``health.json``.
 
     Above 200 lines: every condition that can be true is ranked here, in one place.
-"""
+    """
 
     def __init__(
         self,
@@ -242,7 +242,7 @@ class HealthMonitor:
 
         Not whether the map is being searched: that begins and ends every few seconds, and each time
         the loss would be reported again (`engine.searching` in health.json has it).
-"""
+        """
         fix_ns = estimate.last_fix_ns
         since_s = 0.0 if fix_ns is None else (time.monotonic_ns() - fix_ns) * 1e-9
         alerts = [alert(AlertId.LOST, seconds=since_s)]
@@ -320,7 +320,8 @@ def _error(engine: EngineHealth) -> AlertId:
 
 
 def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
-    """Alert that says what is missing before the first estimate. lacks: why no search is possible.
+    """Alert that says what is missing before the first estimate. lacks: why no search
+    is possible.
     """
     if engine.searching or (lacks is not None and engine.searches):
         return lacks or AlertId.SEARCHING
@@ -333,7 +334,7 @@ def _of_state(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
     """Alert of the tracking state. BRIDGING: duration and 95 % bound of the error.
 
     A second or two of it is no news: a shadow of a cloud, a car that fills the frame.
-"""
+    """
     if estimate.state is TrackingState.LOST:
         return HealthLevel.FAILED, alert(AlertId.LOST, seconds=0.0)
     if estimate.state is not TrackingState.BRIDGING:

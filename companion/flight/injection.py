@@ -41,7 +41,7 @@ class JumpCounter:
 
     DEGRADED keeps the filter's track: only a new start after LOST is a jump, as the first is, and
     the map found again after BRIDGING, whose drift it ends.
-"""
+    """
 
     def __init__(self) -> None:
         self.count = 1
@@ -61,7 +61,7 @@ class FixInjection:
     Runs on the localization thread, and converts there: 0.12 ms in the median (two geodetic
     conversions and two rotations, no look at the map), no more than waking another thread would
     take, and a fix's age counts.
-"""
+    """
 
     def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:
         self._bridge = bridge

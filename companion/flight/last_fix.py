@@ -128,7 +128,7 @@ class FixMemory:
     trusted: whether nobody withholds fixes now; state: what the vehicle says about itself.
     Thread-safe: estimates come on the localization thread, which only leaves them here; the file is
     written on a thread of its own.
-"""
+    """
 
     def __init__(
         self,

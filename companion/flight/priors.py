@@ -1,4 +1,5 @@
-"""Pose priors from the autopilot and other sources, for the start and for the search after a loss.
+"""Pose priors from the autopilot and other sources, for the start and for the search
+after a loss.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class AutopilotSource(Protocol):
 
 
 def drift_sigma_m(seconds: float) -> float:
-    """Horizontal sigma of an EKF's position, so many seconds after its last absolute measurement.
+    """Horizontal sigma of an EKF's position, so many seconds after its last absolute
+    measurement.
     """
     return min(SENSORS.ekf_drift.sigma_m(seconds), _LARGEST_SIGMA_M)
 
@@ -92,7 +94,7 @@ class PositionBelief:
     """Estimates the quality of the EKF's position at any time from GNSS and our own fixes.
 
     Thread-safe: estimates come on the localization thread, states from the bridge's.
-"""
+    """
 
     def __init__(self, config: PriorConfig) -> None:
         self._base_m = config.position_sigma_m
@@ -142,7 +144,7 @@ class AutopilotPose:
     on_gnss: whether GNSS, if healthy, makes the autopilot's position, None where nobody knows: then
     it does where the receiver says the same place. One that was led by our own fixes is none to
     begin from, whatever a receiver says beside it that is not followed.
-"""
+    """
 
     def __init__(
         self,
@@ -161,7 +163,7 @@ class AutopilotPose:
 
         reaches_ekf: whether positions go to it. One in shadow, or withheld, holds no EKF in place:
         taken for one that does, it would let the search look too near where a drifted EKF is.
-"""
+        """
         if estimate.accepted and reaches_ekf:
             self.belief.note_fix(estimate.exposure_time_ns)
 
@@ -229,8 +231,7 @@ class AutopilotPose:
         return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
-        """The camera's rotation (3, 3) in the map's axes, from the autopilot's attitude and gimbal.
-        """
+        """The camera's rotation (3, 3) in the map's axes, from the autopilot's attitude and gimbal."""
         gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
 
@@ -239,7 +240,7 @@ class AutopilotPose:
 
         Inertial as long as none of our fixes goes to the EKF: while a place is on trial. The map
         origin's axes stand for the vehicle's, 0.1° at 10 km.
-"""
+        """
         state = self._autopilot.state()
         if state.ekf_flags & _CONST_POSITION or not state.ekf_flags & _HORIZONTAL:
             return None

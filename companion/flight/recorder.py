@@ -70,7 +70,7 @@ def remove_empty(folder: Path) -> None:
     """Remove the record of a failed start, whose files hold at most column names.
 
     The start may have ended between any two of its steps, so none of this need exist.
-"""
+    """
     tables = [folder / name for name in ("estimates.csv", "targets.csv", "events.csv")]
     snapshots = folder / "snapshots"
     with contextlib.suppress(OSError):
@@ -87,7 +87,7 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
     """Write ``record.json``: settings, the map's hash, versions, and the time on both clocks.
 
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
-"""
+    """
     monotonic_ns = time.monotonic_ns()
     document = {
         "monotonic_ns": monotonic_ns,
@@ -374,7 +374,7 @@ class RecordKeeper:
     """The record of one process, if the disk allows one. A start may be a restart in flight.
 
     say_incomplete: tells the operator why something is missing in it; from any thread.
-"""
+    """
 
     def __init__(self, frame: LocalFrame, say_incomplete: Callable[[str], None]) -> None:
         self._frame = frame

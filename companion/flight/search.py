@@ -79,7 +79,7 @@ class RelocalizationHypothesis:
         """A later frame's query, limited to where the camera can be; None after too long.
 
         velocity: (3,) m/s in the map's axes by the EKF, None where it knows none; reach: as then.
-"""
+        """
         elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
         if not 0.0 < elapsed_s <= _LONGEST_S:
             return None
@@ -119,8 +119,8 @@ class RelocalizationHypothesis:
 
 
 def _on_plane(query: PlaceQuery) -> PlaceQuery:
-    """Height above the plane through the map's origin, which is 8 m above the Earth in 10 km. Zero
-    correction where the position is unknown.
+    """The query with its height above the tangent plane at the map's origin, which is 8 m above the
+    Earth's surface at 10 km; unchanged if the region is unknown.
     """
     if query.region is None:
         return query
@@ -155,7 +155,7 @@ class PlaceSearch:
     The map's overview is opened (or, the first time, computed) on a thread of its own, so that
     neither the start nor a search waits for it. reach: where the camera can be at a time since the
     map last said where it was, asked where the autopilot knows no position.
-"""
+    """
 
     def __init__(
         self,
@@ -197,7 +197,8 @@ class PlaceSearch:
             self._open = None
 
     def hint(self, east_m: float, north_m: float, radius_m: float) -> None:
-        """Set the operator's position, map frame: the next searches look there. It is never a fix.
+        """Set the operator's position, map frame: the next searches look there. It is
+        never a fix.
         """
         self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
 

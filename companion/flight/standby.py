@@ -25,7 +25,7 @@ def ready(
 
     pulse, again, lost_settings: see `Companion`; a standby flies after another died, and so always
     again.
-"""
+    """
     companion = Companion(
         config, pulse=pulse, restart=restart or standby, lost_settings=lost_settings
     )
@@ -36,7 +36,7 @@ def _stand_by(companion: Companion) -> Companion | None:
     """Prepare what takes long, then wait for a line on standard input.
 
     None where it ends without one: the supervisor is gone. Neither link nor feed is opened before.
-"""
+    """
     try:
         companion.prepare()
     except (CompanionError, LocalizerError, OSError) as error:  # the flight will say so, then

@@ -20,7 +20,7 @@ class ViewReporter:
     """Computes the ground point on its own thread, at most `rate_hz` times a second.
 
     look: takes the view; must not block.
-"""
+    """
 
     def __init__(
         self,

@@ -63,7 +63,7 @@ class IntegrityChecks:
     """Call every method under one lock, or from one thread.
 
     Above 200 lines: each check has a few lines here that hand it its evidence and take its finding.
-"""
+    """
 
     def __init__(
         self,
@@ -131,7 +131,8 @@ class IntegrityChecks:
 
     @property
     def _is_only_uncertain(self) -> bool:
-        """Whether the protection level alone holds the output, so that position changes are valid.
+        """Whether the protection level alone holds the output, so that position changes
+        are valid.
         """
         holding = {one.spec.id for one in self._active() if one.spec.action >= OutputAction.HOLD}
         return holding == {AlertId.HPL_OVER_LIMIT}
@@ -179,7 +180,7 @@ class IntegrityChecks:
 
         attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
         reason against it.
-"""
+        """
         self._tilt.add(fix, attitude)
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
@@ -343,7 +344,7 @@ class IntegrityChecks:
         """Whether the EKF moved by metres during a frozen frame; unknown in a hover.
 
         The EKF keeps its speed at first: it follows a frozen position after a second or two.
-"""
+        """
         if state.local_velocity_ned is None or verdict.still_s < _MOVED_LEAST_S:
             return False
         speed = math.hypot(*state.local_velocity_ned[:2])

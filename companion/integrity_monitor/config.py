@@ -39,7 +39,7 @@ class ProtectionConfig(StrictModel):
 
     The covariance holds what `localizer.calibration` states of the camera. Where that is the result
     of a calibration, little is left beside it; else it is a guess, and the camera may be worse.
-"""
+    """
 
     risk: float = Field(
         default=1e-3, gt=0.0, le=0.1, description="probability of an error beyond the level"

@@ -34,7 +34,7 @@ class EkfWatch:
 
         agrees: there is evidence that vision moves as the IMU does; no evidence is no agreement.
         On the ground an EKF begins with a jump: from its origin onto the first position.
-"""
+        """
         leap_m = self._leap(state)
         if not state.armed:
             self._unconfirmed_m = 0.0

@@ -63,7 +63,7 @@ class HeadingHistory:
 
         The gyros' heading suffers where ATTITUDE was lost in a turn, and the autopilot's own may
         step: only what both contradict is a turn.
-"""
+        """
         newest = self._newest()
         if len(newest) < _LEAST:
             return 0.0

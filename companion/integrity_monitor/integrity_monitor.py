@@ -154,7 +154,8 @@ class IntegrityMonitor:
 
     @contextmanager
     def _asked(self) -> Iterator[bool]:
-        """Acquire the monitor's lock; False after a time limit, so that the caller does not hang.
+        """Acquire the monitor's lock; False after a time limit, so that the caller does
+        not hang.
         """
         given = not self._hangs() and self._lock.acquire(timeout=_LOCK_S)
         try:

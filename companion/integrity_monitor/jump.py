@@ -109,7 +109,7 @@ class JumpCheck:
     Meanwhile the last one that passed is carried on by the EKF's velocity, which the held ones do
     not reach. A fix that comes to where it leads passes at once. What moves otherwise, or whose
     heading turned as neither gyros nor autopilot did, is not taken by waiting.
-"""
+    """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
         self._config = config
@@ -188,7 +188,7 @@ class JumpCheck:
 
         What gyros may have drifted grows: once a frame was seen to be turned, a fix is of the one
         whose heading is nearer.
-"""
+        """
         if self._passed is None or turn.time_ns - self._passed.fix.time_ns > _HEADING_S * 1e9:
             return False
         held = self._held
@@ -209,7 +209,8 @@ class JumpCheck:
         return held
 
     def _moves_otherwise(self, held: _Held, since_s: float) -> bool:
-        """Whether the held fixes move differently from the EKF's velocity, as in a rotated frame.
+        """Whether the held fixes move differently from the EKF's velocity, as in a
+        rotated frame.
         """
         led = self._reckoned(held.first, held.newest)
         if led is None:

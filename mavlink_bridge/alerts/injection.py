@@ -1,4 +1,4 @@
-"""Alerts about the positions that are sent, and what the EKF makes of them."""
+"""Alerts about the positions that are sent, and about the EKF's reaction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Alerts about the vehicle, its link and who else speaks on it."""
+"""Alerts about the vehicle, its link, and other senders on it."""
 
 from __future__ import annotations
 
