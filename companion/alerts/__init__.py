@@ -1,1 +1,1 @@
-"""What is made of the alert catalogue (`mavlink_bridge.alerts`): its reference page."""
+"""The reference page of the alert catalogue (`mavlink_bridge.alerts`)."""

@@ -625,7 +625,7 @@ def _state_file(config: CompanionConfig) -> Path | None:
 
 
 def _forbid_memory(config: CompanionConfig) -> InhibitMemory | None:
-    """Of this map and this camera: what was found of another says nothing."""
+    """File of inhibitions for this map and camera; those of another map or camera are ignored."""
     file = _state_file(config)
     if file is None:
         return None

@@ -191,8 +191,8 @@ class AutopilotPose:
         return altitude_m + self._extrinsics.geoid_separation_m - origin_m
 
     def clearance_m(self, time_ns: int) -> float | None:
-        """The vehicle's height above what lies below it, by its rangefinder; None without a reading
-        of about that CLOCK_MONOTONIC time, or where the vehicle leans too much for it to look down.
+        """Height above the ground by the rangefinder, m; None without a reading at about that
+        CLOCK_MONOTONIC time, or if the vehicle is tilted too much.
         """
         state, attitude = self._autopilot.state(), self._autopilot.attitude_at(time_ns)
         away_s = abs(time_ns - state.rangefinder_time_ns) * 1e-9
@@ -231,7 +231,9 @@ class AutopilotPose:
         return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
-        """The camera's rotation (3, 3) in the map's axes, from the autopilot's attitude and gimbal."""
+        """The camera's rotation (3, 3) in the map's axes, from the autopilot's attitude
+        and gimbal.
+        """
         gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
 

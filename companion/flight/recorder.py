@@ -171,7 +171,7 @@ class RecordStream(Protocol):
         ...
 
     def close(self) -> None:
-        """Finish it."""
+        """Write the rest and close the file."""
         ...
 
 
@@ -223,8 +223,8 @@ class Recorder:
         self._thread.start()
 
     def estimate(self, estimate: PoseEstimate, levels: tuple[float, float] | None = None) -> None:
-        """Record one estimate (accepted or not; the trajectory has the accepted ones). levels: its
-        protection levels, horizontal and vertical, m; None where none was computed.
+        """Record one estimate, accepted or not; the trajectory has the accepted ones. levels: its
+        horizontal and vertical protection levels, m; None if none was computed.
         """
         self._put("estimates", lambda: _estimate_row(estimate, levels, self._frame))
         if estimate.accepted:
