@@ -295,7 +295,23 @@ def test_our_own_stamps_begin_beyond_all_that_was_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("unset_clock")
-@pytest.mark.parametrize("content", ["", "[1]", '{"a": 1}', '{"1:2:3": null}', "\0\0"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[1]",
+        "\0\0",
+        "[" * 100_000,
+        '{"1:2:3": null}',
+        '{"1:1:1": 1e400}',
+        '{"1:1:1": 1000000000000000000000000000000}',  # our own begin beyond it, and none fits
+        '{"1:1:1": -5}',
+        '{"1:1:1": 3.7}',
+        '{"1:1:1": true}',
+        '{"1:1:1000": 5}',
+        '{"1:1": 5}',
+    ],
+)
 def test_a_damaged_state_is_told_and_begun_anew(
     tmp_path: Path, content: str, caplog: pytest.LogCaptureFixture
 ) -> None:

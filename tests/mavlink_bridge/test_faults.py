@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-import struct
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -32,12 +31,6 @@ def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
     it.run(15.0)
     assert len(it.vision()) > 50
     return it
-
-
-def silence(flight: Flight, seconds: float) -> None:
-    flight.link.open = False
-    flight.run(seconds)
-    flight.link.open = True
 
 
 def test_five_minutes_without_a_link(flight: Flight) -> None:
@@ -257,17 +250,6 @@ def test_what_counts_is_the_least_lag(
     assert len(flight.told(*LATE)) == texts
 
 
-@pytest.mark.parametrize("gps_id", [0, 1])
-def test_a_latency_text_names_the_receivers_own_delay(
-    monkeypatch: pytest.MonkeyPatch, gps_id: int
-) -> None:
-    """GPS_INPUT counts receivers from 0, ArduPilot's parameters from 1."""
-    injection = InjectionConfig(message="gps_input", gps_id=gps_id, rate_hz=10, delay_ms=20)
-    flight = Flight(monkeypatch, injection=injection)
-    flight.run(10.0)
-    assert flight.told(*LATE) == [alert(AlertId.FIXES_LATE, age_ms=50.0, limit_ms=20.0)]
-
-
 # --- damaged input --------------------------------------------------------------------------------
 
 
@@ -334,7 +316,7 @@ def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
         yield from reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     flight: Flight, seed: int
 ) -> None:
@@ -354,28 +336,6 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     at = flight.shared.tracker.attitude_at(flight.now_ns - 100 * MS)
     assert at is not None
     assert math.isfinite(at.yaw_rad)
-
-
-_EXTREMES: dict[str, tuple[float, ...]] = {
-    "f": (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40, 0.0),
-    "d": (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0),
-}
-
-
-def _extremes(code: str) -> tuple[float, ...]:
-    if code in _EXTREMES:
-        return _EXTREMES[code]
-    bits = 8 * struct.calcsize(f"<{code}")
-    return (0, 2**bits - 1) if code.isupper() or code == "c" else (-(2 ** (bits - 1)), -1)
-
-
-def _payload(kind: Any, values: list[float]) -> bytes:
-    packed = bytearray()
-    codes = kind.native_format.decode().lstrip("<")
-    for code, count, value in zip(codes, kind.array_lengths, values, strict=True):
-        one = bytes([int(value)]) if code == "c" else struct.pack(f"<{code}", value)
-        packed += one * max(count, 1)
-    return bytes(packed)
 
 
 @pytest.mark.parametrize("jumps", [1, 2, 3])
@@ -398,10 +358,6 @@ def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(
     assert changes
     assert changes[-1] <= 1  # with the second message at latest, and then no more
     assert again.end.counters["jumps_repeated"] == 0
-
-
-def test_a_start_without_a_jump_announces_none(flight: Flight) -> None:
-    assert {m.reset_counter for _, m in flight.vision()} == {0}
 
 
 @pytest.mark.parametrize("taken_at", [1, 2, 4, None])

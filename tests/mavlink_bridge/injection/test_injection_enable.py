@@ -68,12 +68,6 @@ def test_the_newest_word_counts() -> None:
     assert it.open
 
 
-def test_a_switch_that_is_on_from_the_start_opens() -> None:
-    it, _ = enable()
-    it.channels(channels(1900))
-    assert it.open
-
-
 @pytest.mark.parametrize("wanted", [math.nan, math.inf, 2.0, -1.0, 0.5])
 def test_only_0_and_1_are_commands(wanted: float) -> None:
     it, told = enable()

@@ -35,14 +35,16 @@ from pathlib import Path
 from mavlink_bridge.config import InjectionEnableConfig
 from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
 from mavlink_bridge.injection.injection_enable import InjectionEnable
-path = Path(sys.argv[1])
-memory = InjectionEnableMemory(RestartMemory(path))
-gate = InjectionEnable(InjectionEnableConfig(), lambda _: None, memory)
-if sys.argv[2] == "command":
-    gate.command(31010, 1.0)
-else:
-    gate.channels([1900] * 18)
-while not path.exists():
+files = [Path(name) for name in sys.argv[1:]]
+gates = [
+    InjectionEnable(
+        InjectionEnableConfig(), lambda _: None, InjectionEnableMemory(RestartMemory(file))
+    )
+    for file in files
+]
+gates[0].command(31010, 1.0)
+gates[1].channels([1900] * 18)
+while not all(file.exists() for file in files):
     time.sleep(0.01)
 print("open", flush=True)
 time.sleep(600)
@@ -50,16 +52,20 @@ time.sleep(600)
 LOW = [1100] * 18
 
 
-def killed(path: Path, by: str) -> None:
-    """A process whose gate was opened, after kill -9."""
+@pytest.fixture(scope="module")
+def left_open(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The files of a process with two gates, opened by command and by channel, after kill -9."""
+    folder = tmp_path_factory.mktemp("killed")
+    files = {by: folder / f"{by}.json" for by in ("command", "channel")}
     child = subprocess.Popen(
-        [sys.executable, "-c", _CHILD, str(path), by], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", _CHILD, *map(str, files.values())], stdout=subprocess.PIPE, text=True
     )
     assert child.stdout is not None
     assert child.stdout.readline() == "open\n"
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
     child.stdout.close()
+    return files
 
 
 def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[Alert]]:
@@ -77,9 +83,8 @@ def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[A
 
 
 @pytest.mark.parametrize("by", ["command", "channel"])
-def test_a_killed_process_leaves_the_gate_open(tmp_path: Path, by: str) -> None:
-    path = tmp_path / "gate.json"
-    killed(path, by)
+def test_a_killed_process_leaves_the_gate_open(left_open: dict[str, Path], by: str) -> None:
+    path = left_open[by]
     assert path.stat().st_mode & 0o777 == 0o600
     enable, told = restarted(path)
     assert enable.open

@@ -513,16 +513,6 @@ def test_evidence_that_an_autopilot_did_not_hear_of_is_asked_for_again() -> None
     assert 2 < sum(asked) <= 5
 
 
-def test_evidence_that_stops_is_asked_for_again() -> None:
-    keeper, config = StreamKeeper(), BridgeConfig()
-    for t in (10, 13):  # answered with the second question
-        assert "RAW_IMU" in names(keeper, config, t)
-    for t in range(14, 20):
-        keeper.seen("RAW_IMU", t * SECOND)
-        assert "RAW_IMU" not in names(keeper, config, t + 0.5)
-    assert all("RAW_IMU" in names(keeper, config, t) for t in (25, 28, 31, 34))
-
-
 def test_rc_channels_and_estimator_by_configuration() -> None:
     wanted = {s.name for s in wanted_streams(BridgeConfig(mode="rc"), "px4")}
     assert {"RC_CHANNELS", "ESTIMATOR_STATUS"} <= wanted
