@@ -161,19 +161,6 @@ def _ended(pid: str) -> bool:
         return True
 
 
-def test_a_stopped_vehicle_leaves_no_process_behind():
-    with _Idle() as vehicle:
-        children = vehicle.processes
-        assert [c.poll() for c in children] == [None, None]
-    assert None not in [c.poll() for c in children]
-
-
-def test_no_endpoint_before_the_start():
-    vehicle = EmbeddedSitl(HOME)
-    with pytest.raises(VehicleProcessError, match="before it is started"):
-        _ = vehicle.gcs_endpoint
-
-
 def test_no_vehicle_at_the_endpoint():
     with pytest.raises(PilotError, match="no vehicle listens"):
         Pilot("tcp:127.0.0.1:9").link.connect(timeout_s=0.5)

@@ -156,10 +156,3 @@ def test_an_aircraft_that_is_late_or_elsewhere_says_so_and_clicks_nowhere(
     with flown(assets, tmp_path / "b", monkeypatch, aside_m=300.0) as (pursuer, flight):
         assert "not in the picture" in pursuer.failure
         assert (flight.asked, pursuer.number, flight.closed) == ([], 0, 1)
-
-
-def test_a_flight_that_ends_before_is_no_click(
-    assets: FlightAssets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with flown(assets, tmp_path, monkeypatch, ends_ns=2 * SECOND) as (pursuer, flight):
-        assert (flight.asked, pursuer.number, flight.closed) == ([], 0, 1)
