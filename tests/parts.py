@@ -44,7 +44,6 @@ RUNS_ALONE = (
     "tests/companion/sources/test_rtsp.py",
     "tests/sitl/demo/test_flight.py",
     "tests/sitl/suite/test_loop_flights.py",
-    "tests/test_real_time.py",
 )
 
 # Where the parts find what is dear to build (tests/conftest.py); a folder that lives as long.
