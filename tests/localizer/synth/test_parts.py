@@ -2,12 +2,10 @@
 
 import numpy as np
 
-from localizer.synth.config import SURVEY, VisitLook, WorldConfig
+from localizer.synth.config import SURVEY, VisitLook
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light, raise_surface
-from localizer.synth.plan.terrain import River, Terrain, make_terrain
 from localizer.synth.tiles.charts import ChartedMesh, pack
-from localizer.synth.tiles.props import CAR_HEIGHT_M, CAR_LENGTH_M, car_mesh, person_mesh
-from localizer.synth.tiles.terrain_mesh import terrain_mesh
+from localizer.synth.tiles.props import CAR_HEIGHT_M, CAR_LENGTH_M, car_mesh
 
 
 def flat_light(look: VisitLook):
@@ -39,12 +37,6 @@ def test_shadow_falls_away_from_the_sun_and_is_as_long_as_its_height_says():
     shadow = light.ceiling[60] > 0.25
     west_end = -30 + np.flatnonzero(shadow)[0] * DSM_GSD_M
     assert abs(west_end - (-2 - 10.0)) < 1.0  # 10 m at 45 degrees, from the far edge: -12 m
-
-
-def test_sky_is_hidden_beside_a_wall():
-    _, light = flat_light(SURVEY)
-    assert sample(light.ambient, 3, 0) < 0.9
-    assert sample(light.ambient, 25, 25) > 0.98
 
 
 def test_packed_charts_come_back_whole():
@@ -80,46 +72,6 @@ def test_a_level_keeps_only_its_faces_and_their_charts():
     assert both.chart.max() == 3
 
 
-def tilted(spacing: float = 5.0) -> Terrain:
-    x, y = np.meshgrid(np.arange(41), np.arange(41))
-    heights = (0.3 * x - 0.1 * y + 0.02 * x * y).astype(np.float32)
-    none = River(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    return Terrain(heights, spacing, none)
-
-
-def test_height_is_that_of_the_mesh():
-    terrain = tilted()
-    points, _, faces, error = terrain_mesh(terrain, -100, 0, 100, 1)
-    assert error < 1e-4
-    triangles = points[faces[: 2 * 20 * 20]]
-    inner = triangles.mean(axis=1)
-    np.testing.assert_allclose(inner[:, 2], terrain.height(inner[:, 0], inner[:, 1]), atol=1e-5)
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    assert (normals[:, 2] > 0).all()
-
-
-def test_skirts_hang_below_the_edge():
-    points, _, faces, _ = terrain_mesh(tilted(), -100, 0, 100, 2)
-    skirt = faces[2 * 10 * 10 :]
-    assert len(skirt) == 2 * 4 * 10
-    centre = np.array([-50.0, -50.0])
-    triangles = points[skirt]
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    outward = triangles.mean(axis=1)[:, :2] - centre
-    assert ((normal[:, :2] * outward).sum(axis=1) > 0).all()
-    assert points[121:, 2].min() < points[:121, 2].min()
-
-
-def test_relief_follows_the_request():
-    terrain = make_terrain(WorldConfig(4, 800.0, relief_m=40.0))
-    assert 36.0 < float(np.ptp(terrain.heights)) < 62.0
-    river = terrain.river
-    inside = np.abs(river.points).max(axis=1) < 390
-    if inside.any():
-        bed = terrain.height(*river.points[inside].T)
-        assert (bed <= river.level[inside] + 2.5).all()
-
-
 def test_a_car_has_the_size_of_a_car_and_closed_outer_faces():
     car = car_mesh(seed=3)
     low, high = car.positions.min(0), car.positions.max(0)
@@ -132,13 +84,3 @@ def test_a_car_has_the_size_of_a_car_and_closed_outer_faces():
     assert car.uvs.max() <= 1
     red = car_mesh((200, 20, 20)).mips[0].reshape(-1, 3).mean(axis=0)
     assert red[0] > red[1] + 20
-
-
-def test_a_person_stands_on_the_ground():
-    person = person_mesh(height_m=1.8)
-    assert person.positions[:, 2].min() == 0.0
-    assert abs(person.positions[:, 2].max() - 1.8) < 1e-6
-    p = person.positions.astype(float)
-    a, b, c = (p[person.faces[:, k]] for k in range(3))
-    outward = ((a + b + c) / 3) * [1, 1, 0]
-    assert (np.cross(b - a, c - a) * outward).sum(axis=1).min() >= -1e-9

@@ -96,16 +96,6 @@ def test_hard_pairs_are_the_worst_but_for_the_very_worst() -> None:
     assert again.state() == hard.state()
 
 
-def test_what_was_learned_is_no_longer_hard() -> None:
-    hard = HardPairs(HardShare(share=0.99, ranks=(0.0, 0.5), every_steps=1))
-    keys = [("a.npz", 0), ("a.npz", 1)]
-    hard.note(0, keys, [2.0, 1.0])
-    for step in range(1, 4):
-        hard.note(step, keys, [0.1, 1.0])
-    rng = np.random.default_rng(0)
-    assert {hard.draw(5, rng) for _ in range(50)} - {None} == {("a.npz", 1)}
-
-
 def test_a_size_is_drawn_once_it_has_begun() -> None:
     narrow, wide = Size(0, 64, (64, 48), 2), Size(5, 128, (96, 64), 1)
     rng = np.random.default_rng(0)
