@@ -241,13 +241,6 @@ def test_what_the_autopilot_said_stands_in_the_live_file_too(flight):
     assert not (flight().folder / "text.csv").exists()
 
 
-def test_the_clock_of_the_flight_is_the_one_of_its_file(flight):
-    keeper = flight(mcap=True)
-    messages, _ = _read(keeper.folder / "record.mcap")
-    ((_, logged, _),) = messages["/events"]
-    assert abs(logged - time.time_ns()) < 600e9  # UTC, not the time since the machine began
-
-
 def test_it_is_put_in_the_place_of_no_device_and_no_table(flight, tmp_path):
     """A rename puts it there, by which root would have lost /dev/full."""
     keeper = flight()

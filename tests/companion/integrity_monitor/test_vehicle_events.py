@@ -311,13 +311,6 @@ def test_a_failure_is_told_again_as_long_as_it_lasts_and_not_more_often(
     assert told == 3 * [FAILED]
 
 
-def test_a_gnss_that_jumps_is_told_and_nothing_is_withheld() -> None:
-    """100 km off, as a spoofer or a cold start may say; it is a receiver's word against ours."""
-    flight = Flight(monitor(), gnss_north_m=lambda at_s: 1e5 if at_s >= 5.0 else 0.0).fly(9.0)
-    assert 7.0 <= flight.told(AlertId.GNSS_VISION_MISMATCH) < 8.0
-    assert flight.held == []
-
-
 class Hand:
     """A clock that goes on when it is told to."""
 

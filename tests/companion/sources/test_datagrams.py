@@ -158,12 +158,6 @@ def test_the_sender_is_kept_over_a_reconnection_and_old_packets_are_not(sockets:
     assert feed.read(65536) == TS[376:]
 
 
-def test_a_read_returns_at_most_what_is_asked_and_loses_nothing(sockets: Sockets) -> None:
-    sockets.feed.begin(30.0)
-    sockets.sender("127.0.0.1").send(TS)
-    assert sockets.feed.read(1000) + sockets.feed.read(1000) == TS
-
-
 def test_silence_and_closing_end_a_read(sockets: Sockets) -> None:
     sockets.feed.begin(0.0)
     with pytest.raises(SilentSenderError):
