@@ -83,9 +83,7 @@ def test_a_withheld_position_that_is_wrong_spoils_no_share() -> None:
     assert counted.low < 0.75 < counted.high
 
 
-def test_what_cannot_be_counted_is_named_and_the_rest_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_counted_is_named_and_the_rest_is_written(tmp_path, monkeypatch, capsys):
     flight = flown(tmp_path / "embedded-normal-fast-3")
     shifted = flown(tmp_path / "ardupilot-map-shifted-15m-5")
     empty = tmp_path / "empty"

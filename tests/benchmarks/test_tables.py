@@ -6,13 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.tables import (
-    ablation_table,
-    axes_table,
-    section,
-    targets_table,
-    throughput_table,
-)
+from benchmarks.tables import ablation_table, axes_table, section, targets_table, throughput_table
 from localizer.errors import SequenceError
 
 

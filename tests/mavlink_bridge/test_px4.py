@@ -168,7 +168,5 @@ def test_parameters_of_external_vision() -> None:
         ({"EKF2_AGP0_ID": 3.0, "EKF2_AGP2_ID": 1.0, "EKF2_AGP2_CTRL": 1.0}, {}),
     ],
 )  # fmt: skip
-def test_parameters_of_the_global_sensor_in_each_instance(
-    parameters: dict[str, float], fixes: dict[str, float]
-) -> None:
+def test_parameters_of_the_global_sensor_in_each_instance(parameters, fixes):
     assert rules("global_position_sensor", {**parameters, "EKF2_DELAY_MAX": 200.0}) == fixes

@@ -113,7 +113,8 @@ def test_an_interrupt_is_not_lost_in_a_callback_of_the_way_up(map_cache, tmp_pat
     assert not (tmp_path / "record").exists()
 
 
-def test_a_port_in_use_is_told_before_anything_is_compiled(map_cache, tmp_path):
+def test_a_port_in_use_is_told_before_anything_is_compiled(map_cache, tmp_path, monkeypatch):
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # it would stay after the test
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         targets = {"detections": f"127.0.0.1:{taken.getsockname()[1]}"}
@@ -125,7 +126,8 @@ def test_a_port_in_use_is_told_before_anything_is_compiled(map_cache, tmp_path):
     assert not (tmp_path / "record").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path):
+def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path, monkeypatch):
+    monkeypatch.setattr("signal.signal", lambda *_: None)
     (tmp_path / "file").touch()
     bridge = {"connection": "tcp:127.0.0.1:9", "tlog": str(tmp_path / "file" / "flight.tlog")}
     result = CliRunner().invoke(app, ["run", _config(tmp_path, map=str(map_cache), bridge=bridge)])

@@ -155,12 +155,7 @@ class _Memory:
 
 
 @pytest.mark.parametrize(
-    ("fails", "log"),
-    [
-        ("", ["stop"]),
-        ("feed", ["leave", "stop"]),
-        ("start", ["leave", "stop"]),
-    ],
+    ("fails", "log"), [("", ["stop"]), ("feed", ["leave", "stop"]), ("start", ["leave", "stop"])]
 )
 def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fails, log):
     """Each failing start in the air dropped the gate that the killed process had left open, and so

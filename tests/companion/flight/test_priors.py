@@ -33,25 +33,6 @@ def test_a_receiver_that_doubts_itself_is_believed_less() -> None:
     assert belief.sigma_m == pytest.approx(30.0)
 
 
-def test_after_gnss_the_sigma_grows_and_nothing_is_independent() -> None:
-    beliefs = PositionBelief(PriorConfig())
-    beliefs.at(with_gnss(10), 10 * SECOND)
-    sigmas = [beliefs.at(FLYING, (10 + t) * SECOND) for t in (5, 15, 60)]
-    values = [b.sigma_m for b in sigmas if b.sigma_m is not None]
-    assert values == sorted(values)
-    assert values[-1] > 100.0
-    assert not any(b.independent for b in sigmas)
-
-
-def test_a_fix_of_ours_begins_the_drift_anew_but_is_no_evidence() -> None:
-    beliefs = PositionBelief(PriorConfig())
-    beliefs.at(with_gnss(10), 10 * SECOND)
-    beliefs.note_fix(100 * SECOND)
-    belief = beliefs.at(FLYING, 101 * SECOND)
-    assert belief.sigma_m == pytest.approx(5.0, abs=0.1)
-    assert not belief.independent
-
-
 def test_a_fix_that_never_went_to_the_ekf_holds_it_nowhere() -> None:
     """In shadow, or withheld: the search would look too near to where the EKF drifted to."""
     pose = autopilot_pose()
@@ -105,9 +86,7 @@ class Placed:
 
 
 @pytest.mark.parametrize("on_gnss", [False, None])
-def test_an_ekf_that_follows_our_fixes_is_no_evidence_whatever_a_receiver_says_beside_it(
-    on_gnss: bool | None,
-) -> None:
+def test_an_ekf_that_follows_our_fixes_is_no_evidence_whatever_a_receiver_says_beside_it(on_gnss):
     """Its source set was vision's; the receiver that had been left for it went on to report a fix.
     Where it had dead reckoned to, the tracking began without a trial, and was searched within 15 m.
     """
@@ -121,9 +100,7 @@ def test_an_ekf_that_follows_our_fixes_is_no_evidence_whatever_a_receiver_says_b
 
 
 @pytest.mark.parametrize(("on_gnss", "apart_m"), [(True, 40.0), (None, 2.0)])
-def test_an_ekf_on_gnss_begins_the_tracking_and_after_a_restart_where_they_agree(
-    on_gnss: bool | None, apart_m: float
-) -> None:
+def test_an_ekf_on_gnss_begins_the_tracking_and_after_a_restart_where_they_agree(on_gnss, apart_m):
     """Who begins in the air does not know the source set, and the receiver knows the place."""
     placed = Placed()
     placed.apart_m = apart_m

@@ -33,9 +33,7 @@ def feed(calibrated: date | None) -> FeedConfig:
         (DONE, -1, False),  # a clock that was never set
     ],
 )
-def test_only_a_recent_calibration_says_how_well_the_camera_is_known(
-    done: date | None, days: int, known: bool
-) -> None:
+def test_only_a_recent_calibration_says_how_well_the_camera_is_known(done, days, known):
     today = DONE + timedelta(days=days)
     assert feed(done).is_calibrated(today) is known
 

@@ -177,10 +177,7 @@ def test_only_the_named_interface_is_bound(sockets: Sockets) -> None:
 
 def test_a_multicast_group_is_joined_on_the_interface() -> None:
     address = UdpAddress("239.255.42.42", 0, "127.0.0.1")
-    with (
-        address.bound() as receiver,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
+    with address.bound() as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         sender.sendto(TS, ("239.255.42.42", receiver.getsockname()[1]))
         receiver.settimeout(30.0)

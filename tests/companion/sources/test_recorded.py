@@ -70,9 +70,7 @@ def test_every_image_comes_once_in_order_in_rgb(kind: str, request: pytest.Fixtu
 
 @pytest.mark.parametrize(("settings", "rate"), [({}, 50), ({"rate_hz": 25}, 25)])
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
-def test_a_raw_stream_plays_at_its_own_rate_or_the_given_one(
-    tmp_path: Path, codec: str, settings: dict[str, float], rate: int
-) -> None:
+def test_a_raw_stream_plays_at_its_own_rate_or_the_given_one(tmp_path, codec, settings, rate):
     """It has no presentation times; FFmpeg takes 25 pictures a second for granted."""
     form = {"libx264": "h264", "mpeg4": "m4v"}[codec]
     path = tmp_path / f"flight.{form}"
@@ -96,9 +94,7 @@ def test_a_raw_stream_plays_at_its_own_rate_or_the_given_one(
 
 @pytest.mark.parametrize("marked", [True, False])
 @pytest.mark.parametrize("cover_first", [True, False])
-def test_a_cover_picture_is_not_the_video(
-    tmp_path: Path, video: Path, cover_first: bool, marked: bool
-) -> None:
+def test_a_cover_picture_is_not_the_video(tmp_path, video, cover_first, marked):
     """Skydio writes one, and it may be stream 0; others write it as a track."""
     w, h = (64, 48) if marked else (640, 480)
     path = tmp_path / "covered.mp4"
@@ -153,9 +149,7 @@ def test_another_shape_than_the_cameras_is_named(kind: str, request: pytest.Fixt
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])
-def test_another_size_of_the_same_shape_scales_the_camera(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_another_size_of_the_same_shape_scales_the_camera(kind, request):
     told = []
     calibrated = Camera(640, 480, 500.0, 510.0, 330.0, 236.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
     source = open_source(

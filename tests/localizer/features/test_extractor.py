@@ -58,9 +58,7 @@ def test_bad_images_are_named(bad: np.ndarray) -> None:
         GradientExtractor().extract(bad)
 
 
-def test_without_shipped_weights_the_fallback_says_so(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_shipped_weights_the_fallback_says_so(monkeypatch, tmp_path, caplog):
     monkeypatch.setattr(extractor, "SHIPPED_MODEL", tmp_path / "tiny.onnx")
     with caplog.at_level(logging.WARNING):
         loaded = load_extractor()
@@ -141,9 +139,7 @@ def test_a_description_that_leaves_a_level_out_is_found(tmp_path: Path) -> None:
         ({"levels": []}, "levels"),
     ],
 )
-def test_a_description_of_no_pyramid_is_found(
-    tmp_path: Path, change: dict[str, object], why: str
-) -> None:
+def test_a_description_of_no_pyramid_is_found(tmp_path, change, why):
     model = tmp_path / "tiny.onnx"
     model.write_bytes(extractor.SHIPPED_MODEL.read_bytes())
     description = json.loads(extractor.SHIPPED_MODEL.with_suffix(".json").read_text()) | change

@@ -6,12 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from localizer.errors import GeoreferenceError
-from localizer.geometry.geo import (
-    NED_FROM_ENU,
-    Geodetic,
-    LocalFrame,
-    ecef_from_geodetic,
-)
+from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame, ecef_from_geodetic
 
 A, F = 6378137.0, 1 / 298.257223563  # WGS84
 LATITUDE, LONGITUDE, HEIGHT = st.floats(-89.9, 89.9), st.floats(-179.9, 179.9), st.floats(-400, 9e3)

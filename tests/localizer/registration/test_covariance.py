@@ -20,11 +20,7 @@ from localizer.registration.covariance import (
     pose_differences,
     sandwich_covariance,
 )
-from localizer.registration.cpu.reference import (
-    project,
-    projection_jacobian,
-    retractions,
-)
+from localizer.registration.cpu.reference import project, projection_jacobian, retractions
 from localizer.registration.selection import mode_probabilities, thinned
 
 PLAIN = NoiseModel(1.0, floor=0.05)

@@ -26,9 +26,7 @@ def test_the_default_appearance_changes_nothing(view: tuple[np.ndarray, np.ndarr
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_every_condition_is_deterministic_and_visible(
-    condition: str, view: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_every_condition_is_deterministic_and_visible(condition, view):
     rgb, depth = view
 
     def draw() -> np.ndarray:

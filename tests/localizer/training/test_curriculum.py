@@ -60,9 +60,7 @@ def config(tmp_path: Path) -> TrainConfig:
                                   "kept_steps": 4})  # fmt: skip
 
 
-def test_a_run_with_sizes_and_hard_pairs_resumes_exactly(
-    config: TrainConfig, tmp_path: Path
-) -> None:
+def test_a_run_with_sizes_and_hard_pairs_resumes_exactly(config, tmp_path):
     whole = Trainer(config.model_copy(update={"output": tmp_path / "whole"}))
     whole.run()
     parts = config.model_copy(update={"output": tmp_path / "parts"})
@@ -130,9 +128,7 @@ def test_a_narrower_pair_keeps_its_geometry(width: int) -> None:
         ("first_step: 0", "first_step: 1", "none begins"),
     ],
 )
-def test_a_curriculum_that_cannot_be_is_named(
-    tmp_path: Path, line: str, wrong: str, said: str
-) -> None:
+def test_a_curriculum_that_cannot_be_is_named(tmp_path, line, wrong, said):
     path = tmp_path / "run.yaml"
     path.write_text(SHIPPED.read_text().replace(line, wrong))
     with pytest.raises(ModelError, match=said):

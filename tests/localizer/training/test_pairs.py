@@ -7,12 +7,7 @@ import pytest
 
 from localizer.errors import SequenceError
 from localizer.geometry.pose import Pose
-from localizer.training.data.pairs import (
-    Pair,
-    SceneConfig,
-    scene_pairs,
-    warp_check,
-)
+from localizer.training.data.pairs import Pair, SceneConfig, scene_pairs, warp_check
 from localizer.training.data.shards import read_shard, write_shard, write_shards
 from localizer.training.places.photos import PhotoLibrary
 

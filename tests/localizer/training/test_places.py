@@ -23,9 +23,7 @@ def likeness(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a.mean(-1).ravel(), b.mean(-1).ravel())[0, 1])
 
 
-def test_soft_ground_gets_another_texture_and_hard_ground_keeps_its_own(
-    ground: tuple[np.ndarray, np.ndarray],
-) -> None:
+def test_soft_ground_gets_another_texture_and_hard_ground_keeps_its_own(ground):
     albedo, lasting = ground
     for seed in range(4):
         fresh = regrown(albedo, lasting, CELL, np.random.default_rng(seed))

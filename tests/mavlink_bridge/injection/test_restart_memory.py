@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -72,9 +71,7 @@ def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[A
     told: list[Alert] = []
     kept = json.loads(path.read_text()) if path.exists() else {}
     memory = RestartMemory(
-        path,
-        lambda: kept.get("utc_s", 0.0) + later_s,
-        lambda: kept.get("clock_s", 0.0) + later_s,
+        path, lambda: kept.get("utc_s", 0.0) + later_s, lambda: kept.get("clock_s", 0.0) + later_s
     )
     enable = InjectionEnable(InjectionEnableConfig(), told.append, InjectionEnableMemory(memory))
     enable.recall()
@@ -132,9 +129,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
 
 
 @pytest.mark.parametrize("later_s", [601.0, -5.0])
-def test_an_old_file_and_one_from_the_future_count_for_nothing(
-    tmp_path: Path, later_s: float
-) -> None:
+def test_an_old_file_and_one_from_the_future_count_for_nothing(tmp_path, later_s):
     path = tmp_path / "gate.json"
     path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
     path.chmod(0o600)
@@ -145,8 +140,7 @@ def test_an_old_file_and_one_from_the_future_count_for_nothing(
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "[]", "nonsense", '{"open": 1}', "{" * 5000, '{"utc_s": 1' + "0" * 400 + "}"],
+    "text", ["", "[]", "nonsense", '{"open": 1}', "{" * 5000, '{"utc_s": 1' + "0" * 400 + "}"]
 )
 def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -> None:
     path = tmp_path / "gate.json"
@@ -197,9 +191,7 @@ def test_a_no_go_of_nonsense_is_none(tmp_path: Path, against: object) -> None:
     memory.stop()
 
 
-def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(tmp_path, monkeypatch):
     """The write was finished after the order to end, and the next start injected unasked."""
     path, flush, ends = tmp_path / "gate.json", os.fsync, threading.Event()
 
@@ -228,9 +220,7 @@ def _bridge(path: Path, connection: str, told: list[Alert]) -> Bridge:
     return Bridge(config, 0.0, on_alert=told.append)
 
 
-def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(
-    tmp_path: Path, autopilot: Any
-) -> None:
+def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(tmp_path, autopilot):
     path, told = tmp_path / "gate.json", list[Alert]()
     _left_open(path)
     with _bridge(path, f"udpout:127.0.0.1:{autopilot.port}", told):

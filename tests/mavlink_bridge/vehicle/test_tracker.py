@@ -18,7 +18,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.status_notifier import StatusNotifier
-from mavlink_bridge.vehicle.origin import OriginKeeper, north_east, offset
+from mavlink_bridge.vehicle.origin import OriginKeeper, north_east
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
 from mavlink_bridge.vehicle.readings import gimbal_in_earth_frame
 from mavlink_bridge.vehicle.tracker import VehicleTracker
@@ -123,9 +123,7 @@ YAW_LOCK, IN_VEHICLE, IN_EARTH = 16, 32, 64
         (YAW_LOCK | IN_EARTH, True),
     ],
 )
-def test_gimbal_frame_by_yaw_in_flags_first_then_yaw_lock(
-    flags: int, earth: bool, quaternion_of: Quaternion
-) -> None:
+def test_gimbal_frame_by_yaw_in_flags_first_then_yaw_lock(flags, earth, quaternion_of):
     assert gimbal_in_earth_frame(flags) is earth
     it = tracker()
     vehicle_yaw = 100.0
@@ -207,9 +205,7 @@ def test_position_at_null_island_is_no_position() -> None:
 
 
 @pytest.mark.parametrize(("before", "after"), [(1_799_999_900, -1_799_999_700), (-300, 100)])
-def test_between_two_places_the_way_over_the_date_line_is_the_short_one(
-    before: int, after: int
-) -> None:
+def test_between_two_places_the_way_over_the_date_line_is_the_short_one(before, after):
     it = tracker()
     for ms, lon in ((1, before), (201, after)):
         m = mavlink.MAVLink_global_position_int_message(
@@ -306,19 +302,6 @@ def test_scaling_is_ardupilots_own() -> None:
     assert north_east(lat, lon, lat + dlat * 1e-7, lon + dlon * 1e-7) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("where", [(47.4, 8.5), (-33.9, 151.2), (64.1, -21.9), (0.0, 179.999)])
-def test_offset_inverts_the_scaling(where: tuple[float, float]) -> None:
-    latitude, longitude = offset(*where, 4000.0, 3000.0)
-    assert north_east(*where, latitude, longitude) == pytest.approx((4000.0, 3000.0), abs=1e-3)
-
-
-def test_px4_projection_agrees_with_a_sphere() -> None:
-    # 1 degree of latitude on PX4's sphere of 6371 km.
-    north, east = north_east(47.0, 8.0, 48.0, 8.0, "px4")
-    assert north == pytest.approx(math.radians(1.0) * 6371000.0, rel=1e-9)
-    assert east == pytest.approx(0.0, abs=1e-6)
-
-
 def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     configured = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
     keeper = OriginKeeper(configured)
@@ -336,11 +319,6 @@ def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     assert news.id is AlertId.ORIGIN_DIFFERS
     assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
     assert keeper.tick(10 * SECOND, 1, asked.append) is None
-
-
-def test_no_origin_is_set_unless_configured() -> None:
-    keeper = OriginKeeper(None)
-    assert all(keeper.tick(i * SECOND, 1, lambda _: None) is None for i in range(20))
 
 
 def test_zero_origin_is_none() -> None:
@@ -438,9 +416,7 @@ def test_a_gimbal_that_falls_silent_makes_room() -> None:
     ("latitude", "longitude", "altitude_m"),
     [(0, 0, 500), (950_000_000, 0, 500), (1, 1_900_000_000, 500), (470_000_000, 80_000_000, 9e4)],
 )
-def test_a_receiver_where_there_is_no_place_is_not_heard(
-    latitude: int, longitude: int, altitude_m: float
-) -> None:
+def test_a_receiver_where_there_is_no_place_is_not_heard(latitude, longitude, altitude_m):
     """A 3D fix in the Gulf of Guinea, beyond a pole, in space: GNSS would count as healthy."""
     it = tracker()
 

@@ -161,9 +161,7 @@ def test_the_blur_is_the_motion_during_the_shutter(renderer: NumbaRenderer) -> N
     assert sharpness(moving, 0.02) < 0.6 * sharpness(moving, 0.0)
 
 
-def test_a_recorded_sequence_is_read_back_as_it_was(
-    renderer: NumbaRenderer, tmp_path: Path
-) -> None:
+def test_a_recorded_sequence_is_read_back_as_it_was(renderer, tmp_path):
     frame = LocalFrame(Geodetic(47.0, 8.0, 430.0))
     track = _track(_pose(30), _pose(33, -70), _pose(35, -60))
     camera = WorldCamera(renderer, CAMERA, Appearance(read_noise=0.01), CameraOptions(seed=4))

@@ -7,11 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sitl.embedded.control.controller import (
-    Carrot,
-    ControlLimits,
-    attitude_control,
-)
+from sitl.embedded.control.controller import Carrot, ControlLimits, attitude_control
 from sitl.embedded.physics import dynamics
 from sitl.embedded.physics.dynamics import GRAVITY, MASS
 from sitl.embedded.physics.rotation import euler, quaternion

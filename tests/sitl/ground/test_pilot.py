@@ -215,10 +215,7 @@ def horizontal(a: Location, b: Location) -> float:
 
 def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
     parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
-    with (
-        real_time(),
-        open_vehicle(kind, HOME, VehicleSetup(30.0, parameters, SPEEDUP)) as vehicle,
-    ):
+    with real_time(), open_vehicle(kind, HOME, VehicleSetup(30.0, parameters, SPEEDUP)) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
             feed = TruthFeed(pilot, vehicle.companion_endpoint, FixModel(sigma_m=0.3))

@@ -84,9 +84,7 @@ def heard(witness: GroundTruth, points: dict[int, Pointed], **other: Any) -> Rec
     return ReceivedMessages(geo=[replace(geo, **other)])
 
 
-def test_right_reports_are_no_problem(
-    witness: GroundTruth, asked: list[SentWish], tmp_path: Path
-) -> None:
+def test_right_reports_are_no_problem(witness, asked, tmp_path):
     points = all_pointed(witness, asked)
     rows = [row(p, s, (0.2, 0.0, 0.1)) for p in points.values() for s in np.arange(0.0, 12.0, 0.2)]
     verdict = judge(witness, asked, heard(witness, points), reports(tmp_path / "t.csv", rows))
@@ -107,18 +105,14 @@ def test_right_reports_are_no_problem(
         (lambda p, q: [], "without a report and without a word"),
     ],
 )
-def test_each_fault_of_a_report_is_a_problem(
-    fault: Any, problem: str, witness: GroundTruth, asked: list[SentWish], tmp_path: Path
-) -> None:
+def test_each_fault_of_a_report_is_a_problem(fault, problem, witness, asked, tmp_path):
     points = all_pointed(witness, asked)
     rows = [*fault(points[1], points[2]), row(points[2], 1.0)]
     verdict = judge(witness, asked, heard(witness, points), reports(tmp_path / "t.csv", rows))
     assert any(problem in found for found in verdict.problems), verdict.problems
 
 
-def test_what_comes_over_the_link_is_judged_too(
-    witness: GroundTruth, asked: list[SentWish], tmp_path: Path
-) -> None:
+def test_what_comes_over_the_link_is_judged_too(witness, asked, tmp_path):
     points = all_pointed(witness, asked)
     path = reports(tmp_path / "t.csv", [row(p, 1.0) for p in points.values()])
     for other, problem in (

@@ -152,12 +152,9 @@ def jumping(taken_s: float, peak: float) -> CaseRecord:
 
 
 @pytest.mark.parametrize(
-    ("taken_s", "peak", "clean"),
-    [(4.3, 10.5, True), (4.3, 13.0, False), (8.0, 10.5, False)],
+    ("taken_s", "peak", "clean"), [(4.3, 10.5, True), (4.3, 13.0, False), (8.0, 10.5, False)]
 )
-def test_a_told_jump_must_be_taken_at_once_and_without_overshoot(
-    taken_s: float, peak: float, clean: bool
-) -> None:
+def test_a_told_jump_must_be_taken_at_once_and_without_overshoot(taken_s, peak, clean):
     jump = expectation(check="jump", at_s=4, north_m=10, settled_s=0.5)
     assert jump.judge(jumping(taken_s, peak)).ok == clean
 
@@ -279,9 +276,7 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("error", "code"), [(0.2, 0), (0.9, 1)])
-def test_the_commands_exit_code_is_for_scripts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float, code: int
-) -> None:
+def test_the_commands_exit_code_is_for_scripts(tmp_path, monkeypatch, error, code):
     def flown(cases: Any, kinds: Any, *_: Any) -> list[ReportRow]:
         return [
             ReportRow(c, k, record(error), judge(c, record(error))) for k in kinds for c in cases

@@ -839,7 +839,5 @@ def test_a_mesh_in_feet_is_refused(tmp_path):
     path.write_text(json.dumps({"epsg": 2263, "offset": [985000, 210000, 0]}))
     with pytest.raises(GeoreferenceError, match="in feet"):
         build_cache(
-            obj(tmp_path),
-            tmp_path / "c",
-            BuildOptions(georeference=path, workers=1, **ELLIPSOIDAL),
+            obj(tmp_path), tmp_path / "c", BuildOptions(georeference=path, workers=1, **ELLIPSOIDAL)
         )
