@@ -74,10 +74,10 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
         info = WorldInfo.load(args.terrain)
         terrain = _Terrain(info, info.origin.height_m - known.cache.frame.origin.height_m)
     renderers = NumbaRenderer(seen, 1), NumbaRenderer(known, 1)
-    ground = ground_uncertainty(known.cache.index, map_kind(known.cache))
+    unknown = ground_uncertainty(known.cache.index, map_kind(known.cache))
     if args.fit:
-        ground = GroundUncertainty(0.0, 0.0, 0.0)
-    scene = FlownScene(args.map.parent.name, *renderers, camera, terrain, ground)
+        unknown = GroundUncertainty(0.0, 0.0, 0.0)
+    scene = FlownScene(args.map.parent.name, *renderers, camera, terrain, unknown)
     extractor = DetailExtractor(load_extractor(threads=1, size=(camera.width, camera.height)))
     config = OdometryConfig()
     if args.fit:
