@@ -63,6 +63,8 @@ def test_only_a_new_start_is_a_jump(states, counts):
     for state in states:
         injection.add_estimate(_estimate(state), None)
     assert [fix.reset_count for fix in bridge.fixes] == counts
+    sent = [state for state in states if state in (TRACKING, BRIDGING)]
+    assert [fix.by_odometry for fix in bridge.fixes] == [state is BRIDGING for state in sent]
 
 
 def test_what_is_rejected_or_unconfirmed_is_not_injected():
