@@ -20,6 +20,7 @@ from companion.integrity_monitor.jump import JumpCheck
 from companion.integrity_monitor.motion import MotionCheck, MotionVerdict
 from companion.integrity_monitor.position_checks import GnssCheck, HeightCheck
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
+from companion.integrity_monitor.scale import ScaleCheck
 from companion.integrity_monitor.step import StepUncertainty
 from companion.integrity_monitor.tilt import TiltCheck
 from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
@@ -75,6 +76,7 @@ class IntegrityChecks:
         self._pictures = FrozenVideoDetector(config.picture)
         self._track = track or InertialTrack()
         self._motion = MotionCheck(config.motion, self._track)
+        self._scale = ScaleCheck(self._track)
         self._height = HeightCheck(config)
         self._gnss = GnssCheck(config)
         self._jumps = JumpCheck(config)
@@ -176,7 +178,7 @@ class IntegrityChecks:
     ) -> VisionFix | None:
         """Return the fix if it may be injected, with a new reset count if earlier fixes were wrong;
         None holds it. A fix of the odometry that only its protection level holds is marked
-        `position_withheld`.
+        `position_withheld`; its velocity gets the scale error that the IMU has shown.
 
         attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
         reason against it.
@@ -201,7 +203,10 @@ class IntegrityChecks:
         if self.action >= OutputAction.HOLD or not admitted:
             self._wrong += self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
             moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
-            return replace(fix, position_withheld=True) if moves_right else None
+            if not moves_right:
+                return None
+            scale = max(fix.scale_sigma or 0.0, self._scale.wrong_by)
+            return replace(fix, position_withheld=True, scale_sigma=scale)
         if held:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The
@@ -257,6 +262,7 @@ class IntegrityChecks:
                 return
             self._waiting.popleft()
             self._verdict = self._motion.add(fix, leaps=leaps)
+            self._scale.add(fix, leaps=leaps)
             self._height_reading = self._height.add(fix, state)
 
     # --- judgement ----------------------------------------------------------------------------
