@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 
 from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
-from mavlink_bridge.alerts.catalogue import body, cleared
 from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
 from mavlink_bridge.alerts.injection import INJECTION
 from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
@@ -28,9 +27,9 @@ Made from the catalogue by `python -m companion.alerts.page`; do not edit.
 An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `health.json` with its
 identifier. *Fix*: a position from vision. *Output held*: no position is sent. *Exclude and reset*:
 as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the switch
-to vision do not start; injection that is running continues. *Event*: it has no end. A text in
-brackets is sent at the end of the alert. The end of other alerts shows by the next status, for
-example `localization tracking`, `injecting` or `the EKF follows`.
+to vision do not start; injection that is running continues. *Event*: it has no end. The end of an
+alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the text in
+brackets. The end of the rest shows by the next status, for example `localization tracking`.
 """
 _TABLE = """
 ## {}
@@ -63,8 +62,8 @@ def page() -> str:
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
     ended = spec.cleared or "event"
-    if spec.reports_end:
-        ended += f" (`{body(cleared(spec.id))}`)"
+    if spec.reports_end and spec.cleared_text is not None:
+        ended += f" (`{spec.cleared_text}`)"
     inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
     action = ", ".join(
         [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]
