@@ -12,7 +12,6 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from localizer.errors import ModelError, SequenceError  # noqa: E402
-from localizer.features.extractor import SHIPPED_MODEL  # noqa: E402
 from localizer.training import __main__ as cli  # noqa: E402
 from localizer.training.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
@@ -20,7 +19,6 @@ from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream 
 from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import read_shard, store  # noqa: E402
 from localizer.training.export.export import export, load_network  # noqa: E402
-from localizer.training.export.from_published import trainable_network  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
 from localizer.training.models.networks import build  # noqa: E402
@@ -188,11 +186,6 @@ def test_a_stopped_generation_leaves_no_half_shard(
     with pytest.raises(KeyboardInterrupt):
         store(tmp_path / "1.npz", [], SceneConfig(width=64, height=48))
     assert not list(tmp_path.iterdir())
-
-
-def test_unfusing_needs_pairs() -> None:
-    with pytest.raises(ModelError, match="needs training pairs"):
-        trainable_network(SHIPPED_MODEL, [])
 
 
 def test_every_number_of_a_run_has_its_bounds() -> None:
