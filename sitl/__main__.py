@@ -40,7 +40,6 @@ from sitl.demo.scenario import (
 from sitl.demo.script import FlightError
 from sitl.errors import SimulationError
 from sitl.operator.follow_run import fly_follows
-from sitl.operator.run import fly_clicks, summary
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
@@ -205,21 +204,6 @@ def loop(
     )
     rows = fly_loop(cases, options, lambda row: print_loop_row(console, row))
     console.print(escape(markdown(rows)))
-    raise typer.Exit(0 if all(row.ok for row in rows) else 1)
-
-
-@app.command()
-def targets(
-    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
-    out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-targets"),
-    seeds: Annotated[str, typer.Option(help="world, errors and clicks: 5, or 5..7")] = "5..7",
-    clicks: Annotated[int, typer.Option(min=1, max=100, help="in each flight")] = 14,
-    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
-) -> None:
-    """Fly an operator who clicks, drags and stops; hold every report against what he pointed at."""
-    console, options = _runner(fc, out, seeds, worlds)
-    rows = fly_clicks(options, clicks)
-    console.print_json(json.dumps(summary(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 

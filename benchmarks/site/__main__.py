@@ -1,6 +1,6 @@
 """The documentation's generated parts, written anew.
 
-    python -m benchmarks.site            # command line, configuration, API, alerts; tables of results
+    python -m benchmarks.site            # command line, configuration, API, alerts; results
     python -m benchmarks.site --check    # ends with 1 and names what is not of today
     python -m benchmarks.site --figures  # of the results pages
     python -m benchmarks.site --pictures report    # the README's, of `make demo`'s report folder

@@ -18,9 +18,7 @@ from localizer.synth.world import WorldInfo
 from sitl.camera.world_camera import FrameLog
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
-from sitl.operator.operator import LATE_S
-from sitl.operator.pursuer import FOLLOWED_S, Pursuer
-from sitl.operator.station import ReceivedMessages
+from sitl.operator.pursuer import FOLLOWED_S, LATE_S, Pursuer
 from tests.companion.targets.scene import CAMERA, DOWN
 
 SECOND = 10**9
@@ -43,7 +41,7 @@ class Flight:
     now_ns: int = SECOND
     chase: Chase | None = None
     places: list[np.ndarray] = field(default_factory=list)
-    asked: list[tuple[int, str, tuple[float, ...]]] = field(default_factory=list)
+    asked: list[tuple[int, float, float]] = field(default_factory=list)
     closed: int = 0
     _pictures: int = 0
 
@@ -68,16 +66,14 @@ class Flight:
         self.places.append(np.array([latitude_deg, longitude_deg, height_m]))
 
     def station(self, _endpoint: str, _alive: Callable[[], None]) -> Any:
-        return SimpleNamespace(
-            heard=ReceivedMessages(), run_until=self._run_until, ask=self._ask, close=self._close
-        )
+        return SimpleNamespace(run_until=self._run_until, track=self._track, close=self._close)
 
     def _run_until(self, done: Callable[[], bool], until_ns: int) -> bool:
         self.pass_until(until_ns)
         return done() or self.now_ns >= self.ends_ns
 
-    def _ask(self, kind: str, parameters: tuple[float, ...]) -> tuple[int, int]:
-        self.asked.append((self.now_ns, kind, parameters))
+    def _track(self, x: float, y: float) -> tuple[int, int]:
+        self.asked.append((self.now_ns, x, y))
         return 0, NUMBER
 
     def _close(self) -> None:
@@ -127,8 +123,7 @@ def test_it_clicks_once_at_the_car_as_late_as_an_operator_and_flies_along(
         assert pursuer.number == NUMBER
         chase = pursuer.chase
         assert chase is not None
-        (clicked_ns, kind, (x, y)) = flight.asked[0]
-        assert (len(flight.asked), kind) == (1, "point")
+        ((clicked_ns, x, y),) = flight.asked
         # The picture of the moment when the car is where it is clicked at, seen so much later.
         assert clicked_ns == chase.begins_ns() + round(LATE_S * SECOND)
         assert pursuer.late_s == pytest.approx(LATE_S)
