@@ -17,14 +17,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sitl.suite.runner import Figures, ReportRow, figures
+from sitl.suite.runner import ReportRow
 
 _COLOURS = {"pass": "green", "better": "cyan", "FAIL": "red", "ERROR": "red"}
 _GAP_S = 1.0  # in which the EKF reported no position
 _COLUMNS = (
     "scenario",
     "vehicle",
-    "by",
     "reference, m",
     "measured, m",
     "what was checked",
@@ -128,7 +127,6 @@ def _cells(row: ReportRow) -> tuple[str, ...]:
     return (
         row.case.name,
         row.vehicle,
-        row.case.via,
         wanted,
         _three(row.measured or ()),
         told,
@@ -155,9 +153,6 @@ def _pace(row: ReportRow) -> list[str]:
 
 
 def _as_data(row: ReportRow) -> dict[str, Any]:
-    paired: Figures | None = None
-    if row.record is not None and row.reference is not None:
-        paired = figures(row.record.as_reference(row.reference.from_s, row.reference.to_s))
     return {
         "scenario": row.case.name,
         "title": row.case.title,
@@ -167,7 +162,6 @@ def _as_data(row: ReportRow) -> dict[str, Any]:
         "guardian": row.guardian_lines,
         "error": row.error,
         "measured": row.measured,
-        "measured_paired_as_reference": paired,
         "findings": [asdict(f) for f in row.findings],
         "pace": None if row.record is None else round(row.record.pace, 3),
         "stall_s": None if row.record is None else round(row.record.stall_s, 3),

@@ -40,7 +40,7 @@ def record(error: float = 0.2, seconds: float = 20.0) -> CaseRecord:
         for i in range(int(10 * seconds))
     ]
     errors = [(t, error, 0.0) for t in times]
-    return CaseRecord(errors=errors, unpaired=errors, samples=samples)
+    return CaseRecord(errors=errors, samples=samples)
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -64,8 +64,7 @@ def case_text(**changes: str) -> str:
         ({"fixes": "{colour: red}"}, "fixes.colour"),
         ({"fixes": "{sigma_m: yes}"}, "fixes.sigma_m: must not be a boolean"),
         ({"bridge": "{injection: {rate_hz: 99}}"}, "rate_hz"),
-        ({"bridge": ""}, "exactly one of `bridge` and `raw`"),
-        ({"raw": "{}"}, "exactly one of `bridge` and `raw`"),
+        ({"bridge": ""}, "bridge"),
         ({"expect": "[]"}, "expect"),
         ({"expect": "[{check: horoscope}]"}, "expect.0"),
         ({"expect": "[{check: mode}]"}, "expect.0.mode.mode"),
@@ -73,7 +72,6 @@ def case_text(**changes: str) -> str:
         ({"timeline": "[{at_s: 3, fixes: {sigma: 1}}]"}, "sigma"),
         ({"timeline": "[{at_s: 3, reboot: true}, {at_s: 1, reboot: true}]"}, "order of at_s"),
         ({"flight": "{side_m: 0}"}, "needs `seconds`"),
-        ({"bridge": "", "raw": "{}", "before": "{reboot: true}"}, "needs the bridge"),
         ({"title": "["}, "not valid YAML"),
         ({"title": "2026-13-41"}, "not valid YAML"),
         ({"name": "../../elsewhere"}, "named by its file"),
@@ -95,11 +93,7 @@ def test_a_good_file_is_named_after_its_stem(tmp_path: Path) -> None:
     path = tmp_path / "hover.yaml"
     path.write_text(case_text())
     case = load_case(path)
-    assert (case.name, case.via, case.vehicle.all_parameters()["VISO_TYPE"]) == (
-        "hover",
-        "bridge",
-        1,
-    )
+    assert (case.name, case.vehicle.all_parameters()["VISO_TYPE"]) == ("hover", 1)
 
 
 def test_an_unknown_name_is_told_with_those_that_exist() -> None:
@@ -112,10 +106,9 @@ def test_shipped_scenarios_hold_for_a_bridge_and_end(case: Case) -> None:
     assert case.title
     last = case.timeline[-1].at_s if case.timeline else 0.0
     assert case.flight.seconds is None or case.flight.seconds > last
-    if case.raw is None:
-        config = bridge_config(case, "tcp:127.0.0.1:5762")
-        assert config.mode == "inject"
-        assert (config.origin is None) == case.vehicle.receiver
+    config = bridge_config(case, "tcp:127.0.0.1:5762")
+    assert config.mode == "inject"
+    assert (config.origin is None) == case.vehicle.receiver
 
 
 def test_the_shipped_scenarios_cover_the_reference_tables() -> None:
@@ -289,7 +282,6 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
     assert "PilotError: not armed / or so |" in text
     data = json.loads((tmp_path / "out/suite.json").read_text())
     assert [d["verdict"] for d in data] == ["pass", "FAIL", "better", "ERROR"]
-    assert data[0]["measured_paired_as_reference"] == [0.2, 0.2, 0.2]
     pictures = sorted(p.name for p in (tmp_path / "out").glob("*.png"))
     assert pictures == ["embedded-gps-input.png", "embedded-odometry.png", "embedded-vpe.png"]
 
