@@ -271,18 +271,11 @@ class _CaseFlight:
             )
             for t in pilot.record.texts
         ]
-        truth = pilot.record.truth_track()
-        times = np.array([t.boot_s for t in truth])
-        true = np.array([HOME.ned_of(t.location)[:2] for t in truth]).reshape(-1, 2)
-        for sample in pilot.record.ekf_track():
+        for sample, true in pilot.record.ekf_pairs():
             at_s = self._seconds(sample.time_ns)
-            i = int(np.searchsorted(times, sample.boot_s))
-            if at_s < 0 or sample.location is None or not 0 < i < len(times):
-                continue
-            share = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
-            ekf = np.array(HOME.ned_of(sample.location)[:2])
-            north, east = ekf - (true[i - 1] + share * (true[i] - true[i - 1]))
-            record.errors.append((at_s, float(north), float(east)))
+            if at_s >= 0 and sample.location is not None:
+                north, east, _ = true.ned_of(sample.location)
+                record.errors.append((at_s, north, east))
 
 
 def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:

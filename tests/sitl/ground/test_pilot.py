@@ -251,8 +251,8 @@ def test_flies_a_mission(real_time, kind):
             pilot.start_mission()
             pilot.link.wait(lambda: 5 in pilot.record.reached, 120.0, "the last waypoint")
             assert horizontal(pilot.record.truth.location, turn) < 6.0
-            errors = pilot.record.ekf_errors(begun)
-            flat = np.hypot(errors[:, 0], errors[:, 1])
+            pairs = [p for p in pilot.record.ekf_pairs() if p[0].time_ns >= begun]
+            flat = [math.hypot(*true.ned_of(sample.location)[:2]) for sample, true in pairs]
             assert len(flat) > 100
             assert np.percentile(flat, 95) < 2.0
             _check_gimbal(pilot)
@@ -261,7 +261,7 @@ def test_flies_a_mission(real_time, kind):
 
 
 def _check_gimbal(pilot):
-    newest = pilot.record.gimbal_track()[-1]
+    newest = pilot.record.gimbal_at(pilot.record.newest_common_ns())
     roll, pitch, yaw = (math.degrees(a) for a in newest.roll_pitch_yaw)
     assert (roll, pitch, yaw) == pytest.approx((0.0, -60.0, 20.0), abs=1.0)
     assert newest.yaw_in_vehicle_frame
