@@ -51,9 +51,9 @@ from sitl.vehicles.process import VehicleKind
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
-    "companion", "companion.log", "companion.yaml", "errors.png", "flight.tlog", "frames.csv",
-    "frames_report.csv", "latest", "overlay-*", "report.html", "report.json", "tracks.png",
-    "truth.tum", "vehicle.csv", "vehicle.log",
+    "companion", "companion.log", "companion.yaml", "flight.tlog", "frames.csv",
+    "frames_report.csv", "latest", "report.html", "report.json", "truth.tum", "vehicle.csv",
+    "vehicle.log",
 )  # fmt: skip
 
 _IDEAL = "a map that shares geometry and texture with the world, a perfect camera, no errors drawn"
