@@ -45,7 +45,8 @@ from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
 from sitl.suite.loop.report import as_data, markdown, print_loop_row, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
-from sitl.suite.report import print_row, print_table, write_report
+from sitl.suite.report import markdown as suite_table
+from sitl.suite.report import print_row, write_report
 from sitl.suite.runner import run_suite
 from sitl.vehicles.process import VehicleKind
 
@@ -180,7 +181,7 @@ def suite(
     """Fly every scenario and compare with what ArduPilot was measured to do; exit 1: one fails."""
     cases, (console, options) = load_cases(only or (), scenarios), _runner(fc, out)
     rows = run_suite(cases, options.vehicles, jobs, seed, lambda row: print_row(console, row))
-    print_table(console, rows)
+    console.print(escape(suite_table(rows)))
     write_report(rows, out)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 

@@ -82,17 +82,17 @@ class Spread:
 
 def ekf_errors(
     vehicle: Columns, span_ns: tuple[int, int], shift_m: tuple[float, float, float] = (0, 0, 0)
-) -> tuple[Array, Array]:
-    """(horizontal error, vertical error) of the autopilot's position against the truth, or against
-    where a map shows the truth that is shifted east, north and up.
+) -> Array:
+    """Horizontal errors of the autopilot's position against the truth, or against where a map shows
+    the truth that is shifted east, north and up.
     """
     t = vehicle["time_ns"]
     inside = (t >= span_ns[0]) & (t <= span_ns[1])
-    d = [
+    east, north = (
         vehicle[f"ekf_{a}_m"][inside] - vehicle[f"{a}_m"][inside] - s
-        for a, s in zip(("east", "north", "up"), shift_m, strict=True)
-    ]
-    return np.hypot(d[0], d[1]), np.abs(d[2])
+        for a, s in zip(("east", "north"), shift_m[:2], strict=True)
+    )
+    return np.asarray(np.hypot(east, north))
 
 
 @dataclass(frozen=True)

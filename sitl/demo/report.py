@@ -39,7 +39,6 @@ from sitl.demo.criteria import (
     FlightFigures,
     headline,
     judge,
-    latency_warning,
 )
 from sitl.demo.flight import DemoRecord
 from sitl.demo.scenario import Scenario
@@ -49,13 +48,12 @@ from sitl.demo.scenario import Scenario
 class FlightReport:
     """The flight's figures over the span without GNSS.
 
-    localizer: the paper's columns over processed frames, and the spreads of its accepted estimates'
-    errors; completeness_sent: per cent of all frames that the camera sent in the span with an
-    accepted estimate. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
+    localizer: the paper's columns over processed frames; localizer_m: of its accepted estimates'
+    errors. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
     against where GNSS would have it; the map lies map_shift_m beside GNSS. inside_bound: per cent
     of fixes within their own 95 % ellipse; inside_level: within their protection level, of which
     protection_m are the horizontal ones. map_kind: what the map can show. targets: name to 3-D
-    error, in the map's frame. warning: of late estimates. won: the flight in one line; broken: why
+    error, in the map's frame. won: the flight in one line; broken: why
     it was not flown to its end; slow: what the computer did not keep up with.
     """
 
@@ -65,9 +63,6 @@ class FlightReport:
     flown_m: float
     localizer: LocalizationMetrics
     localizer_m: Spread
-    localizer_horizontal_m: Spread
-    localizer_deg: Spread
-    completeness_sent: float
     frames_sent: int
     frames_dropped: int
     ekf_horizontal_m: Spread
@@ -77,16 +72,11 @@ class FlightReport:
     inside_level: float | None
     protection_m: Spread
     map_kind: str
-    ekf_vertical_m: Spread
     home_error_m: float
     fixed_targets_m: Spread
-    moving_targets_m: Spread
     targets_m: Mapping[str, Spread]
-    target_fixes: Mapping[str, int]
     stages_ms: Mapping[str, Spread]
-    camera_ms: Mapping[str, tuple[float, float]]
     criteria: tuple[Criterion, ...]
-    warning: str | None
     broken: str | None = None
     slow: str | None = None
 
@@ -124,14 +114,12 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
     )  # fmt: skip
     errors = frame_errors(truth, estimates, span)
     shift_m = record.errors.map_shift_m
-    absolute, _ = ekf_errors(vehicle, span)
-    horizontal, vertical = ekf_errors(vehicle, span, shift_m)
+    absolute = ekf_errors(vehicle, span)
+    horizontal = ekf_errors(vehicle, span, shift_m)
     by_target = _target_errors(record, targets)
     still = {t.name for t in record.targets if isinstance(t, FixedPoint)}
     fixed = [e for name, e in by_target.items() if name in still]
-    moving = {name: e for name, e in by_target.items() if name not in still}
     by_target = {n: e for n, e in by_target.items() if n in still or len(e)}
-    accepted = np.isfinite(errors.translation_m)
     config = load_config(folder / "companion.yaml")
     summary = localization_summary(errors)
     fixed_targets = Spread.of(np.concatenate([*fixed, np.empty(0)]))
@@ -151,10 +139,7 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
         flown_m=_flown(vehicle, span),
         localizer=summary,
         localizer_m=Spread.of(errors.translation_m),
-        localizer_horizontal_m=Spread.of(errors.horizontal_m),
-        localizer_deg=Spread.of(errors.rotation_deg),
-        completeness_sent=100.0 * float(accepted.mean()) if len(accepted) else 0.0,
-        frames_sent=len(accepted),
+        frames_sent=len(errors.processed),
         frames_dropped=int((~errors.processed).sum()),
         ekf_horizontal_m=Spread.of(absolute),
         ekf_in_map_m=judged.ekf_m,
@@ -163,16 +148,11 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
         inside_level=bounds.inside_level,
         protection_m=bounds.level_m,
         map_kind=map_kind(TileCache.open(config.map)).line(),
-        ekf_vertical_m=Spread.of(vertical),
         home_error_m=record.home_error_m,
         fixed_targets_m=fixed_targets,
-        moving_targets_m=Spread.of(np.concatenate([*moving.values(), np.empty(0)])),
         targets_m={name: Spread.of(e) for name, e in by_target.items()},
-        target_fixes={name: len(e) for name, e in by_target.items()},
         stages_ms=stages,
-        camera_ms=record.camera.stage_ms,
         criteria=judge(judged),
-        warning=latency_warning(latency, config.bridge.injection.delay_ms),
         broken=record.broken,
         slow=_pace(record, scenario, errors, latency, config).complaint(),
     )
@@ -259,8 +239,8 @@ def print_report(report: FlightReport, folder: Path) -> None:
         known = advice(criterion.name)
         console.print(f"[red]{criterion.name}[/]: {known.meaning}. Look at: {known.look}.",
                       highlight=False)  # fmt: skip
-    for warning in filter(None, (report.warning, report.slow)):
-        console.print(f"[yellow]warning:[/] {warning}", highlight=False)
+    if report.slow is not None:
+        console.print(f"[yellow]warning:[/] {report.slow}", highlight=False)
     console.print(f"figures: [green]{folder}[/]/report.json")
 
 

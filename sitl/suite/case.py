@@ -109,18 +109,6 @@ class CaseEvent(StrictModel):
             for name, value in due.items()
         }
 
-    @property
-    def label(self) -> str:
-        """For the plot."""
-        parts = [f"{k}={v}" for k, v in {**self.fixes, **self.vehicle, **self.ramp}.items()]
-        if self.reset:
-            parts.append("reset")
-        if self.source_set is not None:
-            parts.append(f"set {self.source_set}")
-        if self.reboot:
-            parts.append("reboot")
-        return ", ".join(parts)
-
 
 class GroundSetup(StrictModel):
     """What is done before take-off. doctor: wrong parameters are found and mended by

@@ -178,9 +178,7 @@ class _CaseFlight:
 
     def _happen(self) -> None:
         while self._waiting and self._waiting[0].at_s <= self._now_s:
-            event = self._waiting.pop(0)
-            self._record.events.append((self._now_s, event.label))
-            self._do(event)
+            self._do(self._waiting.pop(0))
 
     def _ramp_on(self) -> None:
         event, begun_s, due_s = self._ramp or (None, 0.0, math.inf)

@@ -78,7 +78,6 @@ class CaseRecord:
     errors: list[tuple[float, float, float]] = field(default_factory=list)
     samples: list[VehicleSample] = field(default_factory=list)
     texts: list[Text] = field(default_factory=list)
-    events: list[tuple[float, str]] = field(default_factory=list)
     refusals: list[str] | None = None
     doctor: Doctor | None = None
     counters: Figures = field(default_factory=dict)
