@@ -60,7 +60,7 @@ def _flight(sheet: MapSheet) -> Image:
     figure.legend(loc="outside lower center", ncols=4, facecolor="0.7", framealpha=1.0)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return np.array(canvas.buffer_rgba(), np.uint8)[..., :3]
 
 
 def _written(picture: cv2.typing.MatLike, path: Path) -> Path:
