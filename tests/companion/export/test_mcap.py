@@ -135,11 +135,7 @@ def test_a_record_is_what_foxglove_expects(flight, small_assets):
     assert json.loads(point.geojson)["geometry"]["type"] == "Point"
 
     ((schema, _, event),) = messages["/events"]
-    assert (schema, event.message, event.level) == (
-        "foxglove.Log",
-        "no fixes",
-        event.WARNING,
-    )
+    assert (schema, event.message, event.level) == ("foxglove.Log", "no fixes", event.WARNING)
     assert attached == ["record.json"]
 
 

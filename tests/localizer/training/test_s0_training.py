@@ -68,9 +68,7 @@ def test_the_yaml_names_the_network(tmp_path: Path) -> None:
             load_config(path)
 
 
-def test_a_run_trains_resumes_and_writes_its_curve(
-    config: TrainConfig, trainer: Trainer, tmp_path: Path
-) -> None:
+def test_a_run_trains_resumes_and_writes_its_curve(config, trainer, tmp_path):
     assert isinstance(trainer.model, S0Net)
     assert trainer.model.strides == (4, 2, 1)
     parts = config.model_copy(update={"output": tmp_path})

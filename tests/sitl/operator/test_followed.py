@@ -14,7 +14,6 @@ from companion.flight.recorder import TARGET_COLUMNS
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
-from sitl.operator.follow_run import read_fixes
 from sitl.operator.followed import FollowedFix, follow_verdict
 
 SECOND = 10**9
@@ -72,28 +71,3 @@ def test_each_way_of_losing_it_is_told(chase: Chase) -> None:
     gap = [f for f in fixes(chase) if not chase.hidden_ns()[0][0] < f.time_ns < late]
     assert any("after a roof" in why for why in follow_verdict(gap, chase, end_ns).why)
     assert not follow_verdict([], chase, end_ns).is_followed
-
-
-def test_a_flight_s_record_is_judged_like_the_fixes_that_it_holds(
-    chase: Chase, tmp_path: Path
-) -> None:
-    told = fixes(chase)
-    rows: list[dict[str, Any]] = []
-    for number, some in ((1, told), (2, told[:3])):
-        for fix in some:
-            assert fix.velocity is not None
-            names = ("east", "north", "up")
-            place = {f"{a}_m": x for a, x in zip(names, fix.position, strict=True)}
-            velocity = {f"velocity_{a}": x for a, x in zip(names, fix.velocity, strict=True)}
-            cov = {f"cov_{k}": 0.04 * (k[0] == k[1]) for k in ("ee", "en", "eu", "nn", "nu", "uu")}
-            seen = {"visibility": "seen" if fix.is_seen else "hidden"}
-            head = {"exposure_time_ns": fix.time_ns, "target_id": f"ground station {number}"}
-            rows.append({**head, **place, **velocity, **cov, **seen})
-    read = read_fixes(reports(tmp_path / "targets.csv", rows), 1)
-    assert len(read) == len(told)
-    end_ns = chase.begins_ns() + 60 * SECOND
-    verdict, expected = follow_verdict(read, chase, end_ns), follow_verdict(told, chase, end_ns)
-    assert verdict.is_followed
-    assert verdict.p95_m == pytest.approx(expected.p95_m)
-    assert verdict.velocity_p95_mps == pytest.approx(0.0, abs=1e-6)
-    assert verdict.back_s == expected.back_s
