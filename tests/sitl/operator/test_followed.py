@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from companion.flight.recorder import TARGET_COLUMNS
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
 from sitl.operator.followed import FollowedFix, follow_verdict
 
 SECOND = 10**9
-
-
-def reports(path: Path, rows: list[dict[str, Any]]) -> Path:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, TARGET_COLUMNS, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
 
 
 @pytest.fixture
