@@ -1,13 +1,8 @@
-"""The reference page of all alerts, made from the catalogue.
-
-python -m companion.alerts.page docs/reference/alerts.md
-"""
+"""The reference page of all alerts, made from the catalogue."""
 
 from __future__ import annotations
 
 import re
-import sys
-from pathlib import Path
 
 from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
 from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
@@ -22,7 +17,7 @@ hide: [toc]
 
 # Alerts
 
-Made from the catalogue by `python -m companion.alerts.page`; do not edit.
+Made from the catalogue by `python -m benchmarks.site`; do not edit.
 
 An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `health.json` with its
 identifier. *Fix*: a position from vision. *Output held*: no position is sent. *Exclude and reset*:
@@ -52,7 +47,7 @@ _ACTIONS = {
 }
 
 
-def page() -> str:
+def alerts_page() -> str:
     """The page, Markdown."""
     return _HEAD + "".join(
         _TABLE.format(title) + "".join(map(_row, specs)) for title, specs in _GROUPS.items()
@@ -80,12 +75,3 @@ def _value(field: str, spec: AlertSpec) -> str:
         return f"[{MapOffsetUse.APPLIED}]"
     is_number = (isinstance(kind, str) and kind not in ("", "name")) or name == "ratio"
     return "N" if is_number else name.upper()
-
-
-def main() -> None:
-    """Write the page."""
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,1 +1,0 @@
-"""The reference page of the alert catalogue (`mavlink_bridge.alerts`)."""
