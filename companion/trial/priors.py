@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from companion.errors import FootageError
 from companion.geometry import ned_from_world
 from companion.recorded.flight import (
     Datum,
@@ -33,13 +34,15 @@ _LEAST_CLEARANCE_M, _MOST_CLEARANCE_M = 3.0, 10_000.0
 _IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not used at all
 _UNKNOWN_CLEARANCE_M = (15.0, 115.0)  # where cameras of small drones are
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
+_FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
 
 
 @dataclass(frozen=True)
 class FramePrior:
     """One frame's. pose: None where no position is known. sigma_m: horizontal; height_m: world z
-    and its sigma, half of the range where it is not known; clearance_m: above the map's ground.
+    and its sigma, half of the range where it is not known; clearance_m: above the map's ground;
+    was_searched: whether it is a search's result instead of telemetry.
     """
 
     pose: Pose | None
@@ -53,6 +56,7 @@ class FramePrior:
     measured: bool
     over_map: bool
     clearance_m: float
+    was_searched: bool = False
 
     @property
     def is_complete(self) -> bool:
@@ -122,6 +126,7 @@ class FlightPriors:
 
 def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     """What the flight's telemetry says over this map."""
+    _check_near(flight, cache)
     ground, frame = Ground(cache), cache.frame
     geoid_m = cache.manifest.geoid_separation_m
     places = [_enu(f.telemetry.position, frame) for f in flight.frames]
@@ -142,6 +147,35 @@ def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     ]
     notes += _assumptions(flight.frames, made)
     return FlightPriors(tuple(made), datum, tuple(notes))
+
+
+def _check_near(flight: RecordedFlight, cache: TileCache) -> None:
+    """`FootageError` where all positions lie far from the map, with the likely slip."""
+    told = [f.telemetry.position for f in flight.frames if f.telemetry.position is not None]
+    places = np.array([(p.latitude_deg, p.longitude_deg) for p in told]).reshape(-1, 2)
+    low, high = cache.index.box_min[:, :2].min(axis=0), cache.index.box_max[:, :2].max(axis=0)
+    reach_m = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))) + _FAR_M
+
+    def nearest_m(places: Array) -> float:
+        enu = [cache.frame.enu_from_geodetic(lat, lon, 0.0) for lat, lon in places]
+        return float(np.linalg.norm(enu, axis=1).min())
+
+    if not told or nearest_m(places) <= reach_m:
+        return
+    slips = {
+        "latitude and longitude are swapped": places[:, ::-1],
+        "the longitude's sign is wrong": places * [1, -1],
+        "the latitude's sign is wrong": places * [-1, 1],
+    }
+    fits = [what for what, p in slips.items() if np.abs(p[:, 0]).max() <= 90.0
+            and nearest_m(p) <= reach_m]  # fmt: skip
+    origin = cache.frame.origin
+    raise FootageError(
+        f"{flight.name}: its positions, the first latitude {places[0, 0]:.4f}, longitude "
+        f"{places[0, 1]:.4f}, lie {nearest_m(places) * 1e-3:,.0f} km from the map, which is at "
+        f"{origin.latitude_deg:.4f}, {origin.longitude_deg:.4f}: "
+        + (fits[0] if fits else "give the map of that place, which `try` without --map names")
+    )
 
 
 def _enu(position: RecordedPosition | None, frame: LocalFrame) -> Array | None:

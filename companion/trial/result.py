@@ -73,18 +73,22 @@ class Trial:
         return levels
 
     def search_outcome(self) -> tuple[int, int, int]:
-        """Frames that were searched without their position, found there, and found elsewhere."""
+        """Frames that were searched without their position, found there, and found elsewhere: far
+        from where they were recorded and from where their telemetry led, which may be off itself.
+        """
         right = wrong = 0
         for k, one in self.searched.items():
             if not one.accepted or one.pose is None:
                 continue
-            known = self.second[k].pose if self.second[k].accepted else self.priors[k].pose
-            if known is None:
-                right += 1  # nobody says otherwise
-                continue
-            sigma = 0.0 if self.second[k].accepted else self.priors[k].sigma_m
-            limit = max(_LEAST_SAME_M, _SAME_PLACE_SIGMAS * sigma)
-            near = horizontal_m(one.pose, known) <= limit
+            second, prior = self.second[k], self.priors[k]
+            limit_m = max(_LEAST_SAME_M, _SAME_PLACE_SIGMAS * prior.sigma_m)
+            known = [(second.pose, _LEAST_SAME_M)] if second.accepted else []
+            away = [
+                horizontal_m(one.pose, pose) <= limit
+                for pose, limit in (*known, (prior.pose, limit_m))
+                if pose is not None
+            ]
+            near = any(away) or not away  # where nobody says otherwise
             right, wrong = right + near, wrong + (not near)
         return len(self.searched), right, wrong
 
