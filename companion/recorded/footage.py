@@ -33,7 +33,7 @@ from companion.recorded.photo_tags import (
     PhotoTags,
     read_photo_tags,
 )
-from companion.recorded.places_file import PLACES_SUFFIXES, is_places_file, read_places
+from companion.recorded.places_file import PLACES_SUFFIXES, read_places
 from companion.recorded.sequence import is_sequence, read_sequence
 from companion.recorded.subtitles import Subtitles, read_subtitles
 from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
@@ -185,7 +185,7 @@ def _read_photos(
     turned = sum(int(t.exif.get("Orientation") or 1) not in (0, 1) for t in tags)
     if turned:
         notes.append(f"{turned} photos are marked as rotated; they are used as the sensor saw them")
-    frames = _with_places(frames, _places_file(folder, tags, options), notes)
+    frames = _with_places(frames, _places_file(folder, tags, options, notes), notes)
     frames.sort(key=lambda f: f.time_ns if f.time_ns is not None else 0)
     log = _log_file(folder, options)
     beside = None
@@ -275,15 +275,20 @@ def _camera_file(file: Path, width: int, height: int) -> CameraGuess:
         raise FootageError(f"{error}; or give the field of view alone, as --fov DEGREES") from error
 
 
-def _places_file(folder: Path, tags: Sequence[PhotoTags], options: FootageOptions) -> Path | None:
+def _places_file(
+    folder: Path, tags: Sequence[PhotoTags], options: FootageOptions, notes: list[str]
+) -> Path | None:
     if options.places is not None:
         return options.places
     names = {t.path.name for t in tags} | {t.path.stem for t in tags}
-    candidates = [
-        f
-        for f in files_of(folder, PLACES_SUFFIXES)
-        if is_places_file(f) and names & read_places(f).keys()
-    ]
+    candidates = []
+    for file in files_of(folder, PLACES_SUFFIXES):
+        try:
+            if names & read_places(file).keys():
+                candidates.append(file)
+        except FootageError as error:
+            if file.suffix.lower() == ".csv":
+                notes.append(f"not used: {error}")
     if len(candidates) > 1:
         told = ", ".join(f.name for f in candidates)
         raise FootageError(f"{folder}: several files hold places of the photos: {told}; choose one "

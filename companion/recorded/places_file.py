@@ -64,14 +64,6 @@ def read_places(path: Path) -> dict[str, Telemetry]:
     return places
 
 
-def is_places_file(path: Path) -> bool:
-    """Whether a text file holds places of photos."""
-    try:
-        return bool(read_places(path))
-    except FootageError:
-        return False
-
-
 def _rows(lines: list[str]) -> Iterator[tuple[int, list[str]]]:
     """Fields of the lines that hold some: by comma, semicolon, tab or blanks."""
     kept = [

@@ -20,12 +20,11 @@ from companion.recorded.flight import (
     RecordedFlight,
     RecordedFrame,
     RecordedPosition,
-    RecordedView,
 )
 from companion.recorded.photo_tags import looking_down
 from localizer.errors import MapCacheError
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.types import PosePrior
@@ -255,7 +254,8 @@ def _prior(
 ) -> FramePrior:  # fmt: skip
     telemetry = one.telemetry
     view = telemetry.view or looking_down(telemetry.course_deg)
-    at = frame.origin if telemetry.position is None else _geodetic(telemetry.position)
+    told = telemetry.position
+    at = frame.origin if told is None else Geodetic(told.latitude_deg, told.longitude_deg, 0.0)
     rotation = np.asarray(ned_from_world(frame, at).T @ view.ned_from_camera)
     base = ground_m if ground_m is not None else usual_m
     low, high = (base + c for c in _UNKNOWN_CLEARANCE_M)
@@ -264,19 +264,11 @@ def _prior(
         z, sigma = height.value_m, height.sigma_m
         is_known = sigma < _KNOWN_SHARE * (z - base)
     pose = None if place is None else Pose(rotation, np.array([place[0], place[1], z]))
-    sigma_m = telemetry.position.sigma_m if telemetry.position is not None else math.inf
+    sigma_m = told.sigma_m if told is not None else math.inf
     return FramePrior(
-        pose, rotation, sigma_m, z, sigma, is_known, view.tilt_sigma_deg, _heading(view),
+        pose, rotation, sigma_m, z, sigma, is_known, view.tilt_sigma_deg, view.heading_sigma_deg,
         view.measured, ground_m is not None, max(z - base, 1.0),
     )  # fmt: skip
-
-
-def _heading(view: RecordedView) -> float | None:
-    return view.heading_sigma_deg
-
-
-def _geodetic(position: RecordedPosition) -> Geodetic:
-    return Geodetic(position.latitude_deg, position.longitude_deg, 0.0)
 
 
 def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) -> list[str]:
@@ -294,8 +286,3 @@ def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) 
     if beside:
         notes.append(f"{beside} frames were taken beside the map")
     return notes
-
-
-def turned(rotation: Array, heading_rad: float) -> Array:
-    """A camera's rotation (3, 3) turned about the vertical, counter-clockwise."""
-    return np.asarray(so3_exp([0.0, 0.0, heading_rad]) @ rotation)

@@ -130,12 +130,12 @@ def _kind(share: float, trial: Trial, known: Array) -> str:
     if share < _SOME_SHARE:
         return NOT
     wrong = trial.search_outcome()[2]
-    spread = _spread_limit(trial)
+    spread = spread_limit_m(trial)
     scattered = len(known) > 0 and float(np.median(known)) > spread
     return PARTLY if share < _GOOD_SHARE or wrong or scattered else WORKS
 
 
-def _spread_limit(trial: Trial) -> float:
+def spread_limit_m(trial: Trial) -> float:
     """What positions may differ from GNSS by in the median: its own error, and 3 m of ours."""
     sigmas = [p.sigma_m for p in trial.priors if p.pose is not None]
     own = float(np.median(sigmas)) if sigmas else 0.0
