@@ -124,10 +124,10 @@ def write_dataflash(
         north, east, height, roll, pitch, yaw = motion(t)
         at = [round(1e7 * degrees) for degrees in place(north, east, origin)]
         up = [round(100 * metres) for metres in (origin[2] + height, height, origin[2] + height)]
-        turn = [round(math.degrees(a) * 100) for a in (roll, pitch, yaw)]
+        angles = [round(math.degrees(a) * 100) for a in (roll, pitch, yaw)]
         for name, when in (("TRIG", t - 0.2), ("CAM", t)):
             us = round((BOOT_S + when) * 1e6)
-            body += _row(name, us, 0, number, 0, 0, *at, *up, *turn[:2], turn[2] % 36000)
+            body += _row(name, us, 0, number, 0, 0, *at, *up, *angles[:2], angles[2] % 36000)
     path.write_bytes(body)
     return path
 

@@ -218,8 +218,8 @@ def test_photos_whose_exposures_are_logged_take_those(tmp_path, stamps, by):
 
 
 def test_exposures_at_equal_intervals_are_not_guessed():
-    exposures = [Telemetry(round((UTC_S + 2.0 * k) * 1e9)) for k in range(10)]
-    times = [e.time_ns + 300_000_000 for e in exposures]
+    at = [round((UTC_S + 2.0 * k) * 1e9) for k in range(10)]
+    exposures, times = [Telemetry(t) for t in at], [t + 300_000_000 for t in at]
     assert exposures_of(times, exposures) == tuple(exposures)
     assert exposures_of(times[2:8], exposures) is None  # five begins fit alike
     assert exposures_of([*times[:9], times[9] + 5 * 10**9], exposures) is None
