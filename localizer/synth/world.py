@@ -84,7 +84,9 @@ class WorldInfo:
 
     @classmethod
     def load(cls, folder: Path) -> WorldInfo:
-        """Read what `save` wrote."""
+        """Read what `save` wrote. `MapSourceError` if the file is missing, malformed or of another
+        format.
+        """
         path = Path(folder) / _INFO
         try:
             data = json.loads(path.read_text())

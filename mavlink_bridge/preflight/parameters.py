@@ -76,7 +76,9 @@ class ParameterClient(VehicleClient):
         return {name: self._values[name][0] for name in names if name in self._values}
 
     def write(self, name: str, value: float) -> None:
-        """Set a parameter and check what the flight controller made of it."""
+        """Set a parameter and check what the flight controller made of it. `ParameterError` if it
+        has no such parameter or did not take the value.
+        """
         if self.read(name) is None:
             raise ParameterError(f"{name}: the flight controller has no such parameter")
         kind = self._values[name][1]
