@@ -62,6 +62,8 @@ def test_only_a_new_start_is_a_jump(states, counts):
     for state in states:
         injection.add_estimate(_estimate(state), None)
     assert [fix.reset_count for fix in bridge.fixes] == counts
+    sent = [state for state in states if state in (TRACKING, BRIDGING)]
+    assert [fix.by_odometry for fix in bridge.fixes] == [state is BRIDGING for state in sent]
 
 
 def test_what_is_rejected_or_unconfirmed_is_not_injected():
@@ -90,14 +92,6 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
     widths = [fix.position_covariance_ned[0, 0] for fix in bridge.fixes]
     assert widths == pytest.approx([4e-4, 1e-4])
     assert [fix.position_covariance_ned[0, 0] for fix in seen] == pytest.approx([1e-4] * 3)
-
-
-def test_a_fix_of_the_odometry_says_so():
-    bridge = FakeBridge()
-    injection = FixInjection(bridge, INSTALLATION)
-    for state in (TRACKING, BRIDGING):
-        injection.add_estimate(_estimate(state), None)
-    assert [fix.by_odometry for fix in bridge.fixes] == [False, True]
 
 
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():

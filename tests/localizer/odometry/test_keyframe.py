@@ -40,13 +40,6 @@ def test_map_points_keep_their_places_and_get_the_pictures_features(hills):
     )
 
 
-def test_the_count_is_kept(hills):
-    anchors, _ = keyframe_anchors(
-        hills.frame(3).features, CAMERA, hills.pose(3), hills.surface(3), None, 200
-    )
-    assert len(anchors.points_world) == 200
-
-
 def test_the_ground_fills_what_the_map_leaves(hills):
     """The map ends in the middle of the picture: each half gets its own depth."""
     surface, pose = hills.surface(3), hills.pose(3)
@@ -72,15 +65,6 @@ def test_rays_meet_the_ground_where_it_is(ground):
     assert met.all()
     np.testing.assert_allclose(points[:, 2], ground.height(*points.T[:2]), atol=0.01)
     np.testing.assert_allclose(CAMERA.project(POSE.inverse.apply(points))[0], pixels, atol=1e-6)
-
-
-def test_the_sky_has_no_ground():
-    level = camera_pose(np.array([0.0, 0.0, 50.0]), 5.0, 0.0)
-    pixels = np.array([[80.0, 5.0], [80.0, 115.0]])
-    _, met = ground_points(FlatGround(0.0), level, CAMERA, pixels)
-    assert met.tolist() == [False, True]
-    _, met = ground_points(FlatGround(60.0), level, CAMERA, pixels)  # a camera below the ground
-    assert not met.any()
 
 
 def test_features_on_the_gpu_are_refused(hills):
