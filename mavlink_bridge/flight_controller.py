@@ -13,7 +13,7 @@ from mavlink_bridge.alerts.catalogue import CATALOGUE, alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
-from mavlink_bridge.config import BridgeConfig, Mode
+from mavlink_bridge.config import WITHOUT_SOURCE_SET, BridgeConfig, Mode
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
 from mavlink_bridge.injection.interlock import ShadowInterlock
@@ -107,7 +107,7 @@ class FlightControllerEnd:
         that tells what it is told by us (GPS_INPUT) is none; nor is one beside which we are fused.
         """
         current = self.sources.current
-        unswitched = ("gps_input", "external_position_estimate")
+        unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
         if self._shared.config.injection.message in unswitched and (
             current is None or self.sender.fed(now_ns)
         ):
@@ -209,8 +209,6 @@ class FlightControllerEnd:
         elif kind == "STATUSTEXT":
             if not getattr(message, "chunk_seq", 0):  # a longer text's middle begins anyhow
                 self.sources.on_text(str(message.text))
-            sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
-            self._shared.on_vehicle_text(int(message.severity), str(message.text), sender)
         elif kind == "RC_CHANNELS" and self._shared.enable is not None:
             self._shared.enable.channels(self._tracker.snapshot(time_ns).rc_channels_us)
 

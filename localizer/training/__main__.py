@@ -92,20 +92,6 @@ def export(
     )
 
 
-@app.command("make-trainable")
-def make_trainable(
-    model: Annotated[Path, typer.Argument(help="Published ONNX model of this network.")],
-    out: Annotated[Path, typer.Argument(help="Checkpoint to write, for a run's warm_start.")],
-    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
-) -> None:
-    """Make a published model trainable again."""
-    from localizer.training.checkpoint import write_checkpoint
-    from localizer.training.export.from_published import shard_images, trainable_network
-
-    network = trainable_network(model, list(shard_images(shards)))
-    write_checkpoint(out, {"average": network.state_dict()})
-
-
 @app.command()
 def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -> None:
     """Plot a run's metrics beside its CSV."""

@@ -42,8 +42,9 @@ class FakeBridge:
 def _estimate(state, accepted=True):
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
     return PoseEstimate(
-        pose, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, accepted, 5, 0, CAMERA
-    )
+        pose, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, accepted, 5, 0, CAMERA,
+        scale_sigma=0.2 if state is BRIDGING else None,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -92,6 +93,15 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
     widths = [fix.position_covariance_ned[0, 0] for fix in bridge.fixes]
     assert widths == pytest.approx([4e-4, 1e-4])
     assert [fix.position_covariance_ned[0, 0] for fix in seen] == pytest.approx([1e-4] * 3)
+
+
+def test_a_fix_of_the_odometry_says_so():
+    bridge = FakeBridge()
+    injection = FixInjection(bridge, INSTALLATION)
+    for state in (TRACKING, BRIDGING):
+        injection.add_estimate(_estimate(state), None)
+    assert [fix.by_odometry for fix in bridge.fixes] == [False, True]
+    assert bridge.fixes[1].scale_sigma == 0.2
 
 
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():

@@ -5,7 +5,7 @@ import pytest
 
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.config import GrowthModel
-from localizer.odometry.growth import carried, fused, without_constant_error
+from localizer.odometry.growth import carried, fused, stretched, without_constant_error
 from localizer.registration import attitude_constraint, combine, height_constraint
 
 MODEL = GrowthModel(scale=0.01, horizontal=0.1, vertical=0.2, tilt=1e-3, heading=2e-3)
@@ -22,6 +22,19 @@ def test_a_carried_pose_errs_as_its_keyframe_does():
     np.testing.assert_allclose(
         carried(SIGMA, lever)[:3, :3], expected, atol=0.06 * expected.diagonal().max()
     )
+
+
+def test_a_way_back_does_not_take_back_what_another_ground_added():
+    """Out over a valley and back over a hill, with errors that are opposite, alike or neither."""
+    out = np.array([300.0, 0.0, 0.0])
+    half = stretched(np.zeros((3, 3)), 0.1, 0.5 * out)
+    assert stretched(half, 0.1, 0.5 * out)[0, 0] ** 0.5 == pytest.approx(30.0)
+    there = stretched(stretched(np.zeros((3, 3)), 0.1, out), 0.2, -out)
+    assert there[0, 0] ** 0.5 == pytest.approx(30.0 + 60.0)
+    corner = stretched(stretched(np.zeros((3, 3)), 0.1, out), 0.1, np.array([0.0, 300.0, 0.0]))
+    for share in (-1.0, 0.0, 1.0):  # correlation of the two
+        whole = 900.0 * np.array([[1.0, share], [share, 1.0]])
+        assert np.linalg.eigvalsh(corner[:2, :2] - whole)[0] > -1e-9
 
 
 def test_a_sensor_is_weighed_against_what_is_known():

@@ -8,7 +8,7 @@ import pytest
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
 from localizer.odometry import DepthSource, FlatGround
-from localizer.odometry.ground import ground_points
+from localizer.odometry.ground import ground_points, height_above_ground
 from localizer.odometry.keyframe import keyframe_anchors
 from localizer.registration.sampling import sample_features
 from tests.localizer.odometry.conftest import CAMERA
@@ -80,3 +80,15 @@ def test_the_ground_is_below_the_roofs():
     heights = np.r_[rng.normal(12.0, 0.3, 600), rng.uniform(16.0, 30.0, 400)]
     points = np.column_stack([rng.uniform(0, 100, (1000, 2)), heights])
     assert FlatGround.under(points).height_m == pytest.approx(12.0, abs=0.4)
+
+
+def test_an_uncertain_place_above_a_slope_is_at_an_uncertain_height_above_the_ground():
+    """10 m of sigma across 20 % of slope are 2 m of height; along the slope's contours none."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-50, 50, (500, 2)), np.zeros(500)])
+    points[:, 2] = 0.2 * points[:, 0] + rng.normal(0, 0.5, 500)
+    place = np.array([0.0, 0.0, 80.0])
+    for variance, expected in (((100.0, 0.0, 1.0), 5**0.5), ((0.0, 100.0, 1.0), 1.0)):
+        above, sigma = height_above_ground(points, np.diag(variance), place)
+        assert above == pytest.approx(80.0, abs=1.0)
+        assert sigma == pytest.approx(expected, rel=0.05)

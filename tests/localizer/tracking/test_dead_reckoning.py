@@ -76,7 +76,7 @@ class _HeardOdometry:
 
     told: ClassVar[list[float]] = []
 
-    def __init__(self, *_: Any) -> None:
+    def __init__(self, *_: Any, **__: Any) -> None:
         self.ready = True
 
     def begin(self, *_: Any, constraint: PoseConstraint, **__: Any) -> None:

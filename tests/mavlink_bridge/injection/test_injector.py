@@ -471,7 +471,13 @@ def test_gps_input_without_velocity_sets_the_ignore_flags() -> None:
 
 
 def deltas(
-    *, speed: float, fix_hz: float = 10.0, yaw: float = 0.0, late: int = 40 * MS, **where: Any
+    *,
+    speed: float,
+    fix_hz: float = 10.0,
+    yaw: float = 0.0,
+    late: int = 40 * MS,
+    scale_sigma: float | None = 0.1,
+    **where: Any,
 ) -> list[tuple[int, Any]]:
     """What is sent instead of positions that are withheld, on the way north."""
     it, sent = injector(rate_hz=10, delay_ms=100), []
@@ -479,7 +485,8 @@ def deltas(
     for t in range(SECOND, 4 * SECOND, MS):
         if (t - late) % period == 0:
             north = speed * (t - late) / SECOND
-            it.submit(fix(t - late, north, yaw_rad=yaw, position_withheld=True), t)
+            how = {"position_withheld": True, "scale_sigma": scale_sigma}
+            it.submit(fix(t - late, north, yaw_rad=yaw, **how), t)
         assert it.step(t, vehicle) is None
         if (delta := it.motion.take()) is not None:
             sent.append((t, delta))
@@ -501,10 +508,13 @@ def test_of_a_withheld_position_only_its_change_is_sent_in_body_axes() -> None:
 
 
 def test_no_change_of_position_is_sent_that_the_autopilot_would_believe_too_much() -> None:
-    """Too fast for the largest error that it can be told; too long apart; late; a wrong heading;
-    PX4.
+    """Too fast, or the height above the ground too uncertain, for the largest error that it can be
+    told; too long apart; late; a wrong heading; PX4.
     """
     assert deltas(speed=25.0) == []
+    assert deltas(speed=10.0, scale_sigma=0.25) == []
+    assert deltas(speed=5.0, scale_sigma=0.25)
+    assert deltas(speed=10.0, scale_sigma=None) == []
     assert deltas(speed=10.0, fix_hz=1.0) == []
     assert deltas(speed=10.0, late=300 * MS) == []
     assert deltas(speed=10.0, profile=PX4) == []

@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig
-from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge.config import InjectionConfig, OriginConfig, SourceSwitchConfig
 from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import VehicleState
@@ -407,6 +407,28 @@ def test_px4_is_asked_for_its_own_failsafes(autopilot, monkeypatch):
     found = {f.name: f.found for f in examine(settings).findings}
     assert found["when vision ends"].startswith("LAND")
     assert "FS_EKF_ACTION" not in found
+    assert "source switch" not in found
+
+
+def test_px4_has_no_source_sets_to_switch(autopilot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = DoctorFinding("connection", "px4", "a heartbeat", "", True, True)
+    known = ([link], VehicleState(autopilot="px4"))
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
+    autopilot.autopilot, autopilot.parameters = mavlink.MAV_AUTOPILOT_PX4, {"EKF2_EV_CTRL": 1.0}
+    switched = config(autopilot.port).model_copy(
+        update={"switch": SourceSwitchConfig(enabled=True)}
+    )
+    (finding,) = (f for f in examine(switched).findings if f.name == "source switch")
+    assert not finding.ok
+    assert finding.required
+
+
+@pytest.mark.parametrize("message", ["global_position_sensor", "external_position_estimate"])
+def test_what_is_fused_beside_gnss_is_not_switched_to(message: Any) -> None:
+    with pytest.raises(ValueError, match=f"{message}.*no source set: remove switch.enabled"):
+        BridgeConfig(
+            injection=InjectionConfig(message=message), switch=SourceSwitchConfig(enabled=True)
+        )
 
 
 def test_a_vehicle_without_these_parameters_gets_no_such_line(autopilot: Any) -> None:
