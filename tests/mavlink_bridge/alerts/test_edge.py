@@ -18,7 +18,7 @@ READS = "mavlink_bridge.alerts.reading"
 RENDERS = {"text", "body", "reason"}
 EDGES = {  # STATUSTEXT, records and pages
     "mavlink_bridge/status.py", "mavlink_bridge/injection/shadow.py",
-    "companion/alerts/page.py", "companion/flight/component_table.py", "companion/flight/health.py",
+"companion/flight/component_table.py", "companion/flight/health.py",
     "companion/live/orders.py", "companion/live/shown.py", "companion/offline/shadow_check.py",
     "companion/supervision/supervisor.py",
 }  # fmt: skip
