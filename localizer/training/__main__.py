@@ -92,6 +92,20 @@ def export(
     )
 
 
+@app.command()
+def quantize(
+    model: Annotated[Path, typer.Argument(help="ONNX model of `tiny` in float32.")],
+    out: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
+    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) that set the scales.")],
+) -> None:
+    """Write a model's costly convolutions in eight bits, for processors with VNNI."""
+    from localizer.training.export.from_published import shard_images
+    from localizer.training.export.quantize import quantize as write
+
+    cosine = write(model, out, list(shard_images(shards)))
+    typer.echo(f"{out}: least mean cosine to {model} {cosine:.4f}")
+
+
 @app.command("make-trainable")
 def make_trainable(
     model: Annotated[Path, typer.Argument(help="Published ONNX model of this network.")],

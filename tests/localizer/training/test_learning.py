@@ -22,7 +22,8 @@ from localizer.training.data.batches import LoaderConfig, collate, crop_pair, mi
 from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
-from localizer.training.export.from_published import trainable_network  # noqa: E402
+from localizer.training.export.from_published import shard_images, trainable_network  # noqa: E402
+from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.ablation import ablations  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer, learning_rate, perturbed  # noqa: E402
@@ -258,6 +259,12 @@ def test_export_is_checked_against_torch(config: TrainConfig, tmp_path: Path) ->
     assert [level.stride for level in extractor.info.levels] == [8, 4, 2]
     text = model.with_suffix(".json").read_text()
     assert str(config.data.shards) not in text
+    images = list(shard_images(sorted(config.data.shards.glob("*.npz"))))
+    smaller = model.with_name("tiny-int8.onnx")
+    assert quantize(model, smaller, images) > 0.99
+    assert OnnxExtractor(smaller, threads=1).info.name == "tiny-int8"
+    with pytest.raises(ModelError, match="0 images"):
+        quantize(model, smaller, [])
 
 
 def test_a_published_model_becomes_trainable_again(config: TrainConfig, tmp_path: Path) -> None:
