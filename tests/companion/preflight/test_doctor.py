@@ -52,7 +52,9 @@ def test_a_good_deployment(map_cache, feed):
         "power mode",
     }
     assert all(findings[name].ok for name in ("map", "localizer", "camera"))
-    assert findings["localizer"].found.startswith("tiny (onnxruntime, ")
+    assert findings["localizer"].found.startswith("tiny")
+        ("tiny (onnxruntime, ", "tiny-int8 (onnxruntime, ")
+    )
     assert "numba" in findings["localizer"].found
     assert findings["camera"].found == "160x120, 20.0 Hz"
     assert "tiles" in findings["map"].found
