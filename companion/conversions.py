@@ -28,7 +28,7 @@ from localizer.geometry.pose import (
     quaternion_from_matrix,
 )
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.types import PoseEstimate, PosePrior, TargetFix, TrackingState, Visibility
+from localizer.types import PoseEstimate, PosePrior, TargetFix, Visibility
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -84,7 +84,7 @@ def vision_fix(
         attitude_sigma_rad=float(np.sqrt(estimate.covariance.diagonal()[3:].max())),
         reset_count=reset_count,
         quality=round(100 * min(max(estimate.quality, 0.0), 1.0)),
-        by_odometry=estimate.state is TrackingState.BRIDGING,
+        scale_sigma=estimate.scale_sigma,
     )
 
 

@@ -167,7 +167,8 @@ class PoseEstimate:
 
     state: INITIALIZING for a single photo, which cannot be confirmed. BRIDGING estimates come from
     odometry with a growing covariance. focal: the fitted focal length, if it was fitted
-    (`LocalizerConfig.focal_fit_s`) and observable.
+    (`LocalizerConfig.focal_fit_s`) and observable. scale_sigma: of BRIDGING, the share by which its
+    way and velocity may be too long or too short; None otherwise.
     """
 
     world_from_camera: Pose
@@ -182,6 +183,7 @@ class PoseEstimate:
     stage_ms: dict[str, float] = field(default_factory=dict)
     last_fix_ns: int | None = None
     focal: FocalFit | None = None
+    scale_sigma: float | None = None
 
 
 def _up() -> Array:

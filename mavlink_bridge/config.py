@@ -16,6 +16,7 @@ InjectionMessage = Literal[
     "global_position_sensor",
     "external_position_estimate",
 ]
+WITHOUT_SOURCE_SET = ("external_position_estimate", "global_position_sensor")
 Mode = Literal["off", "shadow", "inject", "rc"]
 
 
@@ -293,10 +294,10 @@ class BridgeConfig(StrictModel):
 
     @model_validator(mode="after")
     def _message_has_a_source_set(self) -> BridgeConfig:
-        if self.switch.enabled and self.injection.message == "external_position_estimate":
+        message = self.injection.message
+        if self.switch.enabled and message in WITHOUT_SOURCE_SET:
             raise ValueError(
-                "external_position_estimate is fused beside GNSS and has no source set: remove "
-                "switch.enabled"
+                f"{message} is fused beside GNSS and has no source set: remove switch.enabled"
             )
         return self
 

@@ -13,7 +13,7 @@ from mavlink_bridge.alerts.catalogue import CATALOGUE, alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
-from mavlink_bridge.config import BridgeConfig, Mode
+from mavlink_bridge.config import WITHOUT_SOURCE_SET, BridgeConfig, Mode
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
 from mavlink_bridge.injection.interlock import ShadowInterlock
@@ -107,7 +107,7 @@ class FlightControllerEnd:
         that tells what it is told by us (GPS_INPUT) is none; nor is one beside which we are fused.
         """
         current = self.sources.current
-        unswitched = ("gps_input", "external_position_estimate")
+        unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
         if self._shared.config.injection.message in unswitched and (
             current is None or self.sender.fed(now_ns)
         ):

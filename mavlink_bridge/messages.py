@@ -118,8 +118,9 @@ class VisionFix:
     protection_m: tuple[float, float] | None = None
     """What the horizontal and the vertical error exceed at the stated risk at most; None where
     nobody says."""
-    by_odometry: bool = False
-    """Carried on from an earlier fix: the errors of two in a row are alike."""
+    scale_sigma: float | None = None
+    """Of one that odometry carried on from an earlier fix: the share by which its velocity may be
+    wrong. The errors of two in a row are alike. None of any other."""
     position_withheld: bool = False
     """The position is too uncertain to be sent; its change since the fix before is not."""
 
@@ -141,12 +142,17 @@ class VisionFix:
             raise FixError(
                 f"vision fix: protection levels must not be negative, got {self.protection_m}"
             )
-        sigmas = (self.attitude_sigma_rad, self.velocity_sigma_mps)
+        sigmas = (self.attitude_sigma_rad, self.velocity_sigma_mps, self.scale_sigma or 0.0)
         if not all(0.0 <= sigma <= _LARGEST_SIGMA for sigma in sigmas):
             raise FixError(
-                f"vision fix: attitude and velocity sigma must be 0 to {_LARGEST_SIGMA:g}, got "
+                f"vision fix: attitude, velocity, scale sigma must be 0 to {_LARGEST_SIGMA:g}, got "
                 f"{sigmas}"
             )
+
+    @property
+    def by_odometry(self) -> bool:
+        """Whether odometry carried it on from an earlier fix."""
+        return self.scale_sigma is not None
 
     @property
     def horizontal_sigma_m(self) -> float:

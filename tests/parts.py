@@ -44,7 +44,6 @@ RUNS_ALONE = (
     "tests/companion/sources/test_rtsp.py",
     "tests/sitl/demo/test_flight.py",
     "tests/sitl/suite/test_loop_flights.py",
-    "tests/test_real_time.py",
 )
 
 # Where the parts find what is dear to build (tests/conftest.py); a folder that lives as long.
@@ -89,9 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run all parts with pytest's arguments; pytest's exit code, or mypy's if that alone failed."""
     with tempfile.TemporaryDirectory(prefix="tests-") as shared, _beside(_MYPY) as types:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
-        codes = {
-            SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*WORKERS, *arguments], common | _ONE_CORE),
-        }
+        codes = {SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*WORKERS, *arguments], common | _ONE_CORE)}
         types_code = _told(types)  # before what needs its processors for itself
         codes |= {
             VEHICLES: _run(VEHICLES, [*WORKERS, *arguments], common | _ONE_CORE),

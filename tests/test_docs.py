@@ -80,11 +80,6 @@ def test_every_leaf_of_the_hazard_analysis_has_its_test_and_each_test_exists():
     assert set().union(*held.values()) - known == set()
 
 
-def test_the_readme_is_read_as_text_too():
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert max(map(len, lines)) <= 120
-
-
 def test_generated_pages_are_of_today():
     assert not outdated(ROOT), "python -m benchmarks.site"
 

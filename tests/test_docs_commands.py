@@ -93,19 +93,3 @@ def strangers(line: str) -> list[str]:
 def test_commands_and_their_options_exist(page: Path) -> None:
     found = {line.strip(): strangers(line) for line in lines(page.read_text(encoding="utf-8"))}
     assert not {line: names for line, names in found.items() if names}
-
-
-@pytest.mark.parametrize(
-    ("line", "named"),
-    [
-        ("python -m benchmarks.basin_parts FOLDER", "benchmarks.basin_parts"),
-        ("python -m benchmarks.basin axes F --plots x", "--plots"),
-        ("companion map bild a.tif", "companion map bild"),
-        (".venv/bin/companion evil S", "companion evil"),
-        ("companion eval S --maps C", "--maps"),
-        (".venv/bin/python -m sitl loops --fc both", "sitl loops"),
-        ('make demo ARGS="--sed 3"', "--sed"),
-    ],
-)
-def test_what_is_not_there_is_seen(line: str, named: str) -> None:
-    assert strangers(line) == [named]

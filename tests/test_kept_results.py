@@ -8,7 +8,6 @@ import pytest
 from benchmarks.site.forms import tables_of
 from benchmarks.site.kept import DATA, Kept, PrintedTable, load, save, with_tables
 from companion.errors import ReportError
-from companion.versions import made_by
 
 ROOT = Path(__file__).parents[1]
 KEPT = Kept(
@@ -103,23 +102,3 @@ def test_every_kept_result_stands_on_a_page():
     for path in (ROOT / DATA).glob("*.json"):
         assert load(path).command
         assert f"data/{path.name}" in pages, path
-
-
-def test_reports_name_commit_and_processor():
-    found = made_by()
-    assert found["processor"].split(" x ")[0].isdigit()
-    if (ROOT / ".git").exists():
-        assert len(found["commit"].rstrip("+")) >= 7
-
-
-def test_rates_of_several_runs_stand_together_without_their_stages(tmp_path):
-    run = {"width": 320, "cores": 2, "offered": "two at a time", "frames_answered": 279,
-           "frames_offered": 280, "frames_per_s": 37.8, "latency_p50_ms": 48.5,
-           "latency_p95_ms": 75.9, "cpu_ms_per_frame": 43.3, "share_percent": 81.9,
-           "median_m": 0.159, "p95_m": 0.307}  # fmt: skip
-    paths = [tmp_path / "a.json", tmp_path / "b.json"]
-    for path in paths:
-        path.write_text(json.dumps({"rows": [run, {"width": 320, "stage_ms": {"all": 61.0}}]}))
-    table, _ = tables_of(paths, "")
-    assert len(table.rows) == 2
-    assert table.rows[0][3:6] == ("279 of 280", "37.8", "48 / 76")

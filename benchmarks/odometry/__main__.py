@@ -33,7 +33,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.odometry import GrowthModel, OdometryConfig
+from localizer.map.inspection.kind import map_kind
+from localizer.map.relief import ground_uncertainty
+from localizer.odometry import GroundUncertainty, GrowthModel, OdometryConfig
 from localizer.registration import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
@@ -72,7 +74,10 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
         info = WorldInfo.load(args.terrain)
         terrain = _Terrain(info, info.origin.height_m - known.cache.frame.origin.height_m)
     renderers = NumbaRenderer(seen, 1), NumbaRenderer(known, 1)
-    scene = FlownScene(args.map.parent.name, *renderers, camera, terrain)
+    unknown = ground_uncertainty(known.cache.index, map_kind(known.cache))
+    if args.fit:
+        unknown = GroundUncertainty(0.0, 0.0, 0.0)
+    scene = FlownScene(args.map.parent.name, *renderers, camera, terrain, unknown)
     extractor = DetailExtractor(load_extractor(threads=1, size=(camera.width, camera.height)))
     config = OdometryConfig()
     if args.fit:

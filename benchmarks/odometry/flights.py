@@ -15,6 +15,7 @@ from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.odometry import (
+    GroundUncertainty,
     OdometryConfig,
     OdometryFrame,
     TerrainModel,
@@ -68,13 +69,16 @@ class FlownStretch:
 
 @dataclass(frozen=True)
 class FlownScene:
-    """Where it is flown. seen: renders the world as it is; known: the map's geometry."""
+    """Where it is flown. seen: renders the world as it is; known: the map's geometry; ground: what
+    it does not say of the ground.
+    """
 
     name: str
     seen: MapRenderer
     known: MapRenderer
     camera: Camera
     terrain: TerrainModel | None
+    ground: GroundUncertainty
 
 
 class Flyer:
@@ -114,8 +118,11 @@ class Flyer:
         ]
 
     def _odometry(self, depth: str) -> VisualOdometry:
-        ground = self._scene.terrain if depth == "ground" else None
-        return VisualOdometry(self._scene.camera, self._optimizer, self._config, ground)
+        scene = self._scene
+        terrain = scene.terrain if depth == "ground" else None
+        return VisualOdometry(
+            scene.camera, self._optimizer, self._config, terrain, uncertainty=scene.ground
+        )
 
     def _ranges(self, stretch: TestStretch) -> dict[int, float]:
         """A rangefinder's readings by number of the frame: what lies below in the seen world, roofs

@@ -20,6 +20,7 @@ from companion.integrity_monitor.jump import JumpCheck
 from companion.integrity_monitor.motion import MotionCheck, MotionVerdict
 from companion.integrity_monitor.position_checks import GnssCheck, HeightCheck
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
+from companion.integrity_monitor.scale import ScaleCheck
 from companion.integrity_monitor.step import StepUncertainty
 from companion.integrity_monitor.tilt import TiltCheck
 from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
@@ -75,6 +76,7 @@ class IntegrityChecks:
         self._pictures = FrozenVideoDetector(config.picture)
         self._track = track or InertialTrack()
         self._motion = MotionCheck(config.motion, self._track)
+        self._scale = ScaleCheck(self._track)
         self._height = HeightCheck(config)
         self._gnss = GnssCheck(config)
         self._jumps = JumpCheck(config)
@@ -173,7 +175,8 @@ class IntegrityChecks:
         held: bool = False,
     ) -> VisionFix | None:
         """The fix, if it may be injected; with another reset count where the last were wrong. One
-        of the odometry that its protection level alone speaks against is `position_withheld`.
+        of the odometry that its protection level alone speaks against is `position_withheld`, and
+        its velocity as uncertain as the IMU has found it wrong.
 
         attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
         reason against it.
@@ -198,7 +201,10 @@ class IntegrityChecks:
         if self.action >= OutputAction.HOLD or not admitted:
             self._wrong += self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
             moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
-            return replace(fix, position_withheld=True) if moves_right else None
+            if not moves_right:
+                return None
+            scale = max(fix.scale_sigma or 0.0, self._scale.wrong_by)
+            return replace(fix, position_withheld=True, scale_sigma=scale)
         if held:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The
@@ -254,6 +260,7 @@ class IntegrityChecks:
                 return
             self._waiting.popleft()
             self._verdict = self._motion.add(fix, leaps=leaps)
+            self._scale.add(fix, leaps=leaps)
             self._height_reading = self._height.add(fix, state)
 
     # --- judgement ----------------------------------------------------------------------------

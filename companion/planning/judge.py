@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -14,6 +14,9 @@ from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import RISK_LIMIT
 from localizer.odometry.config import GrowthModel, OdometryConfig
 
+_HILLS = (
+    0.1  # scale error over ground that is not known, mean of the first 150 m at 100 m of height
+)
 _LEAST_MAP_SHARE = 0.5  # of the picture: with less it is the map that ends
 _LIKENESS = 0.7  # of another place's match, beyond which it may be taken for this one
 
@@ -147,7 +150,7 @@ def stretches(
                 found[-1] = (start, end, before + seconds, beside or off_map)
             else:
                 found.append((begin, end, seconds, off_map))
-    outside = odometry.with_ground if terrain else odometry.with_plane
+    outside = odometry.with_ground if terrain else replace(odometry.with_plane, scale=_HILLS)
     return tuple(_stretch(*one, odometry, outside) for one in found)
 
 

@@ -80,9 +80,12 @@ def is_acceptable(
     """Whether one registration may be used. distance_squared: Mahalanobis, from the prediction;
     prior_sigma_m: of the prediction's horizontal place, the larger axis.
     """
-    if result.status is not RegistrationStatus.OK or result.overlap < config.min_overlap:
+    # What is not a number fails a comparison, so each must hold.
+    if result.status is not RegistrationStatus.OK or not result.overlap >= config.min_overlap:
         return False
-    if result.focal_gain > config.max_focal_gain or distance_squared > config.chi2_threshold:
+    if not (
+        result.focal_gain <= config.max_focal_gain and distance_squared <= config.chi2_threshold
+    ):
         return False
     return log_odds(result) >= config.min_log_odds + ambiguity(config, prior_sigma_m)
 

@@ -2,7 +2,7 @@
 
 from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
-from localizer.odometry.ground import FlatGround, TerrainModel
+from localizer.odometry.ground import FlatGround, GroundUncertainty, TerrainModel
 from localizer.odometry.keyframe import DepthSource
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
 from localizer.odometry.usability import ImageFault, Usability, UsabilityConfig, examine
@@ -10,6 +10,7 @@ from localizer.odometry.usability import ImageFault, Usability, UsabilityConfig,
 __all__ = [
     "DepthSource",
     "FlatGround",
+    "GroundUncertainty",
     "GrowthModel",
     "ImageFault",
     "OdometryConfig",

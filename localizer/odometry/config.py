@@ -15,7 +15,7 @@ class GrowthModel:
     root of a metre flown, from keyframe to keyframe; scale is an error that stays.
     """
 
-    scale: float  # scale sigma, as a share of the distance
+    scale: float  # scale sigma over ground of known height, as a share of the distance
     horizontal: float  # walk of east and north, m per root m
     vertical: float  # walk of the height, m per root m
     tilt: float  # walk of roll and pitch, rad per root m
@@ -65,7 +65,7 @@ class OdometryConfig:
     with_range: GrowthModel = GrowthModel(
         registration=49.0, scale=0.045, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
     )
-    # growth over ground taken as level
+    # growth over ground taken as level: as over that of a rangefinder, and `GroundUncertainty`
     with_plane: GrowthModel = GrowthModel(
-        registration=49.0, scale=0.1, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
+        registration=49.0, scale=0.045, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
     )

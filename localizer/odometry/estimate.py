@@ -48,7 +48,8 @@ class OdometryEstimate:
     the keyframe. reason: of a status that is not OK, for people. bridged_s, way_m: time and way
     since the pose was last known otherwise (`begin`). drift_m: radius that the horizontal error
     added since then stays within in 95 % of cases. keyframe_age_s: since the keyframe's exposure.
-    source: of the keyframe's depth.
+    source: of the keyframe's depth. scale_sigma: share by which way and velocity may be too long or
+    too short, as the height above the ground is.
     """
 
     world_from_camera: Pose
@@ -62,6 +63,7 @@ class OdometryEstimate:
     drift_m: float
     keyframe_age_s: float
     source: DepthSource
+    scale_sigma: float
 
     @property
     def usable(self) -> bool:

@@ -31,11 +31,19 @@ def walked(model: GrowthModel, way_m: float) -> Array:
     return np.diag(rates**2 * max(way_m, 0.0))
 
 
-def scaled(model: GrowthModel, displacement: Array) -> Array:
-    """Covariance (6, 6) of an error of scale that is the same all along a displacement (3,)."""
-    added = np.zeros((6, 6))
-    added[:3, :3] = model.scale**2 * np.outer(displacement, displacement)
-    return added
+def stretched(known: Array, scale: float, displacement: Array) -> Array:
+    """Covariance (3, 3) of what errors of scale add, after one more displacement (3,).
+
+    scale: its sigma, a share. How alike two stretches of ground err is not known: the bound holds
+    for any correlation (covariance intersection), and is exact for one scale along a straight line.
+    """
+    added = scale * displacement
+    before, size = float(np.sqrt(np.trace(known))), float(np.linalg.norm(added))
+    if before * size == 0.0:
+        return known + np.outer(added, added)
+    share = size / before
+    total: Array = (1.0 + share) * known + (1.0 + 1.0 / share) * np.outer(added, added)
+    return total
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -14,6 +13,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry.ground import TerrainModel, ground_points
+from localizer.odometry.growth import stretched
 from localizer.registration.anchors import anchors_at
 from localizer.registration.priors import PoseConstraint
 from localizer.types import Anchors, FeaturePyramid
@@ -38,9 +38,9 @@ class Keyframe:
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
     pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
-    sensors said of its pose. features, camera, surface: what it was made of. behind: (3,)
-    displacement from the beginning up to it, by the source of depth over which it was measured.
-    unmatched_m2: of the place, up to it, by what did not match (`GrowthModel.unmatched`).
+    sensors said of its pose. features, camera, surface: what it was made of. scale: sigma of the
+    height above its points as a share of it. stretched: (3, 3) covariance of the place, up to it,
+    by errors of scale. unmatched_m2: likewise by what did not match (`GrowthModel.unmatched`).
     """
 
     anchors: Anchors
@@ -53,13 +53,14 @@ class Keyframe:
     camera: Camera
     surface: Array | None = None
     constraint: PoseConstraint | None = None
-    behind: Mapping[DepthSource, Array] = field(default_factory=dict)
+    scale: float = 0.0
+    stretched: Array = field(default_factory=lambda: np.zeros((3, 3)))
     unmatched_m2: float = 0.0
 
-    def ways(self, pose: Pose) -> dict[DepthSource, Array]:
-        """Displacements (3,) from the beginning to a pose that was measured against this one."""
+    def stretched_to(self, pose: Pose) -> Array:
+        """`stretched` of a pose that was measured against this one."""
         hop = pose.translation - self.world_from_camera.translation
-        return {**self.behind, self.source: self.behind.get(self.source, np.zeros(3)) + hop}
+        return stretched(self.stretched, self.scale, hop)
 
 
 def keyframe_anchors(

@@ -12,8 +12,15 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
-from localizer.odometry.ground import FlatGround, RaisedGround, RangefinderGround, TerrainModel
-from localizer.odometry.growth import carried, scaled
+from localizer.odometry.ground import (
+    FlatGround,
+    GroundUncertainty,
+    RaisedGround,
+    RangefinderGround,
+    TerrainModel,
+    height_above_ground,
+)
+from localizer.odometry.growth import carried
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
 from localizer.odometry.parallax import ParallaxView, align
 from localizer.odometry.track import (
@@ -46,7 +53,7 @@ class VisualOdometry:
     `odometry_optimizer`. ground: a terrain model for where the map has no geometry, of which the
     shape counts: it is raised or lowered to the ground where the map was last seen; None: a plane
     at the height that a rangefinder meets on the way, else at that of the ground where the map was
-    last seen.
+    last seen. uncertainty: of that ground.
 
     Above 200 lines: one frame's way, from keyframe to estimate, over one state.
     """
@@ -58,12 +65,15 @@ class VisualOdometry:
         config: OdometryConfig | None = None,
         ground: TerrainModel | None = None,
         seed: int = 0,
+        uncertainty: GroundUncertainty | None = None,
     ) -> None:
+        self._uncertainty = uncertainty or GroundUncertainty()
         self._camera = camera
         self._optimizer = optimizer
         self.config = config or OdometryConfig()
         self._ground = self._terrain = ground
         self._plane: TerrainModel | None = None
+        self._last_seen = np.zeros(3)  # the middle of the map's surfaces that the plane lies under
         self._sounded = RangefinderGround()
         self._seed = seed
         self._beginning: OdometryStart | None = None
@@ -102,7 +112,7 @@ class VisualOdometry:
             pose, covariance, speed, frame.time_ns, 0.0, aided, corrected, np.zeros((6, 6))
         )
         if surface is not None and len(surface) > self._optimizer.config.min_anchors:
-            self._plane = FlatGround.under(surface)
+            self._plane, self._last_seen = FlatGround.under(surface), surface.mean(axis=0)
             if self._terrain is not None:
                 self._ground = RaisedGround.onto(self._terrain, surface)
 
@@ -196,13 +206,32 @@ class VisualOdometry:
             self.config.anchors, self._seed, frame.sweep,
         )  # fmt: skip
         source = below if source is DepthSource.GROUND else source
-        behind = {} if self._keyframe is None else self._keyframe.ways(pose)
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None
+        before = np.zeros((3, 3)) if self._keyframe is None else self._keyframe.stretched_to(pose)
+        place = covariance[:3, :3] + before
+        scale = self._scale_sigma(source, anchors.points_world, pose.translation, place)
         return Keyframe(
             anchors, pose, covariance, frame.time_ns, source, way_m, frame.features, camera,
-            surface if source is DepthSource.MAP else None, constraint, behind,
+            surface if source is DepthSource.MAP else None, constraint, scale, before,
         )  # fmt: skip
+
+    def _scale_sigma(
+        self, source: DepthSource, points_world: Array, place: Array, covariance: Array
+    ) -> float:
+        """Sigma of the height above the ground as a share of it. place: (3,), its covariance."""
+        base, ground = growth_of(self.config, source).scale, self._uncertainty
+        if source is DepthSource.RANGE:
+            return base
+        above_m, sigma_m = height_above_ground(points_world, covariance, place)
+        away = (points_world.mean(axis=0) - self._last_seen)[:2]
+        away_m = float(np.sqrt(away @ away + np.trace(covariance[:2, :2])))
+        unknown_m = {
+            DepthSource.MAP: ground.missing_m,
+            DepthSource.GROUND: ground.model_m,
+            DepthSource.PLANE: ground.grade * away_m,
+        }[source]
+        return float(np.hypot(base, np.hypot(sigma_m, unknown_m) / above_m))
 
     def _below(self, time_ns: int) -> tuple[TerrainModel | None, DepthSource]:
         """The ground where the map has none, and how it is known."""
@@ -282,12 +311,8 @@ class VisualOdometry:
     ) -> OdometryEstimate:
         assert self._beginning is not None
         begun = self._beginning
-        errors = [
-            scaled(growth_of(self.config, source), way)
-            for source, way in keyframe.ways(pose).items()
-        ]
-        unmatched = np.diag([track.unmatched_m2] * 2 + [0.0] * 4)
-        covariance = track.covariance + np.sum(errors, axis=0) + unmatched
+        covariance = track.covariance + np.diag([track.unmatched_m2] * 2 + [0.0] * 4)
+        covariance[:3, :3] += keyframe.stretched_to(pose)
         known = carried(begun.covariance, pose.translation - begun.pose.translation)
         added = np.linalg.eigvalsh((covariance - known)[:2, :2])[-1]
         return OdometryEstimate(
@@ -297,6 +322,7 @@ class VisualOdometry:
             drift_m=float(np.sqrt(_CHI2_95 * max(added, 0.0))),
             keyframe_age_s=seconds(keyframe.time_ns, time_ns),
             source=keyframe.source,
+            scale_sigma=keyframe.scale,
         )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry import (
+    GroundUncertainty,
     OdometryConfig,
     OdometryFrame,
     OdometryStatus,
@@ -55,12 +56,15 @@ class PropagationResult(Enum):
 
 @dataclass(frozen=True)
 class PropagatedPose:
-    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED."""
+    """The odometry's answer for one frame. pose, covariance (6, 6), scale_sigma (see
+    `OdometryEstimate`): where it is CARRIED.
+    """
 
     status: PropagationResult
     world_from_camera: Pose | None = None
     covariance: Array | None = None
     quality: float = 0.0
+    scale_sigma: float | None = None
 
 
 _NOTHING = PropagatedPose(PropagationResult.NONE)
@@ -76,16 +80,17 @@ class DeadReckoning:
     """The odometry beside the map's registration; one thread, the localization thread's.
 
     camera: the working pinhole, which follows a lens that zooms. sensors: other sensors' accounts
-    of the camera, terrain: the ground's shape, see `Localizer`.
+    of the camera, terrain: the ground's shape, ground: what is not known of it, see `Localizer`.
     """
 
     def __init__(
         self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int,
         sensors: AuxiliarySensors, terrain: TerrainModel | None = None,
+        ground: GroundUncertainty | None = None,
     ) -> None:  # fmt: skip
         self._sensors, self._pinhole = sensors, camera
         registration = odometry_optimizer(optimizer, threads)
-        self._odometry = VisualOdometry(camera, registration, config, terrain)
+        self._odometry = VisualOdometry(camera, registration, config, terrain, uncertainty=ground)
         self._longest_sigma_m = config.longest_sigma_m
         self._off_map_sigma_m = config.off_map_sigma_m
         self._in_view_ns: int | None = None
@@ -146,8 +151,9 @@ class DeadReckoning:
             self._odometry.forget()
             return PropagatedPose(PropagationResult.BROKEN)
         return PropagatedPose(
-            PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality
-        )
+            PropagationResult.CARRIED, estimate.world_from_camera, P, estimate.quality,
+            estimate.scale_sigma,
+        )  # fmt: skip
 
     def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
         """about: where the camera is, to some metres."""

@@ -15,6 +15,7 @@ from localizer.geometry.camera import Camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
+from localizer.map.relief import ground_uncertainty
 from localizer.map.terrain import open_terrain
 from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
@@ -90,10 +91,12 @@ def build_localizer(
     terrain = None
     if config.terrain is not None and config.odometry is not None:
         terrain = open_terrain(config.terrain, stack.cache.frame)
+    kind = map_kind(stack.cache)
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(
         stack.renderer, extractor, optimizer, camera, config, sensors,
-        map_frame=stack.cache.frame, map_kind=map_kind(stack.cache), terrain=terrain,
+        map_frame=stack.cache.frame, map_kind=kind, terrain=terrain,
+        ground=ground_uncertainty(stack.cache.index, kind),
         on_close=on_close, is_loading=lambda: not stack.streamer.idle,
     )  # fmt: skip
 

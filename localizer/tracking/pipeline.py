@@ -27,7 +27,7 @@ from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
 from localizer.map.kind import MapKind
-from localizer.odometry import TerrainModel
+from localizer.odometry import GroundUncertainty, TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
@@ -157,8 +157,9 @@ class Localizer:
     sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
     rate of the motion model. Their roll, pitch and height are fused with each registration
     (`tracking.sensor_fusion`). With the displacement they confirm or refute a tentative track.
-    map_frame, map_kind: the map's. terrain: ground heights outside the map. on_close: releases
-    what was opened for this localizer. is_loading: whether requested tiles are still loading.
+    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: what is not
+    known of the ground, hills where nobody says. on_close: releases what was opened for this
+    localizer. is_loading: whether requested tiles are still loading.
     """
 
     def __init__(
@@ -173,6 +174,7 @@ class Localizer:
         map_frame: LocalFrame | None = None,
         map_kind: MapKind | None = None,
         terrain: TerrainModel | None = None,
+        ground: GroundUncertainty | None = None,
         on_close: Callable[[], None] = lambda: None,
         is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -194,16 +196,26 @@ class Localizer:
         self._fitted_ns: int | None = None  # of the last picture whose focal length was fitted
         self._fusion = SensorFusion(config.attitude, config.height_sigma_m, self._sensors, map_kind)
         self._tracker = Tracker(
-            config, self._sensors, self._dead_reckoning(config, optimizer, terrain)
+            config, self._sensors, self._dead_reckoning(config, optimizer, terrain, ground)
         )
 
     def _dead_reckoning(
-        self, config: LocalizerConfig, optimizer: JNGO, terrain: TerrainModel | None
+        self,
+        config: LocalizerConfig,
+        optimizer: JNGO,
+        terrain: TerrainModel | None,
+        ground: GroundUncertainty | None,
     ) -> DeadReckoning | None:
         if config.odometry is None:
             return None
         return DeadReckoning(
-            self._pinhole, optimizer, config.odometry, config.threads, self._sensors, terrain
+            self._pinhole,
+            optimizer,
+            config.odometry,
+            config.threads,
+            self._sensors,
+            terrain,
+            ground,
         )
 
     def __enter__(self) -> Localizer:

@@ -44,6 +44,7 @@ class _Pose:
     covariance: Array
     quality: float
     status: RegistrationStatus
+    scale_sigma: float | None = None
 
 
 class Tracker:
@@ -245,7 +246,8 @@ def _given(
     if track_status.state is TrackingState.BRIDGING:
         pose, covariance = carried.world_from_camera, carried.covariance
         if pose is not None and covariance is not None:
-            return _Pose(pose, covariance, carried.quality, RegistrationStatus.OK), True
+            ok = RegistrationStatus.OK
+            return _Pose(pose, covariance, carried.quality, ok, carried.scale_sigma), True
     status = result.status if result is not None else RegistrationStatus.NO_OVERLAP
     quality = result.quality if result is not None and status is RegistrationStatus.OK else 0.0
     seen = track_status.state is not TrackingState.BRIDGING and not track_status.tentative
@@ -265,4 +267,5 @@ def _estimate(frame: Frame, given: _Pose, track_status: TrackStatus, usable: boo
         sequence=frame.sequence,
         camera=frame.camera,
         last_fix_ns=track_status.last_fix_ns,
+        scale_sigma=given.scale_sigma,
     )

@@ -39,7 +39,6 @@ _BEST_SATELLITES, _ENOUGH_SATELLITES = 12, 6
 # m/s of ArduPilot's confidence 100 and 0 (EK3_VIS_VERR_MIN, EK3_VIS_VERR_MAX)
 VELOCITY_SIGMA_MPS = (0.1, 2.0)
 _DELTA_NOISE_MPS = 0.3  # of a velocity from two fixes of the odometry
-_DELTA_SCALE = 0.1  # its scale error over ground taken as level, the largest (odometry.md)
 _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 
@@ -158,7 +157,8 @@ def vision_position_delta(
     before: tuple[VisionFix, Attitude], now: tuple[VisionFix, Attitude]
 ) -> Any | None:
     """VISION_POSITION_DELTA (11011): how the vehicle moved and turned between two fixes, in body
-    axes at the second; None where its velocity is less certain than ArduPilot can be told.
+    axes at the second; None where its velocity is less certain than ArduPilot can be told: clipped,
+    the claim would be wrong.
 
     ArduPilot dates it VISO_DELAY_MS before its arrival.
     """
@@ -169,8 +169,10 @@ def vision_position_delta(
     back = quat.conjugate(at.quaternion)
     moved = quat.rotate(back, (north, east, first.height_m - last.height_m))
     w, *axis = quat.multiply(quat.conjugate(then.quaternion), at.quaternion)
-    sigma = math.hypot(_DELTA_NOISE_MPS, _DELTA_SCALE * math.hypot(*moved) / seconds)
     least, most = VELOCITY_SIGMA_MPS
+    if last.scale_sigma is None:
+        return None
+    sigma = math.hypot(_DELTA_NOISE_MPS, last.scale_sigma * math.hypot(*moved) / seconds)
     if sigma > most:
         return None
     return mavlink.MAVLink_vision_position_delta_message(

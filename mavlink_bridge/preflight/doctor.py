@@ -290,6 +290,7 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
             return Diagnosis((*findings, found), state)
         if px4:
             rules: Sequence[ParameterRule] = px4_rules(config, client.read)
+            findings += _source_switch_of_px4(config)
         else:
             source_set = find_source_set(config, client.read)
             rules = [
@@ -301,6 +302,16 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
         known = client.read_known(PX4_PARAMETERS if px4 else PARAMETERS)
         findings += check_failsafes(config, known.get, px4=px4)
     return Diagnosis(tuple(findings), state)
+
+
+def _source_switch_of_px4(config: BridgeConfig) -> list[DoctorFinding]:
+    """PX4 has no source sets: the order to change them is answered UNSUPPORTED in flight."""
+    if not config.switch.enabled:
+        return []
+    why = "PX4 has no source sets (SET_EKF_SOURCE_SET): it fuses GNSS and vision together"
+    return [
+        DoctorFinding("source switch", "enabled", "bridge.switch.enabled false", why, False, True)
+    ]
 
 
 def repair(config: BridgeConfig, findings: Iterable[DoctorFinding]) -> bool:

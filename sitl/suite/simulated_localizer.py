@@ -204,7 +204,7 @@ class BridgeFeed:
             reset_count=resets,
             velocity_ned=None if measured is None else seen.velocity_ned,
             velocity_sigma_mps=measured or 0.3,
-            by_odometry=self._left is not None,
+            scale_sigma=None if self._left is None else _ODOMETRY_SCALE,
         )
 
 

@@ -54,26 +54,20 @@ def refused(
         ("tables --targets /no/such.json", "/no/such.json"),
     ],
 )
-def test_it_is_one_line(
-    command: str, named: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_one_line(command, named, monkeypatch, capsys):
     said = refused(command, monkeypatch, capsys)
     assert named in said
     assert said.count("\n") == 1
 
 
-def test_so_it_is_of_the_training_pairs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_so_it_is_of_the_training_pairs(monkeypatch, capsys):
     pytest.importorskip("torch")
     for command in ("pairs /no/such.yaml", f"pairs {__file__} --pairs 0"):
         assert refused(command, monkeypatch, capsys).count("\n") == 1
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_option_is_explained(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_option_is_explained(name, monkeypatch, capsys):
     if name == "pairs":
         pytest.importorskip("torch")
     monkeypatch.setattr(sys, "argv", [name, "--help"])

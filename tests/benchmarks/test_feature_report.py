@@ -1,6 +1,5 @@
 """The statistics of the feature benchmark, which decide what is called better."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,7 @@ from benchmarks.features.report import (
     wilson,
     write_outcomes,
 )
-from benchmarks.features.tables import TABLES
 from localizer.errors import SequenceError
-from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
-from localizer.types import RenderedView
 
 
 def outcomes(method: str, metres: list[float], source: str = "made") -> list[PairOutcome]:
@@ -75,51 +70,3 @@ def test_a_file_that_is_no_report_is_named(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(SequenceError, match=r"seed0\.csv: "):
         read_outcomes([path])
-
-
-def test_the_tables_for_the_documentation_have_a_row_a_set_and_a_kind() -> None:
-    one = outcomes("gradient", [2.0] * 8, "made") + outcomes("gradient", [2.0] * 4, "quito")
-    two = outcomes("tiny", [0.5] * 8, "made") + outcomes("tiny", [0.5, 0.5, 2.0, 9.0], "quito")
-    _, sets = TABLES["sets"](one + two)
-    assert sets[0] == ("made", "8", "0 [0, 32], 100", "100 [68, 100], 100")
-    assert [row[:2] for row in sets] == [("made", "8"), ("quito", "4"), ("all", "12")]
-    columns, light = TABLES["light"](one + two)
-    assert columns == ("light and weather", "made", "quito")
-    assert light == [
-        ("day", "100, 100 (n 4)", "50, 50 (n 2)"),
-        ("night", "100, 100 (n 4)", "50, 100 (n 2)"),
-    ]
-    _, leads = TABLES["leads"](one + two)
-    assert [row[0] for row in leads] == ["all", "made", "quito", "night"]
-    assert leads[1][2] == "+100.0 [+100.0, +100.0]"
-
-
-def test_new_weights_stand_beside_the_old_ones_with_both_leads_and_the_places() -> None:
-    old = outcomes("tiny", [2.0, 9.0, 0.5, 0.5] * 4)
-    new = outcomes("new.onnx", [0.5, 2.0, 0.5, 0.5] * 4)
-    old, new = ([replace(o, condition=k) for o, k in zip(some, ["dusk", "day"] * 8, strict=True)]
-                for some in (old, new))  # fmt: skip
-    columns, rows = TABLES["against"](old + new)
-    assert columns[:5] == ("pairs", "n", "places", "tiny", "new.onnx")
-    assert rows == [
-        ("made", "16", "4", "50, 75", "75, 100", "+25.0 [+25.0, +25.0]", "+25.0 [+25.0, +25.0]"),
-        ("made: dusk", "8", "4", "50, 100", "100, 100", "+50.0 [+50.0, +50.0]",
-         "+0.0 [+0.0, +0.0]"),
-    ]  # fmt: skip
-
-
-def test_a_narrower_pair_shows_the_same_from_the_same_place() -> None:
-    pytest.importorskip("torch")
-    from benchmarks.features.pairs import TestPair, narrowed
-
-    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
-    rgb = np.repeat(np.arange(64, dtype=np.uint8)[None, :, None], 48, 0).repeat(3, 2)
-    depth = np.where(np.arange(64) < 32, 50.0, 80.0).astype(np.float32)[None].repeat(48, 0)
-    wide = TestPair(RenderedView(rgb, depth, Pose.identity(), camera), rgb, Pose.identity(), "day")
-    assert narrowed(wide, 64) is wide
-    narrow = narrowed(wide, 32)
-    assert narrow.view.rgb.shape == narrow.query.shape == (24, 32, 3)
-    assert set(np.unique(narrow.view.depth)) == {50.0, 80.0}  # nothing between two surfaces
-    assert (narrow.view.depth[:, :16] == 50.0).all()
-    assert narrow.view.camera.fx == pytest.approx(30.0)
-    assert narrow.truth == wide.truth

@@ -11,9 +11,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from benchmarks.protection.__main__ import main
 from benchmarks.protection.flights import FlownPositions, Position, read_flight, report, share
-from mavlink_bridge.alerts.catalogue import alert, cleared, text
-from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import Output
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import TlogRecorder
 
@@ -60,21 +57,6 @@ def test_what_was_injected_is_told_from_what_was_not(tmp_path: Path) -> None:
         assert list(position.error_m) == pytest.approx([0.1, 0.2], abs=1e-3)
 
 
-def test_what_the_guardian_said_is_counted(tmp_path: Path) -> None:
-    quiet = read_flight(flown(tmp_path / "embedded-normal-fast-3"))
-    folder = flown(tmp_path / "embedded-normal-fast-4")
-    alerts = [
-        alert(AlertId.VIDEO_FROZEN, seconds=4.0), alert(AlertId.VIDEO_FROZEN, seconds=9.0),
-        cleared(AlertId.VIDEO_FROZEN), alert(AlertId.GNSS_LOST, output=Output.INJECTING),
-    ]  # fmt: skip
-    events = "".join(f'{BEGIN_NS},warning,"{text(of)}"\n' for of in alerts)
-    (folder / "companion" / "events.csv").write_text("time_ns,level,text\n" + events)
-    loud = read_flight(folder)
-    assert (quiet.told, loud.told) == ({}, {"video_frozen": 2})
-    found = report([quiet, loud])
-    assert found["guardian"]["normal"] == {"flights": 2, "with a finding": 1, "withheld": 1}
-
-
 def test_late_stamps_are_errors_of_the_way_flown_meanwhile(tmp_path: Path) -> None:
     """By the stamped times the pictures would agree with themselves."""
     found = read_flight(flown(tmp_path / "embedded-late-300ms-5", late_ns=125_000_000))
@@ -101,9 +83,7 @@ def test_a_withheld_position_that_is_wrong_spoils_no_share() -> None:
     assert counted.low < 0.75 < counted.high
 
 
-def test_what_cannot_be_counted_is_named_and_the_rest_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_counted_is_named_and_the_rest_is_written(tmp_path, monkeypatch, capsys):
     flight = flown(tmp_path / "embedded-normal-fast-3")
     shifted = flown(tmp_path / "ardupilot-map-shifted-15m-5")
     empty = tmp_path / "empty"

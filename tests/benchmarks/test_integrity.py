@@ -8,13 +8,10 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from benchmarks.basin.views import BasinView
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.fit import fit
 from benchmarks.integrity.report import DISTINCT, FOCAL, LIKELY, OURS, WITHOUT, rows
-from benchmarks.integrity.run import StartOutcome, read, turn, unseen
-from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
+from benchmarks.integrity.run import StartOutcome, read
 from localizer.integrity.acceptance import IntegrityConfig
 
 HALVES = {"right": 40, "wrong": 40}
@@ -104,31 +101,11 @@ def test_the_fit_tells_right_from_wrong_on_a_set_that_it_has_not_seen():
     assert fit(mixed)["left_out"]["quito"]["wrong_accepted"] > 0  # labels that say nothing
 
 
-def test_views_that_another_run_has_seen_are_left_out_and_photos_given_again_are_one(tmp_path):
-    camera = Camera.from_fov(32, 24, 60.0)
-    truth = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
-    photos = [
-        BasinView(tmp_path, np.full((24, 32, 3), k, np.uint8), truth, camera, "day", 100.0)
-        for k in range(3)
-    ]
-    seen = tmp_path / "quito.jsonl"
-    assert unseen(photos * 2, None) == list(range(6))
-    assert unseen(photos * 2, seen) == [0, 1, 2]
-    seen.write_text(json.dumps(asdict(replace(RIGHT, view=4))) + "\n")
-    assert unseen(photos * 2, seen) == [0, 2]
-
-
 def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):
     path = tmp_path / "quito.jsonl"
     lines = [json.dumps(asdict(replace(RIGHT, view=k))) for k in (0, 1, 1)]
     path.write_text("\n".join(lines)[:-20])
     assert [o.view for o in read(path)] == [0]
-
-
-def test_a_set_has_its_turn_and_no_more():
-    mine = turn(lambda: True, 3)
-    assert [mine() for _ in range(5)] == [True, True, True, False, False]
-    assert not turn(lambda: False, 3)()
 
 
 @pytest.mark.parametrize(("hits", "count", "high"), [(0, 10_000, 0.0369), (4, 10_000, 0.1024)])

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
-from tests.benchmarks.commands import COMMANDS, ROOT, source
+from tests.benchmarks.commands import ROOT
 
 
 @pytest.mark.parametrize("error", [ModelError("a.onnx: no"), FileNotFoundError("a.csv")])
@@ -18,11 +18,6 @@ def test_a_named_error_is_one_line(error: Exception, capsys: pytest.CaptureFixtu
         raise error
     assert ended.value.code == 2
     assert capsys.readouterr().err == f"{type(error).__name__}: {error}\n"
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_benchmark_does_so(name: str) -> None:
-    assert "    with named_errors():\n" in source(name).read_text()
 
 
 WITHOUT_TORCH = """
@@ -40,11 +35,6 @@ for name in sys.argv[1:]:
         print(name, end.code)
 """
 NEED_TORCH = ["pairs"]  # and two more, whose other imports take seconds
-
-
-@pytest.mark.parametrize("name", ["basin", "features", "pairs"])
-def test_imports_that_need_torch_are_guarded(name: str) -> None:
-    assert "\nwith needs_torch():\n    " in source(name).read_text()
 
 
 def test_a_benchmark_that_needs_torch_says_so() -> None:

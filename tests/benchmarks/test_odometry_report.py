@@ -5,7 +5,6 @@ import pytest
 
 from benchmarks.odometry.flights import FlownStretch, OdometryStep
 from benchmarks.odometry.report import fitted_growth, rows
-from benchmarks.odometry.stretches import StretchPlan, make_stretch
 
 SIGMA = np.diag([0.05, 0.05, 0.05]) ** 2
 
@@ -58,17 +57,3 @@ def test_what_was_not_carried_on_is_counted():
     assert row["carried_to_the_end"] == 0
     assert row["usable_percent"] == 50
     assert row["end_m_p50"] == pytest.approx(30)  # its error counts all the same
-
-
-def test_a_stretch_stays_over_the_area_at_its_speed():
-    plan = StretchPlan(60.0, 2.0, 10.0, 110.0, (150.0, 100.0))
-    stretch = make_stretch(plan, "day", 3, 20.0)
-    places = np.array([pose.translation for pose in stretch.poses])
-    assert (np.abs(places[:, :2]) < [270, 220]).all()  # turning takes its radius
-    np.testing.assert_allclose(places[:, 2], 130.0, atol=2.01)
-    assert stretch.flown_m(len(places) - 1) == pytest.approx(600, rel=0.01)
-    assert all(pose.rotation[2, 2] < -0.8 for pose in stretch.poses)  # looks down
-    heights = np.array([c.world_from_camera.translation[2] for c in stretch.sensed])
-    assert np.std(heights - places[:, 2]) < 1.0  # the barometer drifts slowly
-    again = make_stretch(plan, "day", 3, 20.0)
-    assert np.array_equal(again.poses[-1].matrix, stretch.poses[-1].matrix)

@@ -78,9 +78,7 @@ def test_a_jump_is_withheld_and_told_by_the_guardian_of_now(tmp_path: Path) -> N
     assert found.told == {"position_jump": 1}
 
 
-def test_what_cannot_be_replayed_is_named_and_the_rest_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_replayed_is_named_and_the_rest_is_written(tmp_path, monkeypatch, capsys):
     flight, empty = recorded(tmp_path / "embedded-normal-fast-3"), tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(TlogError, match="empty"):

@@ -6,15 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.tables import (
-    ablation_table,
-    axes_table,
-    depths_table,
-    optimizer_table,
-    section,
-    targets_table,
-    throughput_table,
-)
+from benchmarks.tables import ablation_table, axes_table, section, targets_table, throughput_table
 from localizer.errors import SequenceError
 
 
@@ -83,17 +75,3 @@ def test_json_of_another_benchmark_is_named(tmp_path):
     path = _written(tmp_path / "a.json", {"rows": []})
     with pytest.raises(SequenceError, match="another benchmark"):
         section("Table 3", lambda: targets_table([path]))
-
-
-def test_an_iteration_stands_beside_the_papers_and_what_was_not_measured_is_a_dash(tmp_path):
-    document = {"sizes": [128, 256], "iteration_ms": {"numba": [1.514, None]},
-                "paper_ms": {"paper: CUDA": [0.44, 0.47]}}  # fmt: skip
-    lines = list(optimizer_table(_written(tmp_path / "o.json", document)))
-    assert lines[2:] == ["| numba | 1.51 | - |", "| *paper: CUDA* | *0.44* | *0.47* |"]
-
-
-def test_depths_name_what_the_other_view_does_not_see(tmp_path):
-    row = {"height_m": 100.0, "pixels": 1000, "median": 1.23e-5, "p95": 2e-4, "p99": 3e-3,
-           "within_1_percent": 99.876, "hidden_percent": 4.04}  # fmt: skip
-    *_, line = depths_table(_written(tmp_path / "d.json", {"rows": [row]}))
-    assert line == "| 100 | 1000 | 1.2e-05 | 2.0e-04 | 3.0e-03 | 99.88 % | 4.0 % |"

@@ -65,9 +65,7 @@ def tracked() -> PoseEstimate:
     )  # fmt: skip
 
 
-def test_a_thread_that_hangs_is_named_and_one_that_ends_is_not(
-    hang: Hang, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_thread_that_hangs_is_named_and_one_that_ends_is_not(hang, caplog, monkeypatch):
     hanging = threading.Thread(target=lambda: hang.over.wait(120.0), name="stuck", daemon=True)
     hanging.start()
     assert not joined(hanging)
@@ -89,9 +87,7 @@ def test_a_map_on_a_dead_disk_keeps_the_targets_end_waiting_no_longer(hang: Hang
     assert ends(reporter.stop)
 
 
-def test_a_last_fix_on_a_dead_disk_is_left_there(
-    hang: Hang, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_last_fix_on_a_dead_disk_is_left_there(hang, tmp_path, monkeypatch):
     monkeypatch.setattr("companion.flight.last_fix._WRITE_S", 0.001)
     autopilot: Any = SimpleNamespace(rotation=lambda _: DOWN, velocity=np.zeros(3))
     path = tmp_path / "last-fix.json"
@@ -124,9 +120,7 @@ def test_a_pulse_that_hangs_never_writes_into_another_file(hang: Hang, tmp_path:
     os.close(reading)
 
 
-def test_a_record_whose_disk_stands_still_gets_no_maps_of_its_targets(
-    hang: Hang, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_whose_disk_stands_still_gets_no_maps_of_its_targets(hang, tmp_path, monkeypatch):
     monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 0.01)
     asked: list[Path] = []
     monkeypatch.setattr("companion.flight.recorder.write_target_files", asked.append)

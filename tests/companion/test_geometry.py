@@ -60,13 +60,6 @@ def test_camera_axes_point_where_they_should(name: str) -> None:
     np.testing.assert_allclose(R, np.column_stack(expected), atol=1e-12)
 
 
-def test_a_mount_pitched_down_looks_down() -> None:
-    mount = Mount.from_degrees(pitch_deg=-30)
-    R = camera_attitude(_attitude(), GimbalAngles(0, 0, 0, GimbalFrame.BODY), mount)
-    forward = R[:, 2]
-    np.testing.assert_allclose(forward, [np.cos(np.pi / 6), 0, 0.5], atol=1e-12)
-
-
 def test_the_lever_arm_turns_with_the_body() -> None:
     arm = (1.0, 0.0, 0.5)  # one metre ahead, half below
     body = _attitude(yaw=90)

@@ -46,9 +46,7 @@ ALONE = [key for key in REMOVED if "signing" not in key and not key.startswith("
 
 
 @pytest.mark.parametrize("old", [*ALONE, *CONSTANTS])
-def test_a_removed_setting_is_left_out_with_a_warning(
-    old: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_removed_setting_is_left_out_with_a_warning(old, caplog):
     with caplog.at_level(logging.WARNING):
         assert config(nested(old, 0.5)) == config({})
     assert "has no effect since 0.2" in caplog.text

@@ -211,9 +211,7 @@ class Clicked:
 
 
 @pytest.mark.parametrize("kind", BOTH)
-def test_a_click_is_answered_with_the_place_under_it(
-    kind: Any, run: Callable[..., Example]
-) -> None:
+def test_a_click_is_answered_with_the_place_under_it(kind, run):
     """Through the vehicle: the click on one port, the companion on another."""
     with kind(HOME) as vehicle, Clicked(BridgeConfig(connection=vehicle.companion_endpoint)):
         example = run("click_to_target.py", vehicle.gcs_endpoint, 0.75, 0.5, 1)

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from mavlink_bridge.atomic_file import read_small_file, replace_file
-from mavlink_bridge.link.replay import ReplayWindow
 
 
 def test_the_new_text_stands_in_the_place_of_the_old_and_nothing_beside_it(tmp_path: Path) -> None:
@@ -58,32 +57,3 @@ def test_a_pipe_a_link_and_what_has_no_end_are_not_read(tmp_path: Path) -> None:
     for name, why in (("endless", "larger"), ("link", "symbolic"), ("pipe", "no plain file")):
         with pytest.raises(OSError, match=why):
             read_small_file(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        '{"1:1:1": 1e400}',
-        "[" * 100_000,
-        '{"1:1:1": 1000000000000000000000000000000}',  # our own begin beyond it, and none fits
-        '{"1:1:1": -5}',
-        '{"1:1:1": 3.7}',
-        '{"1:1:1": true}',
-        '{"1:1:1000": 5}',
-        '{"1:1": 5}',
-        "[]",
-    ],
-)
-def test_a_replay_window_that_names_no_stamps_is_begun_anew_and_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str
-) -> None:
-    path = tmp_path / "seen.json"
-    replace_file(path, text)
-    window = ReplayWindow(path)
-    assert (window.streams, window.newest) == ({}, 0)
-    assert "restarted, messages" in caplog.text
-    window.note((1, 1, 1), 77)
-    window.close()
-    again = ReplayWindow(path)
-    assert again.newest >= 77
-    again.close()

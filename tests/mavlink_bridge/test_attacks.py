@@ -90,9 +90,7 @@ def test_another_systems_arming_does_not_shut_what_is_open_on_the_ground(
 
 
 @pytest.mark.parametrize("forged", [True, False])
-def test_armed_and_disarmed_in_turn_is_told_and_arming_twice_is_not(
-    monkeypatch: pytest.MonkeyPatch, forged: bool
-) -> None:
+def test_armed_and_disarmed_in_turn_is_told_and_arming_twice_is_not(monkeypatch, forged):
     """Of the autopilot's own ids, which an unsigned link cannot tell apart: what is open on the
     ground is shut by it, and the operator learns why.
     """
@@ -117,9 +115,7 @@ def test_a_disarming_that_lasts_is_believed(monkeypatch: pytest.MonkeyPatch) -> 
     assert not flight.shared.tracker.snapshot(flight.now_ns).armed
 
 
-def test_an_origin_that_moves_on_the_ground_or_with_a_reboot_is_followed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_origin_that_moves_on_the_ground_or_with_a_reboot_is_followed(monkeypatch):
     flight = Flight(monkeypatch)
     flight.run(12.0)
     flight.say(heartbeat(armed=False))
@@ -164,9 +160,7 @@ class Orders:
         (mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, 197),
     ],
 )
-def test_orders_of_other_systems_are_denied_and_told_once(
-    monkeypatch: pytest.MonkeyPatch, command: int, component: int
-) -> None:
+def test_orders_of_other_systems_are_denied_and_told_once(monkeypatch, command, component):
     orders = Orders(monkeypatch)
     for _ in range(3):
         assert orders.command(66, command, component) == [mavlink.MAV_RESULT_DENIED]
@@ -184,9 +178,7 @@ def test_the_ground_stations_order_is_obeyed(monkeypatch: pytest.MonkeyPatch) ->
     assert second.command(66, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
 
 
-def test_with_signing_an_unsigned_ground_link_gives_no_orders(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_with_signing_an_unsigned_ground_link_gives_no_orders(monkeypatch, tmp_path):
     from mavlink_bridge.components import Components
 
     signing = SigningConfig(key_file=tmp_path / "key")
@@ -240,9 +232,7 @@ STAMP = 1_000_000_000
 
 
 @pytest.mark.usefixtures("unset_clock")
-def test_a_recorded_order_is_refused_after_a_restart_though_the_clock_is_unset(
-    tmp_path: Path,
-) -> None:
+def test_a_recorded_order_is_refused_after_a_restart_though_the_clock_is_unset(tmp_path):
     path = tmp_path / "seen"
     first = Process(path)
     assert first.takes(signed(STAMP))
@@ -258,9 +248,7 @@ def test_a_recorded_order_is_refused_after_a_restart_though_the_clock_is_unset(
 
 
 @pytest.mark.usefixtures("unset_clock")
-def test_an_order_that_comes_in_the_last_write_is_not_taken_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_order_that_comes_in_the_last_write_is_not_taken_again(tmp_path, monkeypatch):
     """The end came while the disk wrote what was heard before it."""
     first, late, wrote = Process(tmp_path / "seen"), [], threading.Event()
 
@@ -295,10 +283,24 @@ def test_our_own_stamps_begin_beyond_all_that_was_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("unset_clock")
-@pytest.mark.parametrize("content", ["", "[1]", '{"a": 1}', '{"1:2:3": null}', "\0\0"])
-def test_a_damaged_state_is_told_and_begun_anew(
-    tmp_path: Path, content: str, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[1]",
+        "\0\0",
+        "[" * 100_000,
+        '{"1:2:3": null}',
+        '{"1:1:1": 1e400}',
+        '{"1:1:1": 1000000000000000000000000000000}',  # our own begin beyond it, and none fits
+        '{"1:1:1": -5}',
+        '{"1:1:1": 3.7}',
+        '{"1:1:1": true}',
+        '{"1:1:1000": 5}',
+        '{"1:1": 5}',
+    ],
+)
+def test_a_damaged_state_is_told_and_begun_anew(tmp_path, content, caplog):
     path = tmp_path / "seen"
     path.write_text(content)
     with caplog.at_level(logging.WARNING):
@@ -311,9 +313,7 @@ def test_a_damaged_state_is_told_and_begun_anew(
     again.end()
 
 
-def test_a_place_that_cannot_be_written_is_told_and_the_link_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_place_that_cannot_be_written_is_told_and_the_link_goes_on(tmp_path, caplog):
     process = Process(tmp_path / "none" / "seen")
     with caplog.at_level(logging.WARNING):
         assert process.takes(signed(10**14))

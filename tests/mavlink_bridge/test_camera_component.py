@@ -46,15 +46,6 @@ def test_marks_of_fresh_targets_without_end_take_no_memory_without_end():
     assert len(marks) <= 256
 
 
-def test_a_target_that_comes_back_is_not_marked_again():
-    marks = Marks(3.0)
-    report = TargetReport(SECOND, 47.3, 8.5, 450.0, h_accuracy_m=0.5, target_id=4)
-    sent = [marks.due({4: report}, k * 2 * SECOND) for k in range(4)]
-    assert [mark is not None for mark in sent] == [True, True, True, False]
-    assert marks.due({}, 20 * SECOND) is None
-    assert marks.due({4: report}, 30 * SECOND) is None
-
-
 class Station:
     """A ground station's commands to the camera, and what it hears."""
 

@@ -205,9 +205,7 @@ class Attacked(Flight):
 
 
 @pytest.mark.parametrize("name", _VEHICLE)
-def test_no_field_of_the_vehicle_breaks_or_gets_through(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_field_of_the_vehicle_breaks_or_gets_through(name, monkeypatch):
     flight = Attacked(monkeypatch)
     wrong: list[str] = []
     for what, message in attacks(name, flight.boot_ms):
@@ -228,9 +226,7 @@ def test_no_field_of_the_vehicle_breaks_or_gets_through(
     assert max(b - a for a, b in pairwise(times)) <= 300 * MS
 
 
-def test_a_message_of_another_length_is_cut_or_filled_and_breaks_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_message_of_another_length_is_cut_or_filled_and_breaks_nothing(monkeypatch):
     """MAVLink 2 lets a payload be shorter (zeros were cut) or longer (a newer definition)."""
     flight = Attacked(monkeypatch)
     read: set[str] = set()
@@ -258,9 +254,7 @@ _PARAMETERS["COMMAND_INT"][4:] = ["x", "y", "z"]
 
 
 @pytest.mark.parametrize("name", COMMANDS_IN)
-def test_no_parameter_of_a_command_breaks_or_gets_through(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_parameter_of_a_command_breaks_or_gets_through(name, monkeypatch):
     """Every command that a component of ours knows, from a station that may order."""
     flight = Attacked(
         monkeypatch, InjectionEnable(InjectionEnableConfig(), lambda _: None), mode="rc"

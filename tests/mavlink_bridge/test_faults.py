@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-import struct
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -32,12 +31,6 @@ def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
     it.run(15.0)
     assert len(it.vision()) > 50
     return it
-
-
-def silence(flight: Flight, seconds: float) -> None:
-    flight.link.open = False
-    flight.run(seconds)
-    flight.link.open = True
 
 
 def test_five_minutes_without_a_link(flight: Flight) -> None:
@@ -153,9 +146,7 @@ def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
 
 
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0])
-def test_step_of_our_wall_clock_is_in_no_stamp(
-    monkeypatch: pytest.MonkeyPatch, step_s: float
-) -> None:
+def test_step_of_our_wall_clock_is_in_no_stamp(monkeypatch, step_s):
     gps = InjectionConfig(message="gps_input", rate_hz=10, delay_ms=100)
     flight = Flight(monkeypatch, injection=gps)
     flight.run(10.0)
@@ -199,9 +190,7 @@ def test_late_fixes_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not fine.told(*LATE)
 
 
-def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(monkeypatch):
     flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=250))
     flight.latency_ms = 320
     flight.run(30.0)
@@ -214,9 +203,7 @@ def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(
     assert flight.alerts[-1].id is AlertId.FIXES_IN_TIME
 
 
-def test_a_latency_text_never_names_a_figure_within_its_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_latency_text_never_names_a_figure_within_its_limit(monkeypatch):
     """220 ms are told; a latency that wanders about both limits says nothing untrue."""
     flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=220))
     for latency_ms in (240, 215, 245, 215):  # above delay_ms + 10, then a little below it
@@ -245,9 +232,7 @@ def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(("delay_ms", "texts"), [(100, 0), (45, 1)])
-def test_what_counts_is_the_least_lag(
-    monkeypatch: pytest.MonkeyPatch, delay_ms: float, texts: int
-) -> None:
+def test_what_counts_is_the_least_lag(monkeypatch, delay_ms, texts):
     """ArduPilot takes the least lag for VISO_DELAY_MS: later fixes beside it cost no position."""
     flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=delay_ms))
     flight.run(5.0)
@@ -255,17 +240,6 @@ def test_what_counts_is_the_least_lag(
         flight.latency_ms = latency_ms
         flight.run(0.1)
     assert len(flight.told(*LATE)) == texts
-
-
-@pytest.mark.parametrize("gps_id", [0, 1])
-def test_a_latency_text_names_the_receivers_own_delay(
-    monkeypatch: pytest.MonkeyPatch, gps_id: int
-) -> None:
-    """GPS_INPUT counts receivers from 0, ArduPilot's parameters from 1."""
-    injection = InjectionConfig(message="gps_input", gps_id=gps_id, rate_hz=10, delay_ms=20)
-    flight = Flight(monkeypatch, injection=injection)
-    flight.run(10.0)
-    assert flight.told(*LATE) == [alert(AlertId.FIXES_LATE, age_ms=50.0, limit_ms=20.0)]
 
 
 # --- damaged input --------------------------------------------------------------------------------
@@ -295,9 +269,7 @@ def damage(rng: random.Random, share: float) -> Callable[[bytes], bytes]:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_damaged_frames_on_the_flight_controllers_link(
-    monkeypatch: pytest.MonkeyPatch, seed: int
-) -> None:
+def test_damaged_frames_on_the_flight_controllers_link(monkeypatch, seed):
     flight = Flight(monkeypatch)
     flight.mangle = damage(random.Random(seed), 0.3)
     flight.run(90.0)
@@ -334,10 +306,8 @@ def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
         yield from reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
-    flight: Flight, seed: int
-) -> None:
+@pytest.mark.parametrize("seed", range(2))
+def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight, seed):
     ground, link = GroundEnd(flight.shared), SimulatedLink(system_id=1)
     for i, message in enumerate(nonsense(random.Random(seed), 4000)):
         flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
@@ -356,32 +326,8 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     assert math.isfinite(at.yaw_rad)
 
 
-_EXTREMES: dict[str, tuple[float, ...]] = {
-    "f": (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40, 0.0),
-    "d": (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0),
-}
-
-
-def _extremes(code: str) -> tuple[float, ...]:
-    if code in _EXTREMES:
-        return _EXTREMES[code]
-    bits = 8 * struct.calcsize(f"<{code}")
-    return (0, 2**bits - 1) if code.isupper() or code == "c" else (-(2 ** (bits - 1)), -1)
-
-
-def _payload(kind: Any, values: list[float]) -> bytes:
-    packed = bytearray()
-    codes = kind.native_format.decode().lstrip("<")
-    for code, count, value in zip(codes, kind.array_lengths, values, strict=True):
-        one = bytes([int(value)]) if code == "c" else struct.pack(f"<{code}", value)
-        packed += one * max(count, 1)
-    return bytes(packed)
-
-
 @pytest.mark.parametrize("jumps", [1, 2, 3])
-def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(
-    monkeypatch: pytest.MonkeyPatch, jumps: int
-) -> None:
+def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(monkeypatch, jumps):
     """Each process begins with a jump and counted from 0: ArduPilot had seen a 1 last, and fought
     the place that was found after the gap.
     """
@@ -400,14 +346,8 @@ def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(
     assert again.end.counters["jumps_repeated"] == 0
 
 
-def test_a_start_without_a_jump_announces_none(flight: Flight) -> None:
-    assert {m.reset_counter for _, m in flight.vision()} == {0}
-
-
 @pytest.mark.parametrize("taken_at", [1, 2, 4, None])
-def test_a_jump_that_the_ekf_missed_is_announced_again(
-    flight: Flight, taken_at: int | None
-) -> None:
+def test_a_jump_that_the_ekf_missed_is_announced_again(flight, taken_at):
     """ArduPilot's EKF misses the new reset_counter where two messages arrive in one of its steps.
 
     taken_at: the value of the counter at which this one takes it; None: never.
@@ -514,9 +454,7 @@ def fault(flight: Flight) -> AlertId | None:
     return None if found is None else found.id
 
 
-def test_what_keeps_vision_from_the_ekf_stands_as_its_trouble(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_keeps_vision_from_the_ekf_stands_as_its_trouble(monkeypatch):
     """A gimbal 10 degrees off, whose fixes the yaw guard refuses; an EKF that is elsewhere."""
     flight = Flight(monkeypatch)
     flight.run(6.0)
@@ -545,9 +483,7 @@ def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None
     assert flight.alerts[-1] == cleared(AlertId.YAW_UNCHECKED)
 
 
-def test_an_order_that_is_not_acknowledged_is_repeated_and_told_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_order_that_is_not_acknowledged_is_repeated_and_told_once(monkeypatch):
     flight = Flight(monkeypatch, switch=SourceSwitchConfig(enabled=True))
     flight.run(30.0)
     orders = [m for _, m, _ in flight.link.sent if getattr(m, "command", 0) == 42007]
@@ -561,9 +497,7 @@ def test_an_order_that_is_not_acknowledged_is_repeated_and_told_once(
     ("system", "component", "ours"),
     [(1, 191, True), (0, 0, True), (255, 190, False), (1, 100, False)],
 )
-def test_answers_to_others_commands_are_not_ours(
-    monkeypatch: pytest.MonkeyPatch, system: int, component: int, ours: bool
-) -> None:
+def test_answers_to_others_commands_are_not_ours(monkeypatch, system, component, ours):
     """A ground station's refused order must not look like ours."""
     flight = Flight(monkeypatch, switch=SourceSwitchConfig(enabled=True))
     while not any(getattr(m, "command", 0) == 42007 for _, m, _ in flight.link.sent):
@@ -586,9 +520,7 @@ def test_no_origin_is_set_while_the_gate_is_closed(monkeypatch: pytest.MonkeyPat
     assert flight.vision()
 
 
-def test_what_the_autopilot_says_is_handed_on_and_what_others_say_is_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_the_autopilot_says_is_handed_on_and_what_others_say_is_not(monkeypatch):
     flight = Flight(monkeypatch)
     flight.run(2.0)
     for component in (1, 191):

@@ -75,9 +75,7 @@ def stamped(flight: Flight, off_s: float) -> None:
 
 
 @pytest.mark.parametrize("off_s", [-50.0, 500.0])
-def test_no_burst_of_forged_stamps_is_a_reboot_that_makes_room_for_a_forged_origin(
-    flight: Flight, off_s: float
-) -> None:
+def test_no_burst_of_forged_stamps_is_a_reboot_that_makes_room_for_a_forged_origin(flight, off_s):
     begun_ns = flight.now_ns
     for _ in range(10):
         stamped(flight, off_s)
@@ -100,9 +98,7 @@ def test_a_clock_that_jumps_alone_is_followed_half_a_second_later(flight: Flight
 
 
 @pytest.mark.parametrize("says", [heartbeat(12), version(3)], ids=["make", "firmware"])
-def test_another_make_or_firmware_of_the_vehicles_ids_changes_nothing_that_is_sent(
-    flight: Flight, says: Any
-) -> None:
+def test_another_make_or_firmware_of_the_vehicles_ids_changes_nothing_that_is_sent(flight, says):
     flight.say(version(4))
     flight.run(1.0)
     begun_ns, before = flight.now_ns, flight.shared.tracker.snapshot(flight.now_ns)
@@ -126,9 +122,7 @@ def test_another_firmware_after_a_reboot_is_asked_for_and_taken(flight: Flight) 
 
 
 @pytest.mark.parametrize("lie", [2**63 - 1, -(2**63)])
-def test_timesync_answers_that_the_stamps_contradict_are_told_and_not_taken(
-    flight: Flight, lie: int
-) -> None:
+def test_timesync_answers_that_the_stamps_contradict_are_told_and_not_taken(flight, lie):
     flight.answers_timesync = False
     begun_ns, seen, ignored = flight.now_ns, len(flight.link.sent), flight.shared.tracker.ignored
     for step in range(800):
@@ -248,9 +242,7 @@ def reboots(flight: Flight, turn: int) -> None:
         (reboots, 1),
     ],
 )
-def test_a_flood_is_told_in_a_few_lines_and_nothing_grows(
-    monkeypatch: pytest.MonkeyPatch, attack: Attack, most: int
-) -> None:
+def test_a_flood_is_told_in_a_few_lines_and_nothing_grows(monkeypatch, attack, most):
     flight = flown(monkeypatch, armed=attack is not origins, camera=CameraConfig(mount="gimbal"))
     flight.alerts.clear()
     for turn in range(120):
@@ -262,9 +254,7 @@ def test_a_flood_is_told_in_a_few_lines_and_nothing_grows(
     assert len(flight.shared.tracker.other_gimbals) <= 8
 
 
-def test_a_receiver_that_comes_and_goes_is_told_as_lost_and_a_short_gap_is_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_receiver_that_comes_and_goes_is_told_as_lost_and_a_short_gap_is_not(monkeypatch):
     flight = Flight(monkeypatch)
     flight.gnss_north_m, flight.armed = 0.0, True
     flight.run(10.0)
@@ -335,9 +325,7 @@ def test_what_asks_for_an_answer_without_end_gets_few(flight: Flight, attack: At
         [0.2, 0.2, 0.2, 0.8],
     ],
 )
-def test_no_rectangle_without_an_area_in_the_picture_is_tracked(
-    flight: Flight, corners: list[float]
-) -> None:
+def test_no_rectangle_without_an_area_in_the_picture_is_tracked(flight, corners):
     for order in (
         mavlink.MAVLink_command_long_message(1, 100, 2005, 0, *corners, 0, 0, 0),
         mavlink.MAVLink_command_int_message(

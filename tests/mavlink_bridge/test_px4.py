@@ -23,7 +23,7 @@ from mavlink_bridge.messages import Attitude, Origin
 from mavlink_bridge.preflight.doctor import check_parameters
 from mavlink_bridge.preflight.rules import px4_rules
 from mavlink_bridge.quaternion import from_euler
-from mavlink_bridge.vehicle.profile import PX4, select_profile
+from mavlink_bridge.vehicle.profile import PX4
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -168,13 +168,5 @@ def test_parameters_of_external_vision() -> None:
         ({"EKF2_AGP0_ID": 3.0, "EKF2_AGP2_ID": 1.0, "EKF2_AGP2_CTRL": 1.0}, {}),
     ],
 )  # fmt: skip
-def test_parameters_of_the_global_sensor_in_each_instance(
-    parameters: dict[str, float], fixes: dict[str, float]
-) -> None:
+def test_parameters_of_the_global_sensor_in_each_instance(parameters, fixes):
     assert rules("global_position_sensor", {**parameters, "EKF2_DELAY_MAX": 200.0}) == fixes
-
-
-def test_profile_is_chosen_from_1_15_on() -> None:
-    assert select_profile("px4", (1, 15, 0)) is PX4
-    assert select_profile("px4", (1, 18, 0)) is PX4
-    assert not select_profile("px4", (1, 14, 4)).known

@@ -120,9 +120,7 @@ SENT: list[tuple[Any, dict[str, float]]] = [
 
 
 @pytest.mark.parametrize(("message", "values"), SENT, ids=lambda v: getattr(v, "name", ""))
-def test_what_is_sent_is_in_the_units_of_the_definition(
-    message: Any, values: dict[str, float]
-) -> None:
+def test_what_is_sent_is_in_the_units_of_the_definition(message, values):
     for field, value in values.items():
         expected = scaled(kind_of(message), field, value)
         assert getattr(message, field) == pytest.approx(expected, rel=1e-6, abs=0.51), field
@@ -197,9 +195,7 @@ def test_what_is_read_is_in_the_units_of_the_definition() -> None:
         ("MOUNT_ORIENTATION", ("pitch", "roll", "yaw")),
     ],
 )
-def test_old_gimbal_angles_are_in_the_units_of_the_definition(
-    name: str, angles: tuple[str, ...]
-) -> None:
+def test_old_gimbal_angles_are_in_the_units_of_the_definition(name, angles):
     readings = VehicleReadings()
     for message, time_ns in sent(name, dict(zip(angles, (-45.0, 5.0, 30.0), strict=True))):
         readings.take(message, time_ns)

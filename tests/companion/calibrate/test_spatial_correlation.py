@@ -46,20 +46,3 @@ def test_those_of_the_same_ground_that_err_alike_count_once_whenever_they_were_t
     pulls = rng.normal(0.0, 1.0, PLACES)[of]
     factor = larger(pulls - pulls.mean(), grounds)
     assert factor == pytest.approx(np.sqrt(PICTURES / PLACES), rel=0.35)
-
-
-def test_normals_are_the_sums_over_each_pictures_parts():
-    rng = np.random.default_rng(3)
-    owner = np.repeat([0, 1, 2], [4, 6, 5])
-    value, frame, optics = (rng.normal(size=(15, 2, *n)) for n in ((), (6,), (7,)))
-    weight = rng.uniform(0.5, 2.0, 15)
-    made = ImageNormalEquations.of(owner, weight, value, frame, optics)
-    mine = owner == 1
-    J = np.concatenate([optics, frame], axis=2)[mine].reshape(-1, 13)
-    w = np.repeat(weight[mine], 2)
-    normal, pull = (J.T * w) @ J, (J.T * w) @ value[mine].ravel()
-    assert made.shared[1] == pytest.approx(normal[:7, :7])
-    assert made.both[1] == pytest.approx(normal[7:, :7])
-    assert made.own[1] == pytest.approx(normal[7:, 7:])
-    assert made.shared_pull[1] == pytest.approx(pull[:7])
-    assert made.pull[1] == pytest.approx(pull[7:])

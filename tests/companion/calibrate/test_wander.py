@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.calibrate.wander import AttitudeProcess, GaussMarkovProcess, Likelihood
+from companion.calibrate.wander import AttitudeProcess, GaussMarkovProcess
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.pose import Array, matrix_from_euler
 
@@ -79,19 +79,6 @@ def test_errors_about_the_vertical_are_told_from_those_of_the_mounting():
     assert found.sigma[[0, 2]] == pytest.approx([PITCH, ROLL], rel=0.35)
     assert found.sigma[1] < 0.5 * HEADING
     assert 3.0 < found.memory_s < 15.0
-
-
-def test_derivatives_of_the_likelihood_are_those_of_its_value():
-    sources, up = axes()
-    rng = np.random.default_rng(5)
-    left = np.einsum("kip,kp->ki", sources[:40], rng.normal(0.0, 0.005, (40, 3)))
-    likelihood = Likelihood(left, up[:40], TIMES_S[:40], WHITE)
-    at = np.log(np.append([0.004, 0.002, 0.005, 0.003, 0.006], 5.0))
-    _, slopes = likelihood(at)
-    for k, slope in enumerate(slopes):
-        step = np.eye(6)[k] * 1e-5
-        difference = (likelihood(at + step)[0] - likelihood(at - step)[0]) / 2e-5
-        assert slope == pytest.approx(difference, rel=1e-4, abs=1e-4)
 
 
 def strays(rng: np.random.Generator, sigma_m: float, memory_s: float, smooth_s: float) -> Array:

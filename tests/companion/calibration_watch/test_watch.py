@@ -87,9 +87,7 @@ def test_an_honest_flight_has_no_finding(seed: int) -> None:
         (Wrong(boresight_deg=(4.0, 0.0)), "boresight", False),
     ],
 )
-def test_a_wrong_calibration_is_found_within_a_minute(
-    wrong: Wrong, finding: str, denied: bool
-) -> None:
+def test_a_wrong_calibration_is_found_within_a_minute(wrong, finding, denied):
     """And nothing else is; under denial from the IMU, the turns and the barometer alone."""
     flown = Flown(wrong, DENIED if denied else SURVEYED, lost if denied else lambda _: True).fly()
     assert ever(flown) == {finding}
@@ -134,9 +132,7 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
         (-0.2, 3.0, True, 6.0),
     ],
 )
-def test_a_stream_that_zooms_without_saying_so_is_told(
-    focal: float, seconds: float, denied: bool, within_s: float
-) -> None:
+def test_a_stream_that_zooms_without_saying_so_is_told(focal, seconds, denied, within_s):
     """After 50 s of a right lens, in which all was learned; and nothing else is blamed."""
     wrong = Wrong(focal=focal, zoom_s=50.0, zooms_for_s=seconds)
     flown = Flown(wrong, square(80.0), (lambda t: t < 40.0) if denied else lambda _: True).fly()

@@ -26,13 +26,7 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.cache.surface import MapSurface
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import DOWN
-from localizer.types import (
-    Frame,
-    PoseEstimate,
-    ReferenceBundle,
-    RegistrationStatus,
-    TrackingState,
-)
+from localizer.types import Frame, PoseEstimate, ReferenceBundle, RegistrationStatus, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId

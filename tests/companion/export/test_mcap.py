@@ -137,11 +137,7 @@ def test_a_record_is_what_foxglove_expects(flight, small_assets):
     assert json.loads(point.geojson)["geometry"]["type"] == "Point"
 
     ((schema, _, event),) = messages["/events"]
-    assert (schema, event.message, event.level) == (
-        "foxglove.Log",
-        "no fixes",
-        event.WARNING,
-    )
+    assert (schema, event.message, event.level) == ("foxglove.Log", "no fixes", event.WARNING)
     assert attached == ["record.json"]
 
 
@@ -239,13 +235,6 @@ def test_what_the_autopilot_said_stands_in_the_live_file_too(flight):
     assert (schema, said.message, said.name) == ("foxglove.Log", "EKF3 lane switch 1", "1/1")
     assert abs(logged - time.time_ns()) < 600e9
     assert not (flight().folder / "text.csv").exists()
-
-
-def test_the_clock_of_the_flight_is_the_one_of_its_file(flight):
-    keeper = flight(mcap=True)
-    messages, _ = _read(keeper.folder / "record.mcap")
-    ((_, logged, _),) = messages["/events"]
-    assert abs(logged - time.time_ns()) < 600e9  # UTC, not the time since the machine began
 
 
 def test_it_is_put_in_the_place_of_no_device_and_no_table(flight, tmp_path):

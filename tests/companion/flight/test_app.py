@@ -155,12 +155,7 @@ class _Memory:
 
 
 @pytest.mark.parametrize(
-    ("fails", "log"),
-    [
-        ("", ["stop"]),
-        ("feed", ["leave", "stop"]),
-        ("start", ["leave", "stop"]),
-    ],
+    ("fails", "log"), [("", ["stop"]), ("feed", ["leave", "stop"]), ("start", ["leave", "stop"])]
 )
 def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fails, log):
     """Each failing start in the air dropped the gate that the killed process had left open, and so
@@ -191,14 +186,6 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
     ):
         Companion(config, parts).run()
     assert memory.log == log
-
-
-def test_the_gate_the_last_fix_and_what_forbids_are_what_is_left():
-    assert {p.name for p in COMPONENTS if p.hand_over is not None} == {
-        "bridge",
-        "integrity monitor",
-        "last fix",
-    }
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(

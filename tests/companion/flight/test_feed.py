@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import pytest
-
 from companion.flight.feed import Feed
 
 
@@ -33,9 +31,7 @@ def fed(source: Source, take: Any) -> Feed:
     return feed
 
 
-def test_a_part_that_fails_on_a_frame_does_not_end_the_flight(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_part_that_fails_on_a_frame_does_not_end_the_flight(caplog):
     """One picture that the console or a recorder could not take ended the process in the air."""
     taken: list[int] = []
 

@@ -114,19 +114,11 @@ def test_what_is_waited_for_is_told(tmp_path, engine, of):
 def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
     """Found on ArduPilot: the yaw guard refused every fix, LAND without a position, health ok."""
     told, _ = _one_report(
-        tmp_path,
-        StreamState.LIVE,
-        True,
-        tracking=TrackingState.TRACKING,
-        injection_fault=FAULT,
+        tmp_path, StreamState.LIVE, True, tracking=TrackingState.TRACKING, injection_fault=FAULT
     )
     assert told[-1] == (HealthLevel.DEGRADED, FAULT.id)
     lost, _ = _one_report(
-        tmp_path,
-        StreamState.LIVE,
-        True,
-        tracking=TrackingState.LOST,
-        injection_fault=FAULT,
+        tmp_path, StreamState.LIVE, True, tracking=TrackingState.LOST, injection_fault=FAULT
     )
     assert lost[-1][0] is HealthLevel.FAILED  # the worse news
 
@@ -291,10 +283,7 @@ def test_a_camera_that_ended_before_does_not_speak_for_the_flight(tmp_path, monk
 
 @pytest.mark.parametrize(
     ("seconds", "level", "of"),
-    [
-        (1, HealthLevel.OK, AlertId.TRACKING),
-        (23, HealthLevel.DEGRADED, AlertId.BRIDGING),
-    ],
+    [(1, HealthLevel.OK, AlertId.TRACKING), (23, HealthLevel.DEGRADED, AlertId.BRIDGING)],
 )
 def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, of):
     bridged = SimpleNamespace(

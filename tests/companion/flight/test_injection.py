@@ -42,8 +42,9 @@ class FakeBridge:
 def _estimate(state, accepted=True):
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
     return PoseEstimate(
-        pose, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, accepted, 5, 0, CAMERA
-    )
+        pose, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, accepted, 5, 0, CAMERA,
+        scale_sigma=0.2 if state is BRIDGING else None,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -62,6 +63,8 @@ def test_only_a_new_start_is_a_jump(states, counts):
     for state in states:
         injection.add_estimate(_estimate(state), None)
     assert [fix.reset_count for fix in bridge.fixes] == counts
+    sent = [state for state in states if state in (TRACKING, BRIDGING)]
+    assert [fix.by_odometry for fix in bridge.fixes] == [state is BRIDGING for state in sent]
 
 
 def test_what_is_rejected_or_unconfirmed_is_not_injected():
@@ -98,6 +101,7 @@ def test_a_fix_of_the_odometry_says_so():
     for state in (TRACKING, BRIDGING):
         injection.add_estimate(_estimate(state), None)
     assert [fix.by_odometry for fix in bridge.fixes] == [False, True]
+    assert bridge.fixes[1].scale_sigma == 0.2
 
 
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():

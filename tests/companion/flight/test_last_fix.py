@@ -60,9 +60,7 @@ def test_the_way_that_the_ekf_flew_since_is_added(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("ahead_s", "usable"), [(0.0, True), (0.2, True), (0.4, False)])
-def test_a_picture_that_is_newer_than_the_ekf_report_can_be_placed(
-    tmp_path: Path, ahead_s: float, usable: bool
-) -> None:
+def test_a_picture_that_is_newer_than_the_ekf_report_can_be_placed(tmp_path, ahead_s, usable):
     """Killed on the embedded vehicle: positions came at 10 Hz, pictures were 70 ms old, and the
     last place was never used: 3 s on trial instead.
     """
@@ -98,9 +96,7 @@ MINUTE = 60 * SECOND
         (None, None, True),
     ],
 )
-def test_an_ekf_that_counts_from_elsewhere_shows_no_way(
-    tmp_path: Path, offset_ns: int | None, origin: Origin | None, usable: bool
-) -> None:
+def test_an_ekf_that_counts_from_elsewhere_shows_no_way(tmp_path, offset_ns, origin, usable):
     """An autopilot that rebooted while this process was away is where it began, by itself: the
     place was off by the way between, up to 40 m/s times the gap, and not on trial.
     """
@@ -153,9 +149,7 @@ def test_a_flight_that_does_not_end_in_order_leaves_its_place(tmp_path: Path) ->
         (103.0, (510.0, 20.0, -80.0)),  # the EKF jumped
     ],
 )
-def test_what_may_not_be_trusted_is_not_used(
-    tmp_path: Path, at_s: float, local: tuple[float, float, float] | None
-) -> None:
+def test_what_may_not_be_trusted_is_not_used(tmp_path, at_s, local):
     assert memory(kept(tmp_path), local).prior(round(at_s * SECOND)) is None
 
 
@@ -213,9 +207,7 @@ def test_a_pipe_in_its_place_is_not_waited_for(tmp_path: Path) -> None:
     assert read_last_fix(path, boot_id()) is None
 
 
-def test_what_cannot_be_kept_or_removed_ends_no_flight(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_cannot_be_kept_or_removed_ends_no_flight(tmp_path, caplog):
     path = tmp_path / "last-fix.json"
     path.mkdir()  # neither replaced by a file, nor removed as one
     kept_on = memory(path)

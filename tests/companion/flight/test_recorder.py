@@ -148,12 +148,6 @@ def test_a_disk_that_fails_is_told_from_a_wrong_folder(tmp_path, monkeypatch, nu
     assert type(caught.value) is kind
 
 
-def test_a_file_in_the_folders_place_is_a_named_error(tmp_path):
-    (tmp_path / "flight").touch()
-    with pytest.raises(ReportError, match=r"record\.folder .*flight"):
-        Recorder(RecordConfig(folder=tmp_path / "flight"), FRAME)
-
-
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
     (tmp_path / "events.csv").symlink_to("/dev/full")

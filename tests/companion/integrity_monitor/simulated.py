@@ -51,7 +51,7 @@ class Flight:
     """Flies `path` (seconds to north, east) level, and steps the monitor; a fix every 0.1 s.
 
     seen: the path that vision sees; GNSS: its offset (north, m), None without a receiver. moved:
-    when only the position was held, by_odometry.
+    when only the position was held, by_odometry; claims: the scale sigma of each of these.
     """
 
     monitor: IntegrityChecks
@@ -69,6 +69,7 @@ class Flight:
     passed: list[VisionFix] = field(default_factory=list)
     held: list[float] = field(default_factory=list)
     moved: list[float] = field(default_factory=list)
+    claims: list[float] = field(default_factory=list)
     seed: int = 1
     by_odometry: bool = False
 
@@ -172,7 +173,7 @@ class Flight:
             height,
             reset_count=int(at_s >= self.reset_at_s),
             position_covariance_ned=covariance,
-            by_odometry=self.by_odometry,
+            scale_sigma=0.1 if self.by_odometry else None,
         )
 
     def _offer(self, fix: VisionFix) -> None:
@@ -183,6 +184,7 @@ class Flight:
         self.held.append(self.at_s)
         if admitted is not None:
             self.moved.append(self.at_s)
+            self.claims.append(admitted.scale_sigma or 0.0)
 
 
 def jumps(flight: Flight) -> list[float]:

@@ -107,9 +107,7 @@ def test_a_video_that_freezes_below_take_off_is_told() -> None:
         (100.0, 100.0, 9.5, 7.0),  # and zoomed out a hover looks still for longer
     ],
 )
-def test_how_long_a_hover_may_look_still_goes_by_the_zoom(
-    fov_deg: float, depth_m: float, within_s: float, not_before_s: float
-) -> None:
+def test_how_long_a_hover_may_look_still_goes_by_the_zoom(fov_deg, depth_m, within_s, not_before_s):
     watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(horizontal_fov_deg=FOV_DEG))
     view = sighting(0.0, depth_m, fov_deg)
     flight = Filmed(Seen(watched, stands, stands, noise_m=0.02, view=view), stands).fly(12.0)

@@ -90,9 +90,7 @@ def turns(degrees: float, until_s: float) -> tuple[Callable[[float], tuple[float
 
 
 @pytest.mark.parametrize(("degrees", "silent_s"), [(3.0, 0.0), (-5.0, 6.0)])
-def test_a_frame_that_turns_in_a_hover_is_not_taken_by_waiting(
-    degrees: float, silent_s: float
-) -> None:
+def test_a_frame_that_turns_in_a_hover_is_not_taken_by_waiting(degrees, silent_s):
     """It moves as the IMU and the EKF do: it was taken after 5 s, 6 to 120 m aside."""
     seen, angle = turns(degrees, 26.0)
     flight = headed(seen, vision_deg=angle, silent=(12.0, 12.0 + silent_s)).fly(27.0)
@@ -119,9 +117,7 @@ def test_gyros_are_trusted_for_a_minute() -> None:
         {"autopilot_deg": lambda at_s: -8.0 if at_s >= 15.0 else 179.9},  # the EKF aligns its yaw
     ],
 )
-def test_a_place_found_after_a_loss_of_six_seconds_is_taken_after_its_time(
-    options: dict[str, Angle],
-) -> None:
+def test_a_place_found_after_a_loss_of_six_seconds_is_taken_after_its_time(options):
     """The wind took it 25 m aside, and the EKF does not know."""
 
     def blown(at_s: float) -> tuple[float, float]:

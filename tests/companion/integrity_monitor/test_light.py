@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from benchmarks.real.darkened import darkened
@@ -15,14 +13,11 @@ from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.opening import open_localizer
 from localizer.types import Frame, PosePrior
-from sitl.demo.assets import FlightAssets
 
 LIMIT = VideoCheckConfig().low_detail
 
 
-def test_it_is_told_while_registrations_are_still_accepted(
-    small_assets: FlightAssets, small_sequence: Path
-) -> None:
+def test_it_is_told_while_registrations_are_still_accepted(small_assets, small_sequence):
     sequence = load_sequence(small_sequence, TileCache.open(small_assets.map_cache).frame)
     frame, truth = sequence.frame(0), sequence.truth[0]
     beside = Pose(truth.rotation, truth.translation + np.array([2.0, -2.0, 1.0]))

@@ -33,9 +33,7 @@ def feed(calibrated: date | None) -> FeedConfig:
         (DONE, -1, False),  # a clock that was never set
     ],
 )
-def test_only_a_recent_calibration_says_how_well_the_camera_is_known(
-    done: date | None, days: int, known: bool
-) -> None:
+def test_only_a_recent_calibration_says_how_well_the_camera_is_known(done, days, known):
     today = DONE + timedelta(days=days)
     assert feed(done).is_calibrated(today) is known
 
@@ -50,9 +48,3 @@ def test_a_calibrated_camera_has_the_narrower_level_and_one_that_states_more_a_w
     """What the calibration states is in the fix's covariance: 0.1 % are 0.2 m at 120 m."""
     assert level_m(0.2, calibrated=True) < 1.5 < level_m(0.2, calibrated=False)
     assert level_m(0.6, calibrated=True) > 2.5
-
-
-def test_a_budget_of_ones_own_is_kept_for_its_kind_of_camera() -> None:
-    own = ProtectionConfig(calibration_share=0.01, calibrated_share=0.002)
-    assert own.of_camera(calibrated=False).calibration_share == 0.01
-    assert own.of_camera(calibrated=True).calibration_share == 0.002

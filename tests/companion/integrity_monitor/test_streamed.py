@@ -82,9 +82,7 @@ def streamed() -> Iterator[Callable[[Image], Image | None]]:
     ],
     ids=["frozen", "loop"],
 )
-def test_a_stream_that_does_not_show_the_present_is_told(
-    ground: Image, wrong: Callable[[float], float], told: AlertId, within_s: float
-) -> None:
+def test_a_stream_that_does_not_show_the_present_is_told(ground, wrong, told, within_s):
     """At 10 m/s, the fixes as they should be: only the pictures can tell. Each is encoded anew,
     with fresh noise and a fresh stamp, as behind an encoder that goes on.
     """

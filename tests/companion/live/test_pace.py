@@ -13,17 +13,3 @@ def test_the_mean_rate_is_what_was_asked_for(fed_hz, asked_hz, sent_hz):
             pace.went(1000.0 + i / fed_hz)
             sent += 1
     assert sent / 100 == pytest.approx(sent_hz, rel=0.02)
-
-
-def test_a_long_pause_is_not_made_up_for():
-    pace = RateLimiter(0.2)
-    for now_s in (10.0, 10.2, 500.0):
-        assert pace.is_due(now_s)
-        pace.went(now_s)
-    times = [500.0 + i / 100 for i in range(1, 100)]
-    sent = 0
-    for now_s in times:
-        if pace.is_due(now_s):
-            pace.went(now_s)
-            sent += 1
-    assert sent <= 6

@@ -117,24 +117,6 @@ def _give(publisher, shown, number):
     publisher.wake()
 
 
-def test_a_console_that_does_not_read_costs_one_message_and_the_next_gets_the_newest(serving):
-    publisher, shown, _ = serving
-    idle, reader = Console(publisher.path), Console(publisher.path)
-    for console in (idle, reader):
-        console.next("hello")
-        console.send({"kind": "watch", "frames": True})
-    seen: list[Any] = []
-    number = 0
-    while len(seen) < 3:
-        number += 1
-        _give(publisher, shown, number)  # returns at once, however many there are
-        if number % 20 == 0 and (message := reader.poll("frame")) is not None:
-            seen.append(message.head["exposure_ns"])
-            reader.send({"kind": "read"})
-    assert seen == sorted(seen)
-    assert max(publisher.waiting()) <= 65536
-
-
 def _watching(publisher):
     console = Console(publisher.path)
     console.next("hello")

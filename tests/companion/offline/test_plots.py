@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.offline.plots import ErrorSeries, MapPicture, checkerboard, plot_errors, plot_tracks
+from companion.offline.plots import ErrorSeries, MapPicture, plot_errors, plot_tracks
 
 TIME = np.linspace(-5.0, 10.0, 60)
 
@@ -38,11 +38,3 @@ def test_tracks_that_coincide_are_all_seen(tmp_path):
     inside = image[height // 3 : 2 * height // 3, width // 5 : 4 * width // 5]
     for name, colour in colours.items():
         assert (np.abs(inside - colour).max(axis=-1) < 30).sum() > 300, name
-
-
-def test_a_checkerboard_alternates():
-    board = checkerboard(np.zeros((40, 80, 3), np.uint8), np.full((40, 80, 3), 255, np.uint8))
-    assert board[5, 5, 0] == 0
-    assert board[5, 15, 0] == 255
-    assert board[15, 5, 0] == 255
-    assert board.mean() == pytest.approx(127.5)

@@ -387,3 +387,20 @@ def test_a_mission_over_the_edge_is_told_with_pictures_and_exit_code_1(tmp_path,
     assert cv2.imread(str(out / "heat.png")).shape == track.shape
     wrong = run(over, "--config", config, "--out", out, "--condition", "hail")
     assert wrong.exit_code == 2
+
+
+def test_a_mission_over_a_town_holds_with_exit_code_0(tmp_path, small_assets):
+    """The false alarm: nothing is wrong with map, light and way."""
+    town = TileCache.open(small_assets.map_cache)
+    config = tmp_path / "deployment.yaml"
+    config.write_text(DEPLOYMENT.format(map=town.path))
+    path = plan_file(
+        tmp_path / "a.plan", town, waypoint(town, 40, 0, 80), waypoint(town, 0, 40, 80),
+        item(20, 0, 0, 0, 0, 0, 0, 0),
+    )  # fmt: skip
+    out = tmp_path / "report"
+    done = run(path, "--config", config, "--out", out, "--no-alternatives", "--spacing", 40)
+    assert done.exit_code == 0, done.output
+    made = json.loads((out / "plan.json").read_text())
+    assert made["holds"]
+    assert made["stretches"] == []

@@ -1,7 +1,6 @@
 """The companion's own checks of a deployment; the flight controller's are the bridge's."""
 
 import sys
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +11,6 @@ from companion.cli.doctor import print_diagnosis
 from companion.config import CameraModel, parse_config
 from companion.preflight.doctor import examine_deployment
 from companion.sources import StreamState
-from companion.terminal.steps import shown_steps
 from localizer.types import Frame
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
@@ -133,26 +131,6 @@ def test_a_feed_whose_port_another_has_is_not_called_a_camera_that_is_off(map_ca
     finding = _findings(map_cache, "udp://127.0.0.1:5600")["camera"]
     assert (finding.ok, finding.found) == (False, "silent")
     assert finding.why.endswith("in 8 s: cannot connect: Address in use")
-
-
-def test_what_is_being_done_is_told_before_it_takes_time(map_cache, feed):
-    said: list[Any] = []
-    camera = {"source": str(feed), "model": MODEL, "settings": {"rate_hz": 20.0}}
-    config = parse_config({"map": str(map_cache), "camera": camera}, "test")
-    examine_deployment(config, vehicle=False, say=said.append)
-    assert [text.split()[0] for text in said] == ["reading", "making", "reading"]
-    assert str(feed) in said[-1]
-
-
-def test_steps_are_lines_with_seconds_where_there_is_no_terminal(capsys):
-    now = iter([10.0, 10.4, 15.0])
-    with shown_steps(Console(force_terminal=False), lambda: next(now)) as say:
-        say("reading [the] map")
-        say("reading the feed")
-    assert capsys.readouterr().out.splitlines() == [
-        "   0 s reading [the] map",
-        "   5 s reading the feed",
-    ]
 
 
 def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):

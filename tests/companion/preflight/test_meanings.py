@@ -44,9 +44,7 @@ def fixed(pitch_deg: float) -> dict[str, Any]:
         ({}, {"bridge": fixed(0.0)}, "bridge.camera.mount_pitch_deg", "to the horizon"),
     ],
 )
-def test_what_means_something_else_is_named(
-    camera: dict[str, Any], settings: dict[str, Any], name: str, why: str
-) -> None:
+def test_what_means_something_else_is_named(camera, settings, name, why):
     found = meanings(camera, **settings)
     assert list(found) == [name]
     assert why in found[name]

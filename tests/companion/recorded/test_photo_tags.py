@@ -10,7 +10,6 @@ from companion.recorded.photo_tags import looking_down, read_photo_tags
 from tests.companion.recorded.photos import dji, elements, write_photo
 
 _FOCAL, _FOCAL_35, _MAKE, _MODEL = 0x920A, 0xA405, 0x010F, 0x0110
-_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def _looks(path):

@@ -158,12 +158,6 @@ def test_the_sender_is_kept_over_a_reconnection_and_old_packets_are_not(sockets:
     assert feed.read(65536) == TS[376:]
 
 
-def test_a_read_returns_at_most_what_is_asked_and_loses_nothing(sockets: Sockets) -> None:
-    sockets.feed.begin(30.0)
-    sockets.sender("127.0.0.1").send(TS)
-    assert sockets.feed.read(1000) + sockets.feed.read(1000) == TS
-
-
 def test_silence_and_closing_end_a_read(sockets: Sockets) -> None:
     sockets.feed.begin(0.0)
     with pytest.raises(SilentSenderError):
@@ -183,10 +177,7 @@ def test_only_the_named_interface_is_bound(sockets: Sockets) -> None:
 
 def test_a_multicast_group_is_joined_on_the_interface() -> None:
     address = UdpAddress("239.255.42.42", 0, "127.0.0.1")
-    with (
-        address.bound() as receiver,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
+    with address.bound() as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         sender.sendto(TS, ("239.255.42.42", receiver.getsockname()[1]))
         receiver.settimeout(30.0)

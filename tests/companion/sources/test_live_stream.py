@@ -67,9 +67,7 @@ def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["rtp", "rtp hevc", "h264", "sdp"])
-def test_rtp_and_raw_video_are_received_as_transport_streams_are(
-    form: str, url: str, tmp_path: Path
-) -> None:
+def test_rtp_and_raw_video_are_received_as_transport_streams_are(form, url, tmp_path):
     """QGroundControl's "UDP h.264", PX4's Gazebo, OpenHD and WFB-ng send RTP."""
     port, source = url.rpartition(":")[2], url
     target = f"{url}?pkt_size=1400" if form == "h264" else f"rtp://127.0.0.1:{port}"
@@ -178,9 +176,7 @@ def test_closing_ends_the_iteration_before_any_frame_came(url: str) -> None:
     assert watch.states[-1] is StreamState.CLOSED
 
 
-def test_closing_waits_for_a_reader_that_is_just_being_started(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closing_waits_for_a_reader_that_is_just_being_started(url, monkeypatch):
     """The feed's first line and the order to stop come from two threads."""
 
     def decoder(*_: Any) -> None:
@@ -250,9 +246,7 @@ def test_an_address_without_a_possible_port_is_named(url):
         open_source(url, CAMERA)
 
 
-def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(url, monkeypatch):
     """The reader's thread is the only one that can bring the video back."""
 
     def decoder(*_: Any) -> None:
@@ -287,9 +281,7 @@ class _Decoder:
         pass
 
 
-def test_pixels_that_cannot_be_converted_do_not_end_the_feed_in_flight(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pixels_that_cannot_be_converted_do_not_end_the_feed_in_flight(url, monkeypatch):
     """FFmpeg's error left `frames` and ended the flight; one kind ends even the process."""
     monkeypatch.setattr("companion.sources.av_source.VideoDecoder", _Decoder)
     _Decoder.kinds = ["yuv420p", "y210be", "y210be", "yaf32le", "yuv420p"]
@@ -312,9 +304,7 @@ def test_pixels_that_cannot_be_converted_do_not_end_the_feed_in_flight(
     source.close()
 
 
-def test_pixels_that_cannot_be_converted_are_named_at_the_start(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pixels_that_cannot_be_converted_are_named_at_the_start(url, monkeypatch):
     monkeypatch.setattr("companion.sources.av_source.VideoDecoder", _Decoder)
     for kind in ("y210be", "yaf32le"):
         _Decoder.kinds, _Decoder.taken = [kind], [threading.Event()]

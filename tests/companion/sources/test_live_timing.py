@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import pytest
 
 from companion.sources import open_source
-from tests.companion.sources.paced_sender import (
-    CAMERA,
-    PacedSender,
-    Watch,
-    free_port,
-    read_counter,
-)
+from tests.companion.sources.paced_sender import CAMERA, PacedSender, Watch, free_port, read_counter
 
 
 @pytest.fixture
@@ -33,9 +26,7 @@ def _compare(watch: Watch, sender: PacedSender, skip: int = 0) -> tuple[np.ndarr
     return error, latency
 
 
-def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(
-    real_time: Any, url: str
-) -> None:
+def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(real_time, url):
     with real_time():
         with Watch(url) as watch, PacedSender(url, rate_hz=10.0, delay_s=0.02) as sender:
             watch.wait_for(25)
@@ -55,9 +46,7 @@ def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(
     assert sequences == sorted(set(sequences))
 
 
-def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(
-    real_time: Any, url: str
-) -> None:
+def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(real_time, url):
     delay = 0.03
     with real_time():
         with (
@@ -74,9 +63,7 @@ def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(
     assert times == sorted(times)
 
 
-def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
-    real_time: Any, url: str
-) -> None:
+def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(real_time, url):
     with real_time():
         with PacedSender(url, rate_hz=30.0):
             source = open_source(url, CAMERA)

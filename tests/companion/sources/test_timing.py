@@ -93,9 +93,7 @@ def test_a_sender_that_starts_again_is_taken_up_at_once() -> None:
     assert clock.map(100 * 10**9, 102 * 10**9) == 102 * 10**9
 
 
-def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not(
-    clocks: Clocks,
-) -> None:
+def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not(clocks):
     now = clocks.now_ns
     clock = ExposureClock(latency_ns=90 * MS)
     misp = MispTime((now - 60 * MS + clocks.offset_ns) // 1000, locked=True)
@@ -106,9 +104,7 @@ def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not(
 @pytest.mark.parametrize(
     ("offset_ns", "locked"), [(0, False), (3600 * 10**9, True), (-5 * 10**9, True)]
 )
-def test_a_misp_clock_that_is_not_ours_gives_differences_only(
-    clocks: Clocks, offset_ns: int, locked: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_misp_clock_that_is_not_ours_gives_differences_only(clocks, offset_ns, locked, caplog):
     now = clocks.now_ns
     clock = ExposureClock(latency_ns=30 * MS)
     for i, lag in enumerate([30, 55, 48]):
@@ -134,9 +130,7 @@ def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
 
 
 @pytest.mark.parametrize("step_s", [0.0, 0.3, -0.1])
-def test_a_step_of_the_wall_clock_is_told_and_enters_no_exposure_time(
-    clocks: Clocks, caplog: pytest.LogCaptureFixture, step_s: float
-) -> None:
+def test_a_step_of_the_wall_clock_is_told_and_enters_no_exposure_time(clocks, caplog, step_s):
     clock, camera_offset_ns = ExposureClock(0), clocks.offset_ns
 
     def seen() -> int:

@@ -100,9 +100,7 @@ def flown(
 
 
 @pytest.mark.parametrize("factor", [lambda _: 1.4, lambda k: 0.75 + 0.25 * k])
-def test_it_is_matched_at_any_zoom(
-    flight: Flight, small_assets: FlightAssets, factor: Callable[[int], float]
-) -> None:
+def test_it_is_matched_at_any_zoom(flight, small_assets, factor):
     with localizer_of(flight, small_assets) as localizer:
         estimates = flown(flight, localizer, factor)
     # The first reference is of the lens before it zoomed: it shows too little for some.
@@ -110,9 +108,7 @@ def test_it_is_matched_at_any_zoom(
     assert max(flight.off_m(e) for e in estimates if e.accepted) < 0.15
 
 
-def test_the_odometry_carries_on_while_the_lens_zooms(
-    flight: Flight, small_assets: FlightAssets
-) -> None:
+def test_the_odometry_carries_on_while_the_lens_zooms(flight, small_assets):
     with localizer_of(flight, small_assets) as localizer:
         estimates = flown(flight, localizer, lambda k: 1.0 + 0.05 * max(k - 3, 0), seen=3)
     bridged = [e for e in estimates if e.state is TrackingState.BRIDGING]
@@ -120,9 +116,7 @@ def test_the_odometry_carries_on_while_the_lens_zooms(
     assert max(flight.off_m(e) for e in bridged) < 0.3
 
 
-def test_a_lens_that_does_not_zoom_has_one_pinhole_for_all(
-    flight: Flight, small_assets: FlightAssets
-) -> None:
+def test_a_lens_that_does_not_zoom_has_one_pinhole_for_all(flight, small_assets):
     with localizer_of(flight, small_assets) as localizer:
         pinhole = localizer.camera
         for camera in (LENS, LENS.resized(640, 480), LENS.resized(160, 121)):

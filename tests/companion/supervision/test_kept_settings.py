@@ -62,9 +62,7 @@ def _another_programs(path: Path) -> None:
 
 
 @pytest.mark.parametrize("lose", [_gone, _no_file_any_more, _half_written, _another_programs])
-def test_a_lost_file_costs_nothing_in_the_air_and_ends_a_first_start(
-    deployment: Path, kept: Callable[[CompanionConfig], int], lose: Callable[[Path], None]
-) -> None:
+def test_a_lost_file_costs_nothing_in_the_air_and_ends_a_first_start(deployment, kept, lose):
     """Each restart ended with it, and none ever flew again."""
     flown = load_config(deployment)
     descriptor = kept(flown)
@@ -77,9 +75,7 @@ def test_a_lost_file_costs_nothing_in_the_air_and_ends_a_first_start(
         settings_of(deployment, None)
 
 
-def test_a_file_that_is_there_counts(
-    deployment: Path, kept: Callable[[CompanionConfig], int]
-) -> None:
+def test_a_file_that_is_there_counts(deployment, kept):
     descriptor = kept(load_config(deployment))
     deployment.write_text(deployment.read_text().replace("area", "other"))
     again, why = settings_of(deployment, descriptor)
@@ -91,9 +87,7 @@ def test_every_setting_comes_back(kept: Callable[[CompanionConfig], int], tmp_pa
     assert settings_of(tmp_path / "gone.yaml", kept(flown))[0] == flown
 
 
-def test_a_folder_whose_name_is_no_utf8_is_kept(
-    deployment: Path, kept: Callable[[CompanionConfig], int]
-) -> None:
+def test_a_folder_whose_name_is_no_utf8_is_kept(deployment, kept):
     """No supervised flight began there."""
     folder = Path(os.fsdecode(os.fsencode(deployment.parent) + b"/fl\xfcge"))
     folder.mkdir()
@@ -104,9 +98,7 @@ def test_a_folder_whose_name_is_no_utf8_is_kept(
     assert settings_of(moved, descriptor)[0] == flown
 
 
-def test_it_takes_no_standard_streams_place(
-    deployment: Path, kept: Callable[[CompanionConfig], int]
-) -> None:
+def test_it_takes_no_standard_streams_place(deployment, kept):
     """Begun with its input closed, every restart was told ``--kept=0``: wrong usage, its end."""
     config = load_config(deployment)
     saved = os.dup(0)
@@ -121,9 +113,7 @@ def test_it_takes_no_standard_streams_place(
 _READS = 'import os, sys; sys.exit(os.pread(int(sys.argv[1]), 10, 0) != b\'{"map": "/\')'
 
 
-def test_restarted_processes_can_read_it(
-    deployment: Path, kept: Callable[[CompanionConfig], int]
-) -> None:
+def test_restarted_processes_can_read_it(deployment, kept):
     descriptor = kept(load_config(deployment))
     command = [sys.executable, "-S", "-c", _READS, str(descriptor)]
     for _ in range(2):
@@ -132,9 +122,7 @@ def test_restarted_processes_can_read_it(
         process.close()
 
 
-def test_restarts_are_given_it_and_the_first_start_is_not(
-    deployment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_restarts_are_given_it_and_the_first_start_is_not(deployment, monkeypatch):
     begun: list[tuple[list[str], tuple[int, ...]]] = []
 
     class Dies:

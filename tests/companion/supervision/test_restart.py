@@ -61,9 +61,7 @@ def test_a_log_that_is_there_is_appended_to(tmp_path: Path) -> None:
     assert told == f"{tmp_path}: Permission denied"
 
 
-def test_a_disk_that_stands_still_is_not_even_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_stands_still_is_not_even_read(tmp_path, monkeypatch):
     monkeypatch.setattr("companion.supervision.restart._PATIENCE_S", 0.05)
     still = threading.Event()
 
@@ -84,9 +82,7 @@ def test_a_disk_that_stands_still_is_not_even_read(
 @pytest.mark.parametrize(
     ("number", "told"), [(errno.ENOSPC, False), (errno.EUCLEAN, False), (errno.EACCES, True)]
 )
-def test_a_full_or_failing_disk_is_the_recorders_to_tell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, told: bool
-) -> None:
+def test_a_full_or_failing_disk_is_the_recorders_to_tell(tmp_path, monkeypatch, number, told):
     def full(*_: object, **__: object) -> None:
         raise OSError(number, "as it is")
 

@@ -14,11 +14,6 @@ from companion.targets.detections import (
 )
 
 
-def test_round_trip():
-    detection = Detection("car", 123456789, 320.5, 200.25)
-    assert parse_detection(encode_detection(detection)) == (detection, None)
-
-
 @pytest.mark.parametrize(
     "data",
     [

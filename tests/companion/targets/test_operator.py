@@ -113,18 +113,6 @@ def test_forty_clicks_and_rectangles_with_stops_between_are_each_told_under_thei
             assert np.linalg.norm(target.fix.position_world - first.fix.position_world) < 0.05
 
 
-def test_a_click_by_the_newest_frame_would_be_metres_off():
-    """The attack that the delay answers: 10 m/s and 250 ms are 2.5 m."""
-    places = []
-    for delay_ms in (250.0, 0.0):
-        operator = Operator(delay_ms)
-        operator.fly(30)
-        operator.clicks_at(0.5, 0.5, after_ms=0)
-        operator.fly(3)
-        places.append(operator.told[0].fix.position_world)
-    assert 1.5 < np.linalg.norm(places[0] - places[1]) < 6.0
-
-
 def test_the_delay_s_error_is_in_the_covariance_along_the_picture_s_motion():
     def sigma(sigma_ms):
         operator = Operator(sigma_ms=sigma_ms)

@@ -71,14 +71,6 @@ def test_detection_and_estimate_of_one_frame_meet_in_either_order():
             np.testing.assert_allclose(s.targets[0].fix.position_world, [0, 0, 0], atol=1e-6)
 
 
-def test_rejected_estimates_and_other_frames_are_not_used():
-    with Session() as s:
-        s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
-        s.reporter.add_estimate(_estimate(50 * MS, accepted=False))
-        s.reporter.add_estimate(_estimate(150 * MS))
-        assert not s.came.wait(0.5)
-
-
 def test_a_detector_seven_seconds_behind_a_fast_camera_is_heard():
     """It names frames up to 256 back (`FrameTimes`); half of them had lost their pose by then."""
     with Session() as s:

@@ -81,11 +81,3 @@ def test_work_that_cannot_be_counted_is_told_of_after_two_seconds_and_then_every
     assert state.timers[-1].is_cancelled
     state.timers[-2].call()  # one that was under way when it ended begins no other
     assert len(state.timers) == 3
-
-
-def test_work_that_is_soon_done_says_nothing(log):
-    state, console, file = log
-    with shown_work(console, "hashing"):
-        pass
-    assert file.getvalue() == ""
-    assert state.timers[0].is_cancelled

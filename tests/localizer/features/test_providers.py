@@ -106,9 +106,7 @@ def test_the_best_installed_provider_serves_and_is_named(
 
 
 @pytest.mark.parametrize("fault", ["start", "silent", "run"])
-def test_a_provider_that_fails_hands_over_in_one_line(
-    fault: str, install: Callable[..., Asked], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_provider_that_fails_hands_over_in_one_line(fault, install, caplog):
     why = {"start": "libnvinfer.so.10: cannot open shared object file",
            "silent": "its libraries could not be loaded",
            "run": "out of memory"}  # fmt: skip
@@ -124,9 +122,7 @@ def test_a_provider_that_fails_hands_over_in_one_line(
     assert "\n" not in warnings[0]
 
 
-def test_down_to_the_cpu_and_no_further(
-    install: Callable[..., Asked], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_down_to_the_cpu_and_no_further(install, caplog):
     install(["TensorRT", "CUDA", "CPU"], Tensorrt="start", CUDA="run")
     assert OnnxExtractor(SHIPPED_MODEL).provider == "CPU"
     assert len(caplog.messages) == 2
@@ -153,9 +149,7 @@ def test_it_is_warmed_up_at_the_size_of_the_flight(install: Callable[..., Asked]
     assert Stand.made[-1].sizes == [(72, 96)]
 
 
-def test_tensorrt_keeps_its_engine_and_knows_the_sizes(
-    install: Callable[..., Asked], tmp_path: Path
-) -> None:
+def test_tensorrt_keeps_its_engine_and_knows_the_sizes(install, tmp_path):
     prefixes = set()
     for size, half in (((320, 240), False), ((320, 240), True), ((640, 360), True)):
         asked = install(["TensorRT", "CUDA", "CPU"])
@@ -176,9 +170,7 @@ def test_tensorrt_keeps_its_engine_and_knows_the_sizes(
     assert len(prefixes) == 3
 
 
-def test_a_kept_engine_that_is_damaged_is_built_anew(
-    install: Callable[..., Asked], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_kept_engine_that_is_damaged_is_built_anew(install, tmp_path, caplog):
     """As after a power cut while it was written: TensorRT refuses it at every start."""
     asked = install(["TensorRT", "CUDA", "CPU"])
     OnnxExtractor(SHIPPED_MODEL)
@@ -194,9 +186,7 @@ def test_a_kept_engine_that_is_damaged_is_built_anew(
     assert "TensorRT builds its engine again: could not deserialize" in caplog.messages[0]
 
 
-def test_what_was_kept_is_not_always_to_blame(
-    install: Callable[..., Asked], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_was_kept_is_not_always_to_blame(install, tmp_path, caplog):
     asked = install(["TensorRT", "CUDA", "CPU"])
     OnnxExtractor(SHIPPED_MODEL)
     (tmp_path / "tensorrt" / asked[0][0][1]["trt_engine_cache_prefix"]).write_bytes(b"sound")

@@ -43,11 +43,6 @@ def close(a, b, tolerance=1e-9):
     np.testing.assert_allclose(a.translation, b.translation, atol=1e4 * tolerance)
 
 
-@given(vectors(10.0), vectors(10.0))
-def test_hat_is_the_cross_product(a, b):
-    np.testing.assert_allclose(hat(a) @ b, np.cross(a, b), atol=1e-12)
-
-
 @given(rotations())
 def test_so3_exp_is_a_rotation_and_the_matrix_exponential(phi):
     R = so3_exp(phi)
@@ -77,30 +72,6 @@ def test_se3_exp_is_the_matrix_exponential_and_log_its_inverse(rho, phi):
     # Near a half turn the translation part of the logarithm is ill-conditioned.
     if np.linalg.norm(phi) < 3.0:
         np.testing.assert_allclose(pose.log(), xi, atol=1e-6)
-
-
-@given(poses())
-def test_inverse(pose):
-    close(pose @ pose.inverse, Pose.identity())
-    close(pose.inverse @ pose, Pose.identity())
-    close(pose.inverse.inverse, pose)
-
-
-@given(poses(), poses(), poses())
-def test_composition_is_associative(a, b, c):
-    close((a @ b) @ c, a @ (b @ c))
-
-
-@given(poses(), poses(), vectors(1e3))
-def test_composition_is_composition_of_maps(a, b, point):
-    np.testing.assert_allclose((a @ b).apply(point), a.apply(b.apply(point)), atol=1e-6)
-    np.testing.assert_allclose((a.matrix @ [*point, 1.0])[:3], a.apply(point), atol=1e-6)
-
-
-@given(poses())
-def test_matrix_round_trip(pose):
-    close(Pose.from_matrix(pose.matrix), pose)
-    close(Pose.from_matrix(pose.matrix[:3]), pose)
 
 
 @given(poses())

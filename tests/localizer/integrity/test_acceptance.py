@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
@@ -67,3 +70,35 @@ def test_each_kind_of_evidence_counts() -> None:
 def test_another_focal_length_that_fits_better_rejects() -> None:
     assert not is_acceptable(CONFIG, _registration(focal_gain=0.05), 1.0)
     assert is_acceptable(CONFIG, _registration(focal_gain=-0.01), 1.0)
+
+
+EVIDENCE = st.fixed_dictionaries(
+    {
+        "overlap": st.floats(0, 1), "quality": st.floats(0, 1), "lead": st.floats(0, 2),
+        "votes": st.integers(0, 60), "peak": st.floats(0, 12),
+    }
+)  # fmt: skip
+
+
+def _with(evidence: dict[str, Any]) -> Registration:
+    found = PatchAgreement(patches=60, votes=evidence["votes"], peak=evidence["peak"])
+    rest = {k: v for k, v in evidence.items() if k not in ("votes", "peak")}
+    return _registration(agreement=found, **rest)
+
+
+@given(EVIDENCE, EVIDENCE, st.floats(0, 30), st.floats(1, 1000), st.floats(1, 1000))
+def test_more_evidence_or_a_narrower_prior_never_costs_an_accepted_place(
+    one, other, distance_squared, sigma_m, other_m
+):
+    less = _with({key: min(one[key], other[key]) for key in one})
+    more = _with({key: max(one[key], other[key]) for key in one})
+    if is_acceptable(CONFIG, less, distance_squared, max(sigma_m, other_m)):
+        assert is_acceptable(CONFIG, more, distance_squared, min(sigma_m, other_m))
+
+
+@pytest.mark.parametrize("name", ["overlap", "quality", "lead", "peak"])
+def test_evidence_that_is_no_number_accepts_nothing(name):
+    good = {"overlap": 0.9, "quality": 0.6, "lead": 1.0, "votes": 50, "peak": 6.0}
+    assert is_acceptable(CONFIG, _with(good), 1.0)
+    assert not is_acceptable(CONFIG, _with(good | {name: math.nan}), 1.0)
+    assert not is_acceptable(CONFIG, _with(good), math.nan)

@@ -9,12 +9,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.height_error import CANDIDATES_M, MapHeightError, height_likelihood
 from localizer.integrity.patch_covariance import patch_covariance
 from localizer.registration.agreement import PatchDisplacements
-from localizer.registration.priors import (
-    attitude_constraint,
-    combine,
-    fused,
-    height_constraint,
-)
+from localizer.registration.priors import attitude_constraint, combine, fused, height_constraint
 
 HEIGHT_M, FOCAL_PX = 120.0, 110.0
 DOWN = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, HEIGHT_M]))

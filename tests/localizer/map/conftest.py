@@ -54,11 +54,7 @@ def glb(positions, uvs, faces, image: bytes, mime: str = "image/jpeg", **extra) 
         "meshes": [
             {
                 "primitives": [
-                    {
-                        "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
-                        "indices": 2,
-                        "material": 0,
-                    }
+                    {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
                 ]
             }
         ],

@@ -49,8 +49,7 @@ def test_what_is_unknown_is_filled_and_does_not_spread(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("west", "crs", "why"),
-    [(7.99, None, "coordinate system"), (20.0, "EPSG:4326", "from the map")],
+    ("west", "crs", "why"), [(7.99, None, "coordinate system"), (20.0, "EPSG:4326", "from the map")]
 )
 def test_what_is_no_terrain_of_the_place_is_named(tmp_path, west, crs, why):
     path = written(tmp_path / "t.tif", np.full((72, 72), 600.0), west, crs)
@@ -99,8 +98,7 @@ def test_what_holds_no_heights_is_no_ground(tmp_path, data, why):
 
 
 @pytest.mark.parametrize(
-    ("data", "tags"),
-    [(HILL * 100.0, {"scales": 0.01}), (HILL / 0.3048, {"units": "ft"})],
+    ("data", "tags"), [(HILL * 100.0, {"scales": 0.01}), (HILL / 0.3048, {"units": "ft"})]
 )
 def test_scale_and_unit_are_honoured(tmp_path, data, tags):
     found = open_terrain(other(tmp_path / "t.tif", data, **tags), FRAME).heights

@@ -8,7 +8,7 @@ import pytest
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
 from localizer.odometry import DepthSource, FlatGround
-from localizer.odometry.ground import ground_points
+from localizer.odometry.ground import ground_points, height_above_ground
 from localizer.odometry.keyframe import keyframe_anchors
 from localizer.registration.sampling import sample_features
 from tests.localizer.odometry.conftest import CAMERA
@@ -40,13 +40,6 @@ def test_map_points_keep_their_places_and_get_the_pictures_features(hills):
     )
 
 
-def test_the_count_is_kept(hills):
-    anchors, _ = keyframe_anchors(
-        hills.frame(3).features, CAMERA, hills.pose(3), hills.surface(3), None, 200
-    )
-    assert len(anchors.points_world) == 200
-
-
 def test_the_ground_fills_what_the_map_leaves(hills):
     """The map ends in the middle of the picture: each half gets its own depth."""
     surface, pose = hills.surface(3), hills.pose(3)
@@ -74,15 +67,6 @@ def test_rays_meet_the_ground_where_it_is(ground):
     np.testing.assert_allclose(CAMERA.project(POSE.inverse.apply(points))[0], pixels, atol=1e-6)
 
 
-def test_the_sky_has_no_ground():
-    level = camera_pose(np.array([0.0, 0.0, 50.0]), 5.0, 0.0)
-    pixels = np.array([[80.0, 5.0], [80.0, 115.0]])
-    _, met = ground_points(FlatGround(0.0), level, CAMERA, pixels)
-    assert met.tolist() == [False, True]
-    _, met = ground_points(FlatGround(60.0), level, CAMERA, pixels)  # a camera below the ground
-    assert not met.any()
-
-
 def test_features_on_the_gpu_are_refused(hills):
     level = hills.frame(0).features.levels[0]
     on_device = replace(level, features=DeviceArray(64, level.features.shape, np.dtype("f4")))
@@ -96,3 +80,15 @@ def test_the_ground_is_below_the_roofs():
     heights = np.r_[rng.normal(12.0, 0.3, 600), rng.uniform(16.0, 30.0, 400)]
     points = np.column_stack([rng.uniform(0, 100, (1000, 2)), heights])
     assert FlatGround.under(points).height_m == pytest.approx(12.0, abs=0.4)
+
+
+def test_an_uncertain_place_above_a_slope_is_at_an_uncertain_height_above_the_ground():
+    """10 m of sigma across 20 % of slope are 2 m of height; along the slope's contours none."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-50, 50, (500, 2)), np.zeros(500)])
+    points[:, 2] = 0.2 * points[:, 0] + rng.normal(0, 0.5, 500)
+    place = np.array([0.0, 0.0, 80.0])
+    for variance, expected in (((100.0, 0.0, 1.0), 5**0.5), ((0.0, 100.0, 1.0), 1.0)):
+        above, sigma = height_above_ground(points, np.diag(variance), place)
+        assert above == pytest.approx(80.0, abs=1.0)
+        assert sigma == pytest.approx(expected, rel=0.05)

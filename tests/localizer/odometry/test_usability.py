@@ -80,9 +80,3 @@ def test_half_a_picture_is_enough():
     verdict = examine(picture)
     assert verdict.usable
     assert verdict.structured == pytest.approx(0.5, abs=0.05)
-
-
-def test_any_size_is_judged_alike():
-    large = cv2.resize(ground_picture(), (1280, 960), interpolation=cv2.INTER_CUBIC)
-    assert examine(large).usable
-    assert examine(np.full((1080, 1920, 3), 90, np.uint8)).fault is ImageFault.FLAT

@@ -21,22 +21,6 @@ def test_anchors_lie_on_the_ground(reference, place):
     np.testing.assert_allclose(z, place.height(x, y), atol=1e-3)
 
 
-def test_unprojection_and_projection_are_inverse(reference):
-    view, pyramid = reference
-    anchors = select_anchors(view, pyramid)
-    pixels, inside = view.camera.project(view.world_from_camera.inverse.apply(anchors.points_world))
-    assert inside.all()
-    np.testing.assert_allclose(pixels, anchors.pixels, atol=1e-4)
-    assert np.all(anchors.pixels % 1 == 0.5)
-
-
-def test_count_and_shapes(reference):
-    anchors = select_anchors(reference[0], reference[1], count=200)
-    assert anchors.points_world.shape == (200, 3)
-    assert [f.shape for f in anchors.features] == [(200, 16)] * 3
-    assert all(f.dtype == np.float32 and f.flags.c_contiguous for f in anchors.features)
-
-
 def test_spread_over_the_whole_view(reference, camera):
     """Every cell of a 4 x 4 split gets its share, within a third."""
     anchors = select_anchors(reference[0], reference[1], count=480)
@@ -71,20 +55,6 @@ def test_a_steep_plane_is_no_depth_edge(camera, scene, reference):
     top = anchors.pixels[:, 1].min()
     horizon = np.flatnonzero(depth[:, 0] > 0)[0]
     assert top < horizon + 8
-
-
-def test_deterministic_by_seed(reference):
-    view, pyramid = reference
-    a, b, c = (select_anchors(view, pyramid, count=100, seed=s) for s in (4, 4, 5))
-    np.testing.assert_array_equal(a.pixels, b.pixels)
-    assert not np.array_equal(a.pixels, c.pixels)
-
-
-def test_morton_order_keeps_neighbours_together(reference):
-    pixels = select_anchors(*reference).pixels
-    steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
-    shuffled = np.random.default_rng(0).permutation(pixels)
-    assert steps.mean() < 0.3 * np.linalg.norm(np.diff(shuffled, axis=0), axis=1).mean()
 
 
 def test_view_of_nothing_gives_no_anchors(reference):

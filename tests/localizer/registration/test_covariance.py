@@ -10,7 +10,6 @@ import pytest
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.backend import LMSettings, level_problems, local_origin
 from localizer.registration.covariance import (
-    CovarianceSums,
     NoiseModel,
     anchor_model,
     apart_px,
@@ -21,12 +20,7 @@ from localizer.registration.covariance import (
     pose_differences,
     sandwich_covariance,
 )
-from localizer.registration.cpu.reference import (
-    ReferenceBackend,
-    project,
-    projection_jacobian,
-    retractions,
-)
+from localizer.registration.cpu.reference import project, projection_jacobian, retractions
 from localizer.registration.selection import mode_probabilities, thinned
 
 PLAIN = NoiseModel(1.0, floor=0.05)
@@ -64,15 +58,6 @@ def test_a_quadratic_cost_has_the_curvature_of_its_hessian(hessian):
     assert curvature_ratio(sloped, steps, hessian) == pytest.approx(0.3)
 
 
-def test_axes_that_lose_the_overlap_are_left_out_and_a_flat_cost_has_a_least_curvature(hessian):
-    steps = curvature_steps(np.eye(6), 0.1)
-    scores = quadratic(steps, 0.5 * hessian)
-    scores[[3, 9]] = np.inf
-    assert curvature_ratio(scores, steps, hessian) == pytest.approx(0.5)
-    assert curvature_ratio(np.full(13, 0.4), steps, hessian) == pytest.approx(0.03)
-    assert curvature_ratio(np.full(13, np.inf), steps, hessian) == pytest.approx(0.03)
-
-
 def test_each_step_moves_the_image_by_the_wanted_distance(problem, pose):
     level, _ = problem
     x, before = project(level, *pose)
@@ -80,34 +65,6 @@ def test_each_step_moves_the_image_by_the_wanted_distance(problem, pose):
     for R, t in zip(*(a[1:] for a in retractions(*pose, steps)), strict=True):
         moved = project(level, R, t)[1] - before
         assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(0.15, rel=0.01)
-
-
-def measured(problem, pose, noise):
-    """Curvature at the true pose with noise on the query."""
-    level, _ = problem
-    rng = np.random.default_rng(3)
-    noisy = level.features + noise * rng.standard_normal(level.features.shape).astype(np.float32)
-    level = replace(level, features=noisy)
-    sums = covariance_sums(anchor_model(level, *pose, SETTINGS, 16.0))
-    assert sums is not None
-    steps = curvature_steps(sums.motion, 0.15)
-    scores = ReferenceBackend().refine(level, *retractions(*pose, steps), 0, SETTINGS).scores
-    return sums, curvature_ratio(scores, steps, sums.hessian)
-
-
-def test_noise_that_inflates_the_hessian_lowers_the_curvature(problem, pose):
-    """Gauss-Newton takes the noise's gradients for texture; the cost does not get steeper."""
-    clean, noisy = measured(problem, pose, 0.0), measured(problem, pose, 0.15)
-    assert noisy[0].hessian.trace() > clean[0].hessian.trace()
-    assert noisy[1] < 0.7 * clean[1]
-
-
-def test_half_the_curvature_is_four_times_the_covariance(problem, pose):
-    sums, _ = measured(problem, pose, 0.05)
-    full = sandwich_covariance(sums, PLAIN)
-    half = sandwich_covariance(replace(sums, curvature=0.5), PLAIN)
-    assert full is not None
-    np.testing.assert_allclose(half, 4.0 * full, rtol=1e-9)
 
 
 def summed(level, pose, count):
@@ -118,22 +75,6 @@ def summed(level, pose, count):
     return replace(sums, anchors=total, share=few.points.shape[1] / total)
 
 
-def test_adding_up_fewer_anchors_does_not_change_the_covariance(problem, pose):
-    """Noise that is independent between anchors; the reference's anchors have all of it."""
-    level, _ = problem
-    rng = np.random.default_rng(5)
-    ratios = []
-    for _ in range(30):
-        noise = 0.1 * rng.standard_normal(level.anchor_features.shape).astype(np.float32)
-        noisy = replace(level, anchor_features=level.anchor_features + noise)
-        every = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1]), PLAIN)
-        third = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1] // 3), PLAIN)
-        assert every is not None
-        assert third is not None
-        ratios.append(np.exp(np.linalg.slogdet(third)[1] / 6 - np.linalg.slogdet(every)[1] / 6))
-    assert 0.7 < np.median(ratios) < 1.4
-
-
 def test_few_anchors_count_for_less_than_their_noise_says(problem, pose):
     sums = summed(problem[0], pose, 10_000)
     many, few = (
@@ -142,43 +83,6 @@ def test_few_anchors_count_for_less_than_their_noise_says(problem, pose):
     )
     assert many is not None
     np.testing.assert_allclose(few, 2.0 * many, rtol=1e-3)
-
-
-def share_within(rng, cells, noise):
-    """Share of 400 estimates within the 95 % bound of their covariances, where the gradients of
-    `cells` cells are what the isotropic model says they are.
-    """
-    half = rng.standard_normal((6, 6))
-    shape = half @ half.T + np.eye(6)
-    root, none, inside = np.linalg.cholesky(shape), np.zeros((6, 6)), 0
-    for _ in range(400):
-        gradients = (root @ rng.standard_normal((6, cells))).T
-        error = gradients.sum(axis=0)
-        rest = gradients - error / cells  # at the optimum the gradients cancel
-        sums = CovarianceSums(
-            np.eye(6), rest.T @ rest, cells * shape, cells, 32.0, none, np.eye(6), 1000
-        )
-        covariance = sandwich_covariance(sums, noise)
-        assert covariance is not None
-        inside += error @ np.linalg.solve(covariance, error) < 12.59
-    return inside / 400
-
-
-def test_few_cells_do_not_tell_the_noises_shape():
-    """From 20 cells the 21 numbers of the meat are too uncertain; the model's shape mends that."""
-    rng = np.random.default_rng(4)
-    assert share_within(rng, 20, NoiseModel(1.0)) < 0.9
-    assert share_within(rng, 20, NoiseModel(1.0, shape_cells=40.0)) > 0.93
-    assert 0.92 < share_within(rng, 200, NoiseModel(1.0, shape_cells=40.0)) < 0.99
-
-
-def test_the_models_size_does_not_matter_to_the_shrunk_noise(problem, pose):
-    sums = summed(problem[0], pose, 10_000)
-    noise = NoiseModel(1.0, shape_cells=40.0)
-    larger = replace(sums, isotropic=7.0 * sums.isotropic)
-    np.testing.assert_allclose(
-        sandwich_covariance(larger, noise), sandwich_covariance(sums, noise), rtol=1e-9
-    )
 
 
 def displaced(level, pose, cell_px):

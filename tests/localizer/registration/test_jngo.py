@@ -13,9 +13,7 @@ from localizer.registration import (
     JNGO,
     JNGOConfig,
     attitude_constraint,
-    combine,
     height_constraint,
-    position_constraint,
     select_anchors,
 )
 from localizer.types import FeatureLevel, RegistrationStatus
@@ -118,17 +116,6 @@ def test_more_anchors_sharpen_the_winner(jngo, place, camera, scene_factory, pri
             result = jngo.register(query, camera, anchors, prior(scene.reference, 1.0, 1.0))
             found.append(result.world_from_camera.distance_to(scene.true)[0])
     assert np.median(errors_by_count[1500]) < 0.6 * np.median(errors_by_count[150])
-
-
-def test_backends_agree_on_the_whole_schedule(scene, prior):
-    config = JNGOConfig(hypotheses=16, keep=(6, 3))
-    about = prior(scene.reference, 1.0, 1.5)
-    a = JNGO(config, "reference").register(scene.query, scene.camera, scene.anchors, about)
-    b = JNGO(config, "numba").register(scene.query, scene.camera, scene.anchors, about)
-    distance, angle = a.world_from_camera.distance_to(b.world_from_camera)
-    assert distance < 1e-3
-    assert angle < 1e-3
-    np.testing.assert_allclose(a.covariance, b.covariance, rtol=0.02, atol=1e-9)
 
 
 def test_same_seed_same_bits(jngo, scene, prior):
@@ -301,29 +288,6 @@ def test_an_attitude_constraint_pulls_the_attitude(jngo, scene, prior):
     held = jngo.register(*arguments, constraint=attitude_constraint(turned, 1e-5, 1e-5))
     angle = so3_log(held.world_from_camera.rotation @ turned.T)
     assert np.linalg.norm(angle) < 1e-3
-
-
-def test_combined_constraints_are_their_information_mean():
-    a = position_constraint(np.array([0.0, 0.0, 100.0]), np.diag([4.0, 4.0, 4.0]))
-    b = height_constraint(104.0, 2.0)
-    c = attitude_constraint(so3_exp([0.0, 0.0, 0.3]), 0.01, 0.1)
-    both = combine(a, b, c)
-    np.testing.assert_allclose(both.world_from_camera.translation, [0.0, 0.0, 102.0], atol=1e-9)
-    np.testing.assert_allclose(both.world_from_camera.rotation, c.world_from_camera.rotation)
-    assert both.information[2, 2] == pytest.approx(0.5)
-    only_height = combine(b)
-    np.testing.assert_allclose(only_height.world_from_camera.translation, [0.0, 0.0, 104.0])
-
-
-def test_unknown_backend_is_named():
-    with pytest.raises(ValueError, match="cuda-magic"):
-        JNGO(backend="cuda-magic")
-
-
-def test_level_count_mismatch_is_named(jngo, scene, prior):
-    short = replace(scene.query, levels=scene.query.levels[:2])
-    with pytest.raises(ValueError, match="3 feature levels"):
-        jngo.register(short, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0))
 
 
 def test_the_detail_level_sharpens_the_winner(jngo, place, camera, scene_factory, prior):

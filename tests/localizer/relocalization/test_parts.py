@@ -16,10 +16,10 @@ from localizer.relocalization.align import FrameShift, moved
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
-from localizer.relocalization.patch import footprint, rectify, turned
-from localizer.relocalization.search import ground_of, headings, scales, shared_extractions
+from localizer.relocalization.patch import rectify, turned
+from localizer.relocalization.search import ground_of, scales
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
-from localizer.relocalization.verify import Verifier, tilt_and_heading
+from localizer.relocalization.verify import Verifier
 from localizer.render.topview import DOWN
 from localizer.tracking.sensor_fusion import FusedRegistration
 from localizer.types import FeatureLevel, Frame, RegistrationStatus
@@ -171,23 +171,6 @@ def test_rectified_ground_lies_where_it_is():
     assert patch.seen[int(rows[0]), int(columns[0])]
 
 
-def test_the_footprint_holds_what_is_seen():
-    found = footprint(CAMERA, DOWN, 100.0, 500.0)
-    corner = CAMERA.rays(np.zeros(2)) * 100.0
-    np.testing.assert_allclose(found.centre, 0, atol=1e-9)
-    assert found.side_m == pytest.approx(2 * np.hypot(*corner[:2]), rel=1e-6)
-    assert footprint(CAMERA, DOWN, 100.0, 90.0).side_m == 90.0
-
-
-def test_headings_cover_what_is_not_known():
-    all_round = headings(query(), CONFIG)
-    step = np.radians(CONFIG.heading_step_deg)
-    np.testing.assert_allclose(np.diff(np.append(all_round, 2 * np.pi)), step)
-    few = headings(query(np.radians(7.5)), CONFIG)
-    assert np.abs(few).max() + step / 2 >= np.radians(15) - 1e-9
-    assert len(few) <= 6
-
-
 def test_heights_cover_the_ground_and_its_error():
     ground = np.array([[0.0, 20.0], [np.nan, -5.0]], np.float32)
     found = scales(query(), ground, CONFIG)
@@ -196,19 +179,6 @@ def test_heights_cover_the_ground_and_its_error():
     assert found[-1] >= 107 / reach
     assert (found[1:] / found[:-1] <= CONFIG.scale_step + 1e-9).all()
     assert len(scales(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
-
-
-def test_extractions_are_shared_within_a_ratio():
-    heights = np.array([50.0, 60.0, 70.0, 80.0, 200.0])
-    assert shared_extractions(heights, 1.35) == [[0, 1], [2, 3], [4]]
-
-
-def test_tilt_and_heading_of_a_turn():
-    reference = so3_exp((0.4, -0.2, 1.0))
-    turn = turned(np.eye(3), np.radians(130)) @ so3_exp((np.radians(2), 0, 0))
-    tilt, heading = tilt_and_heading(turn @ reference, reference)
-    assert np.degrees(tilt) == pytest.approx(2.0, abs=0.01)
-    assert np.degrees(heading) == pytest.approx(130.0, abs=0.05)
 
 
 def test_the_shift_of_an_image_is_found_and_moves_the_camera():

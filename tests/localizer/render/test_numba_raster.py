@@ -12,7 +12,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import cast_rays, pick
 from localizer.map.cache.tile import TileMesh, build_mips
-from localizer.render.base import NEAR_M, SKY, are_visible, bounding_spheres
+from localizer.render.base import NEAR_M
 from localizer.render.numba_raster import NumbaRenderer
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -157,14 +157,6 @@ def test_triangles_across_the_near_plane_are_cut(renderer):
     assert (depth[:32] == 0).all()
 
 
-def test_nothing_nearer_than_the_near_plane(renderer):
-    camera = Camera(32, 32, 16.0, 16.0, 16.0, 16.0)
-    view = Pose(DOWN, np.array([0.0, 0.0, NEAR_M * 0.9]))
-    drawn = renderer.draw([quad(50.0)], view, camera)
-    assert (drawn.depth == 0).all()
-    assert (drawn.rgb == SKY).all()
-
-
 def test_neighbouring_triangles_leave_no_cracks(renderer):
     rng = np.random.default_rng(5)
     n = 150
@@ -249,14 +241,6 @@ def test_extra_meshes_are_drawn_where_they_are(renderer):
     assert drawn.depth[int(pixel[1]), int(pixel[0])] == pytest.approx(29, rel=1e-5)
 
 
-def test_results_belong_to_the_caller(renderer):
-    camera = Camera.from_fov(64, 64, 60)
-    first = renderer.draw([quad(100.0)], Pose(DOWN, np.array([0, 0, 50.0])), camera)
-    kept = first.depth.copy()
-    renderer.draw([quad(100.0)], Pose(DOWN, np.array([0, 0, 80.0])), camera)
-    assert np.array_equal(first.depth, kept)
-
-
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
 @pytest.mark.parametrize("value", [1e12, 1e38, 1e39, 1e308, np.inf, np.nan])
 def test_a_pose_beyond_all_measure_shows_nothing_and_harms_nothing(renderer, value):
@@ -275,12 +259,3 @@ def test_distorted_cameras_are_refused(renderer):
     camera = Camera(64, 64, 60.0, 60.0, 32.0, 32.0, (0.1, 0, 0, 0, 0))
     with pytest.raises(CameraError, match="pinhole"):
         renderer.render(Pose.identity(), camera)
-
-
-def test_visibility_of_a_bounding_sphere():
-    camera = Camera.from_fov(64, 64, 60)
-    view = Pose(DOWN, np.array([0.0, 0.0, 50.0]))
-    places = np.array([[0, 0, 0], [30.0, 0, 0], [40.0, 0, 0], [0, 0, 60.0]])
-    meshes = [quad(4.0, pose=Pose(np.eye(3), place)) for place in places]
-    seen = are_visible(*bounding_spheres(meshes), view, camera)
-    assert seen.tolist() == [True, True, False, False]

@@ -52,27 +52,6 @@ def test_a_survey_moves_its_surface_smoothly_and_by_what_is_said() -> None:
     assert SurveyErrors().displaced(points) is points
 
 
-def test_a_survey_has_the_holes_that_are_said_and_few() -> None:
-    step = np.arange(-200, 200, 2.0)
-    x, y = np.meshgrid(step, step)
-    corners = np.stack([x, y, 0 * x], -1).reshape(-1, 1, 3) + np.array(
-        [[0, 0, 0], [2, 0, 0], [0, 2, 0]]
-    )
-    positions, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
-    kept = SurveyErrors(holes_per_km2=60.0, seed=1).without_holes(positions, faces, 400.0)
-    holes_m2 = np.logical_not(kept).sum() * 4.0
-    assert 4 * np.pi < holes_m2 < 20 * 40.0
-    assert SurveyErrors(seed=1).without_holes(positions, faces, 400.0).all()
-
-
-def test_walls_blur_more_than_roofs_and_texels_are_coarse() -> None:
-    chart = (np.random.default_rng(2).random((120, 160, 3)) * 255).astype(np.uint8)
-    survey = SurveyErrors(wall_blur_m=0.5, texel_m=0.25)
-    roof, wall = (survey.photographed(chart, 0.125, up) for up in (0.8, 0.0))
-    assert roof.shape == wall.shape == chart.shape
-    assert wall.std() < 0.5 * roof.std() < 0.5 * chart.std()
-
-
 def test_every_place_is_surveyed_and_lived_in_its_own_way() -> None:
     pairs = [surveyed_and_lived(WorldConfig(seed, 400.0)) for seed in range(6)]
     assert len({survey.survey for survey, _ in pairs}) == 6

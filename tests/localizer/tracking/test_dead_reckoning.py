@@ -45,9 +45,7 @@ def error_m(estimate: PoseEstimate, truth: Pose) -> float:
 
 
 @pytest.mark.parametrize("longest_m", [15.0, 0.01])
-def test_the_maps_edge_is_bridged_and_the_map_found_again(
-    small_assets: FlightAssets, sequence: Sequence, longest_m: float
-) -> None:
+def test_the_maps_edge_is_bridged_and_the_map_found_again(small_assets, sequence, longest_m):
     """Where there is no map to be found again, also beyond the largest sigma."""
     config = LocalizerConfig(width=256, odometry=OdometryConfig(longest_sigma_m=longest_m))
     with open_localizer(small_assets.map_cache, sequence.frame(0).camera, config) as localizer:
@@ -78,7 +76,7 @@ class _HeardOdometry:
 
     told: ClassVar[list[float]] = []
 
-    def __init__(self, *_: Any) -> None:
+    def __init__(self, *_: Any, **__: Any) -> None:
         self.ready = True
 
     def begin(self, *_: Any, constraint: PoseConstraint, **__: Any) -> None:
@@ -92,9 +90,7 @@ class _HeardOdometry:
         pass
 
 
-def test_a_height_far_from_the_origin_is_told_in_the_worlds_axes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_height_far_from_the_origin_is_told_in_the_worlds_axes(monkeypatch):
     """An aircraft that keeps its height 10 km from the map's origin was told to climb against the
     plane: 0.8 m in half a kilometre.
     """

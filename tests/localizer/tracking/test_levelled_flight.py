@@ -63,9 +63,7 @@ def _filmed(small_assets: FlightAssets, above_m: float, count: int) -> list[tupl
 
 
 def fly(
-    assets: FlightAssets,
-    filmed: list[tuple[Frame, Pose]],
-    pitch_off_deg: Callable[[int], float],
+    assets: FlightAssets, filmed: list[tuple[Frame, Pose]], pitch_off_deg: Callable[[int], float]
 ) -> tuple[list[float], AttitudeBias]:
     """Position errors (m) of the flight with a gimbal that is off by so much, and what was learned
     of it.

@@ -60,9 +60,7 @@ def config(tmp_path: Path) -> TrainConfig:
                                   "kept_steps": 4})  # fmt: skip
 
 
-def test_a_run_with_sizes_and_hard_pairs_resumes_exactly(
-    config: TrainConfig, tmp_path: Path
-) -> None:
+def test_a_run_with_sizes_and_hard_pairs_resumes_exactly(config, tmp_path):
     whole = Trainer(config.model_copy(update={"output": tmp_path / "whole"}))
     whole.run()
     parts = config.model_copy(update={"output": tmp_path / "parts"})
@@ -94,16 +92,6 @@ def test_hard_pairs_are_the_worst_but_for_the_very_worst() -> None:
     again = HardPairs(HardShare(share=0.5, ranks=(0.1, 0.3), every_steps=4))
     again.restore(hard.state())
     assert again.state() == hard.state()
-
-
-def test_what_was_learned_is_no_longer_hard() -> None:
-    hard = HardPairs(HardShare(share=0.99, ranks=(0.0, 0.5), every_steps=1))
-    keys = [("a.npz", 0), ("a.npz", 1)]
-    hard.note(0, keys, [2.0, 1.0])
-    for step in range(1, 4):
-        hard.note(step, keys, [0.1, 1.0])
-    rng = np.random.default_rng(0)
-    assert {hard.draw(5, rng) for _ in range(50)} - {None} == {("a.npz", 1)}
 
 
 def test_a_size_is_drawn_once_it_has_begun() -> None:
@@ -140,9 +128,7 @@ def test_a_narrower_pair_keeps_its_geometry(width: int) -> None:
         ("first_step: 0", "first_step: 1", "none begins"),
     ],
 )
-def test_a_curriculum_that_cannot_be_is_named(
-    tmp_path: Path, line: str, wrong: str, said: str
-) -> None:
+def test_a_curriculum_that_cannot_be_is_named(tmp_path, line, wrong, said):
     path = tmp_path / "run.yaml"
     path.write_text(SHIPPED.read_text().replace(line, wrong))
     with pytest.raises(ModelError, match=said):

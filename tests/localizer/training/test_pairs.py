@@ -1,6 +1,5 @@
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -8,16 +7,7 @@ import pytest
 
 from localizer.errors import SequenceError
 from localizer.geometry.pose import Pose
-from localizer.training.data.contact_sheet import contact_sheet
-from localizer.training.data.pairs import (
-    COMBINED,
-    OUTDATED,
-    SEASON,
-    Pair,
-    SceneConfig,
-    scene_pairs,
-    warp_check,
-)
+from localizer.training.data.pairs import Pair, SceneConfig, scene_pairs, warp_check
 from localizer.training.data.shards import read_shard, write_shard, write_shards
 from localizer.training.places.photos import PhotoLibrary
 
@@ -70,44 +60,12 @@ def test_the_coarse_map_is_where_the_true_surface_is() -> None:
     assert 0.0 < np.median(error) < 1.5
 
 
-def test_test_conditions_come_one_at_a_time() -> None:
-    conditions = ("night", SEASON, OUTDATED, COMBINED)
-    config = replace(SMALL, references=4, queries_per_light=1, conditions=conditions)
-    kinds = {(p.condition, p.season, p.outdated) for p in scene_pairs(1007, config, None)}
-    plain = {("night", False, False), ("day", True, False), ("day", False, True)}
-    assert len(kinds) >= 3
-    assert all(k in plain or k[1:] == (True, True) for k in kinds)
-
-
-def test_exact_motion_is_kept() -> None:
-    config = replace(SMALL, motion=(5.0, 5.0))
-    for pair in scene_pairs(1005, config, None):
-        metres, degrees = pair.world_from_reference.distance_to(pair.world_from_query)
-        assert metres == pytest.approx(5.0)
-        assert degrees == pytest.approx(5.0)
-
-
-def test_a_seed_gives_the_same_pairs(pairs: list[Pair]) -> None:
-    again = next(iter(scene_pairs(1000, SMALL, None)))
-    np.testing.assert_array_equal(again.query, pairs[0].query)
-    np.testing.assert_array_equal(again.reference_depth, pairs[0].reference_depth)
-
-
 def test_shards_keep_what_was_generated(pairs: list[Pair], tmp_path: Path) -> None:
     stored = read_shard(write_shard(tmp_path, 1000, SMALL, None))[0]
     np.testing.assert_array_equal(stored.reference, pairs[0].reference)
     np.testing.assert_allclose(stored.reference_depth, pairs[0].reference_depth, rtol=1e-3)
     assert stored.camera == pairs[0].camera
     assert stored.world_from_query.distance_to(pairs[0].world_from_query) == (0.0, 0.0)
-
-
-def test_the_contact_sheet_shows_every_pair(pairs: list[Pair], tmp_path: Path) -> None:
-    image: Any = cv2.imread(str(contact_sheet(pairs[:2], tmp_path / "sheet.png")))
-    assert image.shape == (2 * SMALL.height, 5 * SMALL.width, 3)
-    checker = image[: SMALL.height, 3 * SMALL.width : 4 * SMALL.width]
-    reference = image[: SMALL.height, : SMALL.width]
-    changed = (checker != reference).any(-1).mean()
-    assert 0.05 < changed < 0.6
 
 
 def test_shards_on_disk_are_not_made_again(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from localizer.training.config import load_config
 from localizer.training.data.pairs import SceneConfig, draw_visit, scene_pairs, visit_of
 from localizer.training.data.streams import scene_config
 from localizer.training.places.land import generated_place
-from localizer.training.places.styles import LAMPS, STYLES, styled_ground, styled_light
+from localizer.training.places.styles import LAMPS, STYLES, styled_ground
 
 CONFIG = SceneConfig(
     cells=128, width=64, height=48, photo_share=0.0, cell_m=(0.5, 0.8), queries_per_light=1
@@ -51,28 +51,6 @@ def test_the_ground_is_changed_where_it_should_be() -> None:
         assert (off > 0.02).mean() > 0.01
     leafy = [(c[..., 1] - c[..., [0, 2]].max(-1)).mean() for c in (before, changed["leaf off"])]
     assert leafy[1] < leafy[0]
-
-
-def test_the_light_is_of_its_style() -> None:
-    place = generated_place(np.random.default_rng(5), 256, 0.5)
-    sun = styled_light
-    rng = np.random.default_rng(2)
-    light = sun(_noon(), place, "low sun", rng).light
-    assert np.degrees(np.arcsin(light.sun[2])) < 12.5
-    through = sun(_noon(), place, "cloud shadows", rng).sunlit
-    assert through is not None
-    assert through.min() < 0.3
-    assert through.max() > 0.9
-    dark = sun(_noon(), place, LAMPS, rng)
-    assert dark.light.direct == 0.0
-    assert dark.glow is not None
-    assert dark.glow.max() > 3 * dark.light.ambient
-
-
-def _noon():  # type: ignore[no-untyped-def]
-    from localizer.synth.heightfield.scene import SkyLight
-
-    return SkyLight((0.0, 0.6, 0.8), 0.8, 0.5)
 
 
 def test_styles_are_drawn_where_they_are_asked_for() -> None:

@@ -17,7 +17,7 @@ from mavlink_bridge.alerts.alert import (
 from mavlink_bridge.alerts.catalogue import CATALOGUE, TEXT_LENGTH, alert, cleared, severity, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
-from mavlink_bridge.alerts.words import CalibrationError, ChosenSet, Name, RcChannel, Word
+from mavlink_bridge.alerts.words import ChosenSet, Name, RcChannel, Word
 
 NUMBERS = {
     "used": 200, "system": 200, "device": 200, "number": 12, "level": 88.0, "seconds": 30.0,
@@ -84,16 +84,6 @@ def test_values_are_named_by_the_catalogue() -> None:
         alert(AlertId.VIDEO_FROZEN, metres=3.0)
     with pytest.raises(ValueError, match="the text uses"):
         AlertSpec(AlertId.VIDEO_FROZEN, Severity.ERROR, "frozen", "frozen {seconds}", {"m": "m"})
-
-
-def test_alerts_that_differ_in_numbers_only_have_one_key() -> None:
-    four, nine = (alert(AlertId.VIDEO_FROZEN, seconds=s) for s in (4.0, 9.0))
-    assert four.key == nine.key
-    long, short = (
-        alert(AlertId.FOCAL_LENGTH, percent=3.0, direction=one)
-        for one in (CalibrationError.LONG, CalibrationError.SHORT)
-    )
-    assert long.key != short.key
 
 
 def test_other_texts_are_no_alert() -> None:

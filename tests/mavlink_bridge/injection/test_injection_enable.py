@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.alert import Alert
@@ -44,16 +41,6 @@ def test_a_pulse_at_the_threshold_does_not_flutter() -> None:
     assert not it.open
 
 
-@pytest.mark.parametrize("silent", [channels(0), channels(65535), channels(2300), (), (1900,) * 8])
-def test_a_receiver_that_says_nothing_changes_nothing(silent: tuple[int, ...]) -> None:
-    it, _ = enable()
-    it.channels(silent)
-    assert not it.open
-    it.channels(channels(1900))
-    it.channels(silent)
-    assert it.open
-
-
 def test_the_newest_word_counts() -> None:
     it, _ = enable()
     assert it.command(COMMAND, 1.0) == mavlink.MAV_RESULT_ACCEPTED
@@ -66,25 +53,3 @@ def test_the_newest_word_counts() -> None:
     it.channels(channels(1100))
     it.channels(channels(1900))
     assert it.open
-
-
-def test_a_switch_that_is_on_from_the_start_opens() -> None:
-    it, _ = enable()
-    it.channels(channels(1900))
-    assert it.open
-
-
-@pytest.mark.parametrize("wanted", [math.nan, math.inf, 2.0, -1.0, 0.5])
-def test_only_0_and_1_are_commands(wanted: float) -> None:
-    it, told = enable()
-    assert it.command(COMMAND, wanted) == mavlink.MAV_RESULT_DENIED
-    assert told == []
-
-
-def test_other_commands_and_a_gate_without_command_are_unsupported() -> None:
-    it, _ = enable(command="user_3")
-    assert it.command(COMMAND, 1.0) == mavlink.MAV_RESULT_UNSUPPORTED
-    assert it.command(mavlink.MAV_CMD_USER_3, 1.0) == mavlink.MAV_RESULT_ACCEPTED
-    never, _ = enable(command=None)
-    assert never.command(COMMAND, 1.0) == mavlink.MAV_RESULT_UNSUPPORTED
-    assert not never.open

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,9 +47,7 @@ def on_gnss(monkeypatch: pytest.MonkeyPatch, **options: Any) -> Flight:
     return flight
 
 
-def test_a_map_20_m_off_is_neither_injected_nor_switched_to(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_map_20_m_off_is_neither_injected_nor_switched_to(monkeypatch):
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.north_m = 20.0
     flight.run(45.0)
@@ -69,9 +66,7 @@ def test_a_map_20_m_off_is_neither_injected_nor_switched_to(
     assert lost == [alert(AlertId.GNSS_LOST, output=Output.NOTHING)]
 
 
-def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(monkeypatch, tmp_path):
     """The process that had seen it was killed, the next one had nothing to compare with: after two
     seconds it injected.
     """
@@ -99,9 +94,7 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
     assert not file.exists()
 
 
-def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(monkeypatch, tmp_path):
     enable, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
     killed = on_gnss(monkeypatch, state_file=enable)
     killed.end.set_map_id("map a")
@@ -121,9 +114,7 @@ def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(
 
 
 @pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, [True])])
-def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
-    begins: bool, kept: list[bool]
-) -> None:
+def test_only_who_never_began_is_kept_from_beginning_by_a_restart(begins, kept):
     """A receiver that is led astray while vision is flown on speaks against it, too: without the
     restart it is flown on.
     """
@@ -150,9 +141,7 @@ def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
     assert told == kept
 
 
-def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(monkeypatch):
     flight = on_gnss(monkeypatch, switch=SWITCH)
     begun_ns = flight.now_ns
     flight.run(20.0)
@@ -169,9 +158,7 @@ def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
     assert told(flight, AlertId.GNSS_BACK) == [AlertId.GNSS_BACK]
 
 
-def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(monkeypatch):
     """The EKF would be left to positions that never reach it, and land."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.run(20.0)
@@ -213,9 +200,7 @@ def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.Mon
     assert told(flight, *SOURCES, AlertId.SOURCE_SET_HELD) == [AlertId.SOURCE_SET_SELECTED]
 
 
-def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_gnss_it_begins_and_says_that_nothing_was_compared(monkeypatch):
     flight = on_gnss(monkeypatch)
     flight.gnss_north_m = None
     begun_ns = flight.now_ns
@@ -224,9 +209,7 @@ def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
     assert told(flight, *SHADOW) == [AlertId.INJECTION_UNCHECKED]
 
 
-def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(monkeypatch):
     """Injection would begin unproven, and would not be taken back."""
     flight = on_gnss(monkeypatch)
     for _ in range(3):  # too short for a score, and a gap of 1.8 s: lost for 0.3 s
@@ -240,9 +223,7 @@ def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(
     assert told(flight, *SHADOW) == []
 
 
-def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(monkeypatch):
     """It says nothing against the map: a vehicle without GNSS would have landed for it."""
     flight = on_gnss(monkeypatch)
     for _ in range(80):
@@ -269,9 +250,7 @@ def accept(flight: Flight, *, echo: bool) -> None:
     flight.say(mavlink.MAVLink_command_ack_message(42007, 0))
 
 
-def test_an_ekf_that_flies_on_vision_since_before_the_start_is_no_word_for_vision(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_ekf_that_flies_on_vision_since_before_the_start_is_no_word_for_vision(monkeypatch):
     """A companion that begins anew in the air: a wrong map was compared with itself, and a go."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.armed = True
@@ -283,9 +262,7 @@ def test_an_ekf_that_flies_on_vision_since_before_the_start_is_no_word_for_visio
     assert told(flight, OFF.id) == [OFF.id]
 
 
-def test_a_start_in_the_air_on_gnss_is_compared_with_the_receiver_and_switches(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_start_in_the_air_on_gnss_is_compared_with_the_receiver_and_switches(monkeypatch):
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.armed = True
     flight.run(20.0)
@@ -299,9 +276,7 @@ def test_a_start_in_the_air_on_gnss_is_compared_with_the_receiver_and_switches(
     assert flight.end.sources.current == 2
 
 
-def test_a_start_in_the_air_on_vision_goes_back_to_gnss_where_vision_ends(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_start_in_the_air_on_vision_goes_back_to_gnss_where_vision_ends(monkeypatch):
     """The EKF had no position at all then, and the vehicle landed."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.armed, flight.sees = True, False
@@ -322,9 +297,7 @@ def test_shadow_mode_orders_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("echo", [True, False])
-def test_what_the_pilot_chooses_is_followed_and_not_undone(
-    monkeypatch: pytest.MonkeyPatch, echo: bool
-) -> None:
+def test_what_the_pilot_chooses_is_followed_and_not_undone(monkeypatch, echo):
     switch = SourceSwitchConfig(enabled=True, return_to_gnss=True)
     flight = on_gnss(monkeypatch, switch=switch)
     flight.run(20.0)
@@ -399,9 +372,7 @@ def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(flight, *SHADOW) == [AlertId.INJECTION_FORCED]
 
 
-def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(monkeypatch):
     """A calibration that was found wrong: no injection, no switch, until it is over."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.end.inhibit(AlertId.FOCAL_LENGTH)
@@ -434,9 +405,7 @@ def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.Mon
     assert told(flight, *SHADOW) == [AlertId.INJECTION_NOT_READY]
 
 
-def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_gps_input_told_the_receiver_is_no_word_for_vision(monkeypatch):
     """The pilot had injected a map 20 m off: receiver and EKF repeated it, which was a go, and his
     next injection and a switch to vision began without a word.
     """
@@ -459,9 +428,7 @@ def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
     assert told(flight, *SHADOW) == 2 * [AlertId.INJECTION_NOT_READY]
 
 
-def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(monkeypatch):
     injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input", gps_id=1)
     flight = on_gnss(monkeypatch, mode="shadow", injection=injection)
     flight.run(20.0)
@@ -504,13 +471,8 @@ def test_a_go_is_forgotten_after_ten_minutes_without_gnss() -> None:
     assert not compared.may_switch(701, go=False, gnss=False)
 
 
-@pytest.mark.parametrize(
-    ("gnss", "text"),
-    [(None, ["injecting"]), (0.0, [])],
-)
-def test_arming_without_gnss_tells_whether_positions_flow(
-    monkeypatch: pytest.MonkeyPatch, gnss: float | None, text: list[str]
-) -> None:
+@pytest.mark.parametrize(("gnss", "text"), [(None, ["injecting"]), (0.0, [])])
+def test_arming_without_gnss_tells_whether_positions_flow(monkeypatch, gnss, text):
     flight = on_gnss(monkeypatch)
     flight.gnss_north_m = gnss
     flight.run(10.0)
@@ -547,9 +509,7 @@ def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
-def test_an_overloaded_computer_does_not_fill_the_operators_screen(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_overloaded_computer_does_not_fill_the_operators_screen(monkeypatch):
     """A second and a half of fixes, as long without, for three minutes: 42 texts before."""
     flight = Flight(monkeypatch)
     flight.run(20.0)

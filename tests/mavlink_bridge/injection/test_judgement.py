@@ -260,11 +260,6 @@ def test_no_switch_to_vision_that_is_not_good() -> None:
     assert drive(SourceSwitch(CONFIG), 5.0, gps=False, good=False) == []
 
 
-def test_order_is_repeated_until_acknowledged() -> None:
-    orders = drive(SourceSwitch(CONFIG), 6.0, gps=False, acknowledge=False)
-    assert 4 <= len(orders) <= 6
-
-
 def test_back_to_gnss_only_if_configured_and_once_it_was_compared() -> None:
     never = SourceSwitch(CONFIG)
     drive(never, 5.0, gps=False)
@@ -287,18 +282,6 @@ def test_no_return_to_a_far_receiver_of_which_nobody_says_that_it_is_bad() -> No
     assert drive(back, 60.0, 5.0, seen=False, ekf=60.0) == []
     orders = drive(back, 12.0, 65.0)
     assert [order.source_set for _, order in orders] == [1]
-
-
-def test_healthy_gnss_is_not_left_for_a_wrong_map() -> None:
-    """The EKF's inertial navigation is with the receiver: two against one."""
-    switch = SourceSwitch(CONFIG)
-    assert drive(switch, 20.0, north=20.0, ekf=0.5) == []
-    assert switch.refusal == alert(
-        AlertId.SOURCE_SET_HELD, cause="GNSS off vision", why="EKF with GNSS",
-        metres=pytest.approx(20.0, abs=0.5),
-    )  # fmt: skip
-    assert drive(switch, 5.0, 20.0) == []
-    assert switch.refusal is None
 
 
 @pytest.mark.parametrize("how", [{"gps": False}, {"flags": 32768}, {"north": 12.0}])

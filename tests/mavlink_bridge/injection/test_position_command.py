@@ -125,9 +125,7 @@ def test_a_vehicle_that_does_not_answer_is_asked_once_a_second_and_only_on_gnss(
     assert vehicle.told(AlertId.COMMAND_NOT_TAKEN) == [silent]
 
 
-def test_a_vehicle_that_stops_accepting_is_asked_until_it_accepts_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_vehicle_that_stops_accepting_is_asked_until_it_accepts_again(monkeypatch):
     vehicle = Vehicle(monkeypatch, ACCEPTED)
     vehicle.run(PASSED_S)
     vehicle.result = FAILED

@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -35,14 +34,16 @@ from pathlib import Path
 from mavlink_bridge.config import InjectionEnableConfig
 from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
 from mavlink_bridge.injection.injection_enable import InjectionEnable
-path = Path(sys.argv[1])
-memory = InjectionEnableMemory(RestartMemory(path))
-gate = InjectionEnable(InjectionEnableConfig(), lambda _: None, memory)
-if sys.argv[2] == "command":
-    gate.command(31010, 1.0)
-else:
-    gate.channels([1900] * 18)
-while not path.exists():
+files = [Path(name) for name in sys.argv[1:]]
+gates = [
+    InjectionEnable(
+        InjectionEnableConfig(), lambda _: None, InjectionEnableMemory(RestartMemory(file))
+    )
+    for file in files
+]
+gates[0].command(31010, 1.0)
+gates[1].channels([1900] * 18)
+while not all(file.exists() for file in files):
     time.sleep(0.01)
 print("open", flush=True)
 time.sleep(600)
@@ -50,25 +51,27 @@ time.sleep(600)
 LOW = [1100] * 18
 
 
-def killed(path: Path, by: str) -> None:
-    """A process whose gate was opened, after kill -9."""
+@pytest.fixture(scope="module")
+def left_open(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The files of a process with two gates, opened by command and by channel, after kill -9."""
+    folder = tmp_path_factory.mktemp("killed")
+    files = {by: folder / f"{by}.json" for by in ("command", "channel")}
     child = subprocess.Popen(
-        [sys.executable, "-c", _CHILD, str(path), by], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", _CHILD, *map(str, files.values())], stdout=subprocess.PIPE, text=True
     )
     assert child.stdout is not None
     assert child.stdout.readline() == "open\n"
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
     child.stdout.close()
+    return files
 
 
 def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[Alert]]:
     told: list[Alert] = []
     kept = json.loads(path.read_text()) if path.exists() else {}
     memory = RestartMemory(
-        path,
-        lambda: kept.get("utc_s", 0.0) + later_s,
-        lambda: kept.get("clock_s", 0.0) + later_s,
+        path, lambda: kept.get("utc_s", 0.0) + later_s, lambda: kept.get("clock_s", 0.0) + later_s
     )
     enable = InjectionEnable(InjectionEnableConfig(), told.append, InjectionEnableMemory(memory))
     enable.recall()
@@ -77,9 +80,8 @@ def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[A
 
 
 @pytest.mark.parametrize("by", ["command", "channel"])
-def test_a_killed_process_leaves_the_gate_open(tmp_path: Path, by: str) -> None:
-    path = tmp_path / "gate.json"
-    killed(path, by)
+def test_a_killed_process_leaves_the_gate_open(left_open: dict[str, Path], by: str) -> None:
+    path = left_open[by]
     assert path.stat().st_mode & 0o777 == 0o600
     enable, told = restarted(path)
     assert enable.open
@@ -127,9 +129,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
 
 
 @pytest.mark.parametrize("later_s", [601.0, -5.0])
-def test_an_old_file_and_one_from_the_future_count_for_nothing(
-    tmp_path: Path, later_s: float
-) -> None:
+def test_an_old_file_and_one_from_the_future_count_for_nothing(tmp_path, later_s):
     path = tmp_path / "gate.json"
     path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
     path.chmod(0o600)
@@ -140,8 +140,7 @@ def test_an_old_file_and_one_from_the_future_count_for_nothing(
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "[]", "nonsense", '{"open": 1}', "{" * 5000, '{"utc_s": 1' + "0" * 400 + "}"],
+    "text", ["", "[]", "nonsense", '{"open": 1}', "{" * 5000, '{"utc_s": 1' + "0" * 400 + "}"]
 )
 def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -> None:
     path = tmp_path / "gate.json"
@@ -192,9 +191,7 @@ def test_a_no_go_of_nonsense_is_none(tmp_path: Path, against: object) -> None:
     memory.stop()
 
 
-def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(tmp_path, monkeypatch):
     """The write was finished after the order to end, and the next start injected unasked."""
     path, flush, ends = tmp_path / "gate.json", os.fsync, threading.Event()
 
@@ -223,9 +220,7 @@ def _bridge(path: Path, connection: str, told: list[Alert]) -> Bridge:
     return Bridge(config, 0.0, on_alert=told.append)
 
 
-def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(
-    tmp_path: Path, autopilot: Any
-) -> None:
+def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(tmp_path, autopilot):
     path, told = tmp_path / "gate.json", list[Alert]()
     _left_open(path)
     with _bridge(path, f"udpout:127.0.0.1:{autopilot.port}", told):

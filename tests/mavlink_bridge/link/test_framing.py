@@ -58,26 +58,6 @@ def test_garbage_between_frames_costs_no_frame(noise: bytes) -> None:
     assert [m.time_boot_ms for m in got] == list(range(1000, 1020))
 
 
-def test_truncated_and_corrupted_frames_cost_only_themselves() -> None:
-    rng = random.Random(1)
-    good = frames(300)
-    stream = b""
-    kept = []
-    for i, frame in enumerate(good):
-        kind = i % 3
-        if kind == 0:
-            stream += frame[: rng.randrange(1, len(frame))]
-        elif kind == 1:
-            position = rng.randrange(1, len(frame) - 2)
-            stream += frame[:position] + bytes([frame[position] ^ 0x55]) + frame[position + 1 :]
-        else:
-            stream += frame
-            kept.append(1000 + i)
-    reader = FrameReader()
-    got = [m.time_boot_ms for m in reader.feed(stream + b"\x00" * 300)]
-    assert got == kept
-
-
 def test_duplicated_and_lost_frames_are_counted() -> None:
     good = frames(10)
     reader = FrameReader()
@@ -107,14 +87,6 @@ def test_any_payload_of_any_message_is_decoded_or_counted() -> None:
     assert counters.messages > 0.9 * len(mavlink.mavlink_map)
 
 
-def test_memory_stays_bounded_on_endless_noise() -> None:
-    rng = random.Random(3)
-    reader = FrameReader()
-    for _ in range(200):
-        reader.feed(bytes(0xFD if rng.random() < 0.5 else rng.randrange(256) for _ in range(1000)))
-    assert reader.waiting < 1000
-
-
 def test_unwanted_messages_are_not_decoded() -> None:
     reader = FrameReader(wanted={0})
     assert reader.feed(b"".join(frames(5))) == []
@@ -134,14 +106,6 @@ def test_only_frames_signed_with_the_key_pass() -> None:
     assert reader.feed(b"".join(frames(3, bytes(32)))) == []
     assert len(reader.feed(b"".join(frames(4, KEY)))) == 4
     assert reader.counters.unsigned == 2
-    assert reader.counters.bad_signatures == 3
-
-
-def test_replay_is_refused() -> None:
-    reader = FrameReader(key=KEY)
-    recorded = frames(3, KEY)
-    assert len(reader.feed(b"".join(recorded))) == 3
-    assert reader.feed(b"".join(recorded)) == []
     assert reader.counters.bad_signatures == 3
 
 

@@ -20,14 +20,7 @@ from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkMessage
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import (
-    Bridge,
-    BridgeConfig,
-    CameraView,
-    TargetReport,
-    TrackRequest,
-    VisionFix,
-)
+from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest, VisionFix
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import values_of
 from mavlink_bridge.alerts.words import InjectionOrder

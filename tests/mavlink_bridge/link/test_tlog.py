@@ -55,9 +55,7 @@ def test_a_full_disk_is_told_once_and_costs_the_record_only(autopilot: Any) -> N
         assert bridge.counters()["fc_handler_errors"] == 0
 
 
-def test_a_start_on_a_failing_disk_goes_on_without_a_tlog(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_start_on_a_failing_disk_goes_on_without_a_tlog(tmp_path, monkeypatch):
     """As after a restart in the air; a wrong path is an error all the same."""
 
     def refuse(number: int) -> Callable[..., None]:
@@ -101,9 +99,7 @@ def test_greatest_size_and_bounded_queue(tmp_path: Path) -> None:
     idle.close()
 
 
-def test_a_disk_that_stalls_does_not_stall_the_sender(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_stalls_does_not_stall_the_sender(tmp_path, monkeypatch):
     writing, written, closed = threading.Event(), threading.Event(), threading.Event()
     waited_in_vain = []
 

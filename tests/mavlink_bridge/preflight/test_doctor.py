@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig
-from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge.config import InjectionConfig, OriginConfig, SourceSwitchConfig
 from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import VehicleState
@@ -61,9 +61,7 @@ GOOD = {
 
 def config(port: int = 14551, **injection: Any) -> BridgeConfig:
     return BridgeConfig(
-        connection=f"udpout:127.0.0.1:{port}",
-        injection=InjectionConfig(**injection),
-        origin=ORIGIN,
+        connection=f"udpout:127.0.0.1:{port}", injection=InjectionConfig(**injection), origin=ORIGIN
     )
 
 
@@ -128,10 +126,7 @@ def test_gps_input_with_old_names_and_another_receiver() -> None:
     settings = config(message="gps_input", gps_id=1)
     assert failures(settings, parameters) == {"GPS_TYPE2"}
     still = config(message="gps_input", gps_id=1, gps_velocity=False)
-    assert failures(still, {**parameters, "GPS_TYPE2": 14.0}) == {
-        "EK3_SRC1_VELXY",
-        "EK3_SRC1_VELZ",
-    }
+    assert failures(still, {**parameters, "GPS_TYPE2": 14.0}) == {"EK3_SRC1_VELXY", "EK3_SRC1_VELZ"}
 
 
 @pytest.mark.parametrize(("gps_id", "asked"), [(0, False), (1, True)])
@@ -155,9 +150,7 @@ def test_a_second_receiver_needs_room_in_the_ekfs_buffer(gps_id: int, asked: boo
         ({"ARMING_SKIPCHK": -1.0}, {}),
     ],
 )
-def test_a_vehicle_on_gnss_arms_without_vision(
-    parameters: dict[str, float], fixed: dict[str, float]
-) -> None:
+def test_a_vehicle_on_gnss_arms_without_vision(parameters, fixed):
     shadow = BridgeConfig(connection="udpout:127.0.0.1:1", mode="shadow")
     found = check_parameters(arming_rules(shadow, 2, parameters.get), parameters.get)
     assert {f.name: f.fix for f in found if not f.ok} == fixed
@@ -181,9 +174,7 @@ def test_odometry_wants_velocity_noise_that_is_true() -> None:
         ({"GPS1_TYPE": 0.0, "EK3_SRC_OPTIONS": 9.0}, {}),  # no receiver
     ],
 )
-def test_what_lets_the_autopilot_use_gnss_by_itself_is_found(
-    more: dict[str, float], fixes: dict[str, float]
-) -> None:
+def test_what_lets_the_autopilot_use_gnss_by_itself_is_found(more, fixes):
     parameters = {"GPS1_TYPE": 1.0, "EK3_SRC_OPTIONS": 0.0} | more
     found = check_parameters(gnss_rules(parameters.get), parameters.get)
     assert {f.name: f.fix for f in found if not f.ok} == fixes
@@ -262,9 +253,7 @@ def test_examination_and_repair(autopilot: Any, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     "message", ["vision_position_estimate", "odometry", "gps_input", "global_position_sensor"]
 )
-def test_parameters_that_are_no_numbers_are_wrong_and_can_be_written(
-    message: Any, value: float
-) -> None:
+def test_parameters_that_are_no_numbers_are_wrong_and_can_be_written(message, value):
     config = BridgeConfig(injection=InjectionConfig(message=message))
     for rules in (ardupilot_rules(config, find_source_set(config, lambda _: value)),
                   px4_rules(config, lambda _: value)):  # fmt: skip
@@ -300,9 +289,7 @@ def test_a_port_that_is_taken_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -
     assert "is the companion running" in finding.why
 
 
-def test_unknown_parameter_cannot_be_written(
-    autopilot: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_parameter_cannot_be_written(autopilot, monkeypatch):
     monkeypatch.setattr("mavlink_bridge.preflight.parameters._ANSWER_S", 0.2)
     autopilot.parameters = {"A": 1.0}
     with ParameterClient(config(autopilot.port)) as client:
@@ -334,9 +321,7 @@ def test_parameters_are_asked_of_one_vehicle_and_taken_from_its_autopilot(autopi
     assert {m.target_system for m in sets} == {1}
 
 
-def test_two_vehicles_on_the_link_are_a_required_failure(
-    autopilot: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_vehicles_on_the_link_are_a_required_failure(autopilot, monkeypatch):
     """No parameter may be read, judged or written while nobody said of which vehicle."""
     monkeypatch.setattr("mavlink_bridge.preflight.doctor._MEASURE_S", 0.6)
     autopilot.parameters = dict(GOOD)
@@ -369,9 +354,7 @@ def test_two_vehicles_on_the_link_are_a_required_failure(
         ("FENCE_ACTION", 1.0, {"FENCE_ACTION"}),
     ],
 )
-def test_what_happens_when_vision_ends_is_told_and_never_written(
-    name: str, value: float, told: set[str]
-) -> None:
+def test_what_happens_when_vision_ends_is_told_and_never_written(name, value, told):
     findings = check_failsafes(config(), {**GOOD, name: value}.get)
     assert {f.name for f in findings if not f.ok} == told
     assert not any(f.required or f.fix is not None for f in findings)
@@ -403,9 +386,7 @@ PX4_GOOD = {
         ("COM_POS_FS_EPH", 50.0, {"COM_POS_FS_EPH"}),
     ],
 )
-def test_what_px4_does_when_vision_ends_is_told_likewise(
-    name: str, value: float, told: set[str]
-) -> None:
+def test_what_px4_does_when_vision_ends_is_told_likewise(name, value, told):
     findings = check_failsafes(config(), {**PX4_GOOD, name: value}.get, px4=True)
     assert {f.name for f in findings} == {*PX4_GOOD, "when vision ends"} - {"COM_POSCTL_NAVL"}
     assert {f.name for f in findings if not f.ok} == told
@@ -414,9 +395,7 @@ def test_what_px4_does_when_vision_ends_is_told_likewise(
     assert {1.0: "LAND", 7.0: "7"}.get(value, "altitude mode") in ends.found
 
 
-def test_px4_is_asked_for_its_own_failsafes(
-    autopilot: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_px4_is_asked_for_its_own_failsafes(autopilot, monkeypatch):
     link = DoctorFinding("connection", "px4", "a heartbeat", "", True, True)
     known = ([link], VehicleState(autopilot="px4"))
     monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
@@ -428,6 +407,28 @@ def test_px4_is_asked_for_its_own_failsafes(
     found = {f.name: f.found for f in examine(settings).findings}
     assert found["when vision ends"].startswith("LAND")
     assert "FS_EKF_ACTION" not in found
+    assert "source switch" not in found
+
+
+def test_px4_has_no_source_sets_to_switch(autopilot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = DoctorFinding("connection", "px4", "a heartbeat", "", True, True)
+    known = ([link], VehicleState(autopilot="px4"))
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
+    autopilot.autopilot, autopilot.parameters = mavlink.MAV_AUTOPILOT_PX4, {"EKF2_EV_CTRL": 1.0}
+    switched = config(autopilot.port).model_copy(
+        update={"switch": SourceSwitchConfig(enabled=True)}
+    )
+    (finding,) = (f for f in examine(switched).findings if f.name == "source switch")
+    assert not finding.ok
+    assert finding.required
+
+
+@pytest.mark.parametrize("message", ["global_position_sensor", "external_position_estimate"])
+def test_what_is_fused_beside_gnss_is_not_switched_to(message: Any) -> None:
+    with pytest.raises(ValueError, match=f"{message}.*no source set: remove switch.enabled"):
+        BridgeConfig(
+            injection=InjectionConfig(message=message), switch=SourceSwitchConfig(enabled=True)
+        )
 
 
 def test_a_vehicle_without_these_parameters_gets_no_such_line(autopilot: Any) -> None:

@@ -100,9 +100,7 @@ def test_places_of_the_mission(with_mission: Callable[..., Any], lost: int) -> N
     ("how", "why"),
     [({"refused": mavlink.MAV_MISSION_DENIED}, "MAV_MISSION_RESULT 14"), ({"silent": True}, "sil")],
 )
-def test_refusal_and_silence_are_named(
-    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, how: Any, why: str
-) -> None:
+def test_refusal_and_silence_are_named(with_mission, monkeypatch, how, why):
     monkeypatch.setattr(
         "mavlink_bridge.preflight.mission._ANSWER_S", 0.2 if "silent" in how else 30.0
     )
@@ -124,27 +122,21 @@ def test_a_count_that_changes_meanwhile_is_not_ours(with_mission: Callable[..., 
     same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
 
 
-def test_a_place_that_is_not_on_earth_is_named(
-    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_that_is_not_on_earth_is_named(with_mission, monkeypatch):
     monkeypatch.setattr(f"{__name__}.ITEMS", [*ITEMS[:2], (16, RELATIVE, 1_740_000_000, 85455940)])
     vehicle = with_mission()
     with pytest.raises(MissionError, match=r"item 2 .* 174, 8\.54559 degrees"):
         download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
 
 
-def test_a_place_that_is_not_set_is_where_the_vehicle_is(
-    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_that_is_not_set_is_where_the_vehicle_is(with_mission, monkeypatch):
     unset = (21, RELATIVE, 0x7FFFFFFF, 0x7FFFFFFF)  # land here
     monkeypatch.setattr(f"{__name__}.ITEMS", [*ITEMS, unset])
     vehicle = with_mission()
     same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
 
 
-def test_a_mission_that_never_ends_is_given_up(
-    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mission_that_never_ends_is_given_up(with_mission, monkeypatch):
     monkeypatch.setattr("mavlink_bridge.preflight.mission._LONGEST_S", -1.0)
     vehicle = with_mission()
     with pytest.raises(MissionError, match="gave 0 of 6 items"):

@@ -9,9 +9,7 @@ import pytest
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
-from localizer.map.cache.tile import TileMesh
 from sitl.camera.detector import Detector, DetectorErrors, DetectorView, FixedPoint
-from sitl.camera.movers import Mover
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
 # 50 m up, looking down: x east, y south.
@@ -33,13 +31,6 @@ def _eye(listener, targets, errors=EXACT):
 
 def _view(depth=50.0, time_ns=7, pose_of_row=lambda _: POSE):
     return DetectorView(time_ns, np.full((240, 320), depth, np.float32), pose_of_row)
-
-
-def _car(speed=0.0):
-    triangle = TileMesh(np.zeros((3, 3), np.float32), np.zeros((3, 2), np.float32),
-                        np.array([[0, 1, 2]], np.int32), (np.zeros((2, 2, 3), np.uint8),),
-                        Pose.identity())  # fmt: skip
-    return Mover("car0", np.array([[5.0, 5, 0], [9.0, 5, 0], [9.0, 9, 0]]), speed, 0.0, triangle)
 
 
 def test_a_visible_target_is_sent_where_it_projects(listener):
@@ -64,30 +55,6 @@ def test_a_visible_target_is_sent_where_it_projects(listener):
 def test_what_nobody_could_see_is_not_reported(listener, place, depth):
     eye = _eye(listener, [FixedPoint("a", np.array(place))])
     assert eye.observe(_view(depth)) == []
-    eye.close()
-
-
-def test_a_target_is_where_its_row_saw_it(listener):
-    """The shutter rolls: a target in another row is seen from another pose."""
-    place = np.array([4.0, 15.0, 0.0])
-    moved = Pose(POSE.rotation, POSE.translation + np.array([1.0, 0.0, 0.0]))
-    eye = _eye(listener, [FixedPoint("a", place)])
-    rolling = _view(pose_of_row=lambda row: moved if row < 100 else POSE)
-    (seen,) = eye.observe(rolling)
-    assert seen.v < 100
-    pixel, _ = CAMERA.project(moved.inverse.apply(place))
-    assert (seen.u, seen.v) == pytest.approx(pixel)
-    eye.close()
-
-
-def test_only_what_moves_is_reported_by_its_box(listener):
-    eye = _eye(listener, [_car(), FixedPoint("a", np.array([4.0, 3.0, 0.0]))],
-               DetectorErrors(noise_px=0.0, box_centre=True))  # fmt: skip
-    car, point = eye.observe(_view())
-    middle, _ = CAMERA.project(POSE.inverse.apply(np.array([5.0, 5.0, 0.75])))
-    assert (car.u, car.v) == pytest.approx(middle)
-    ground, _ = CAMERA.project(POSE.inverse.apply(np.array([4.0, 3.0, 0.0])))
-    assert (point.u, point.v) == pytest.approx(ground)
     eye.close()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
-from sitl.camera.imaging import Sensor, line_kernel
+from sitl.camera.imaging import Sensor
 from sitl.camera.world_camera import HAZY_AFTERNOON
 
 
@@ -52,14 +52,6 @@ def test_the_noise_has_the_general_ones_strength_and_differs_between_frames() ->
         assert abs(correlation) < 0.05
 
 
-def test_a_sensors_own_compression_is_kept() -> None:
-    rgb, depth = _scene()
-    compressed = Appearance(jpeg_quality=30)
-    expected = apply_appearance(rgb, depth, compressed, np.random.default_rng(0))
-    result = Sensor(compressed).apply(rgb, depth, 0.0, 0.0)
-    np.testing.assert_array_equal(result, expected)
-
-
 @pytest.mark.parametrize("condition", ["rain", "snow"])
 def test_weather_that_is_drawn_goes_through_the_general_function(condition: str) -> None:
     drawn = sample_appearance(np.random.default_rng(2), condition)
@@ -69,16 +61,3 @@ def test_weather_that_is_drawn_goes_through_the_general_function(condition: str)
     without = replace(quiet, rain_streaks=0, snow_flakes=0, snow_cover=0.0)
     bare = Sensor(without, seed=5).apply(rgb, depth, 0.0, 0.0)
     assert np.abs(result.astype(int) - bare).max() > 10  # dim rain is 20, snow 60
-
-
-def test_the_blur_kernel_is_a_line_of_the_given_length_and_direction() -> None:
-    kernel = line_kernel(6.0, 30.0)
-    n = kernel.shape[0] // 2
-    v, u = np.mgrid[-n : n + 1, -n : n + 1]
-    assert kernel.sum() == pytest.approx(1)
-    assert (kernel * u).sum() == pytest.approx(0, abs=1e-6)
-    along = u * np.cos(np.radians(30)) + v * np.sin(np.radians(30))
-    across = v * np.cos(np.radians(30)) - u * np.sin(np.radians(30))
-    # A line of length L has a variance of L^2 / 12; bilinear drawing adds up to a quarter pixel².
-    assert (kernel * along**2).sum() == pytest.approx(3.0, abs=0.35)
-    assert (kernel * across**2).sum() < 0.26

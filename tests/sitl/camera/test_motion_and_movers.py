@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from companion.geometry import GimbalAngles, Mount
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, quaternion_from_matrix, so3_exp
 from localizer.map.cache.tile import TileMesh
-from sitl.camera.movers import Crowd, Mover, spread, there_and_back
+from sitl.camera.movers import Mover
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 
 MESH = TileMesh(
@@ -35,17 +34,6 @@ def test_a_track_interpolates_position_and_rotation_evenly() -> None:
     assert track.at(2000) is not None
 
 
-def test_a_track_ignores_what_is_late_and_forgets_what_is_old() -> None:
-    track = PoseTrack(keep=3)
-    for t in (10, 20, 15, 30, 40):
-        track.add(t, Pose(np.eye(3), np.array([float(t), 0, 0])))
-    assert track.newest_ns == 40
-    assert track.at(10) is None
-    middle = track.at(25)
-    assert middle is not None
-    assert middle.translation[0] == pytest.approx(25)
-
-
 def test_a_vehicles_sample_gives_its_cameras_pose() -> None:
     frame = LocalFrame(Geodetic(47.0, 8.0, 430.0))
     body = quaternion_from_matrix(matrix_from_euler(0.1, -0.05, np.pi / 2))
@@ -66,31 +54,3 @@ def test_a_mover_goes_round_at_its_speed() -> None:
     np.testing.assert_allclose(pose.rotation[:, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(pose.rotation[:, 2], [0, 0, 1])
     np.testing.assert_allclose(pose.translation, [40, 29, 1])
-
-
-def test_movers_turn_smoothly_at_corners() -> None:
-    mover = Mover("a", SQUARE, speed_mps=10.0, phase_m=0.0, mesh=MESH)
-    headings = [
-        np.arctan2(*mover.velocity_at(round(t * 1e9))[1::-1]) for t in np.arange(3, 5, 0.05)
-    ]
-    assert np.abs(np.diff(np.unwrap(headings))).max() < np.radians(30)
-    assert np.degrees(headings[-1]) == pytest.approx(90, abs=1)
-
-
-def test_there_and_back_keeps_to_the_right() -> None:
-    lane = np.array([[0.0, 0, 3], [50, 0, 3], [100, 0, 3]])  # going east
-    path = there_and_back(lane, 1.0, 5.0)
-    np.testing.assert_allclose(path[:3, 1], -1.0)  # right of east is south
-    np.testing.assert_allclose(path[3:, 1], 5.0)  # right of west is north
-    np.testing.assert_allclose(path[:, 2], 3.0)
-
-
-def test_the_same_seed_spreads_the_same_movers() -> None:
-    def make(seed: int) -> list[tuple[float, ...]]:
-        crowd = Crowd("car", [MESH], (6, 14))
-        movers = spread(crowd, [SQUARE, SQUARE * 3], 12, np.random.default_rng(seed))
-        return [tuple(m.position_at(10**10)) for m in movers]
-
-    assert make(1) == make(1)
-    assert make(1) != make(2)
-    assert len(set(make(1))) == 12

@@ -13,7 +13,7 @@ import pytest
 
 from companion.geometry import GimbalFrame
 from localizer.geometry.geo import Geodetic, LocalFrame
-from sitl.camera.pose_sender import enu, truth_feed
+from sitl.camera.pose_sender import truth_feed
 from sitl.camera.true_motion import TruthSample
 from sitl.errors import SimulationError
 from sitl.geodesy import Location
@@ -74,11 +74,6 @@ class _Gimbal:
 def _fed(record: _Record, camera: _Camera, shift=(0.0, 0.0, 0.0)) -> Any:
     pilot: Any = SimpleNamespace(record=record)
     return truth_feed(pilot, camera, CACHE, _Gimbal(), shift)  # type: ignore[arg-type]
-
-
-def test_heights_above_the_sea_become_heights_in_the_maps_frame():
-    east, north, up = enu(_Record().location, CACHE)
-    assert (east, north, up) == pytest.approx((30.0, 40.0, 100.0), abs=1e-3)
 
 
 @pytest.mark.parametrize(

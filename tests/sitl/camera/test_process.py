@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import multiprocessing
 import socket
 import threading
 import time
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -173,52 +170,6 @@ def test_streams_what_the_true_pose_sees_and_stops_and_resumes(cache: Path, tmp_
     other = renderer.render(true_poses[0], CAMERA, wait=True).rgb.astype(int)
     assert np.abs(other - received[-1][0].image).mean() > 25
     streamer.close()
-
-
-class _Watched:
-    """A pipe that notes who uses it, and lets another thread try while it waits."""
-
-    def __init__(self, connection: Connection, other: threading.Thread) -> None:
-        self._connection, self._other = connection, other
-        self.users: list[str] = []
-        self.stopping = False
-
-    def send(self, message: object) -> None:
-        self.users.append(threading.current_thread().name)
-        self._connection.send(message)
-
-    def recv(self) -> object:
-        self.users.append(threading.current_thread().name)
-        return self._connection.recv()
-
-    def poll(self, timeout: float = 0.0) -> bool:
-        self.users.append(threading.current_thread().name)
-        if self.stopping and timeout > 0:
-            self._other.start()
-            self._other.join(0.3)
-        return self._connection.poll(timeout)
-
-
-def test_nobody_else_is_on_the_pipe_while_the_camera_stops(cache: Path, tmp_path: Path) -> None:
-    """A flight's thread goes on sending: it could take the statistics, or a part of them."""
-
-    def send() -> None:
-        with contextlib.suppress(WorldCameraError):  # when the process is gone already
-            process.send(_sample(0, 0))
-
-    ours, its = multiprocessing.Pipe()
-    sender = threading.Thread(target=send, name="sender")
-    pipe: Any = _Watched(ours, sender)
-    process = WorldCameraProcess(
-        _config(cache, tmp_path / "frames.csv", _free_url()), lambda: (pipe, its)
-    )
-    process.start()
-    pipe.users.clear()
-    pipe.stopping = True
-    process.stop()
-    sender.join()
-    assert process.statistics is not None
-    assert pipe.users == ["MainThread"] * 3 + ["sender"] * (len(pipe.users) - 3)
 
 
 def test_a_missing_cache_is_an_error_in_the_parent(tmp_path: Path) -> None:

@@ -103,12 +103,3 @@ def test_a_lossy_link_loses_its_share_and_sends_the_rest_in_whole_datagrams() ->
     assert link.lost == pytest.approx(75, abs=25)
     with pytest.raises(ValueError, match="udp://host:port"):
         LossyLink("rtsp://a/b", 0.1)
-
-
-def test_a_supersampled_picture_is_the_average_of_what_its_pixels_cover() -> None:
-    """Of a pattern too fine for the picture: point samples alias, a finer rendering does less."""
-    lens = RenderedLens.of(Camera.from_fov(320, 240, 60), 2.0)
-    size = (lens.pinhole.height, lens.pinhole.width)
-    fine = np.indices(size).sum(axis=0) % 2 * 255
-    image = np.repeat(fine[..., None], 3, 2).astype(np.uint8)
-    assert np.abs(lens.distort(image).astype(int) - 127).max() <= 2

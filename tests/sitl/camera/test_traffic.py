@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.geo import Geodetic
 from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.camera.traffic import traffic
@@ -47,11 +47,3 @@ def test_the_same_arguments_give_the_same_truth_and_the_epoch_shifts_it(world: W
         np.testing.assert_allclose(
             first.position_at(9 * SECOND), second.position_at(109 * SECOND), atol=1e-9
         )
-
-
-def test_traffic_is_given_in_the_maps_frame(world: WorldInfo) -> None:
-    moved = LocalFrame(world.frame.position([100.0, -50.0, 7.0]))
-    here = traffic(world, world.frame, cars=2, people=0)
-    there = traffic(world, moved, cars=2, people=0)
-    for a, b in zip(here, there, strict=True):
-        np.testing.assert_allclose(a.position_at(0) - b.position_at(0), [100, -50, 7], atol=0.02)

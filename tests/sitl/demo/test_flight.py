@@ -16,15 +16,15 @@ from sitl.demo.report import make_report, print_report
 from sitl.demo.scenario import CameraSpec, Injection, Scenario, ScenarioLeg
 from sitl.demo.script import FlightError, FlightScript
 
-# Light, because it flies in real time on what may be two cores.
+# Light and low, because it flies in real time on what may be two cores.
 SCENARIO = Scenario(
-    takeoff_height_m=80,
+    takeoff_height_m=45,
     deny_after_s=3,
     speed_m_s=6,
     legs=(
-        ScenarioLeg(east_m=0, north_m=60, height_m=80, gimbal_pitch_deg=-80),
-        ScenarioLeg(east_m=50, north_m=30, height_m=85, gimbal_pitch_deg=-80),
-        ScenarioLeg(east_m=0, north_m=0, height_m=80, gimbal_pitch_deg=-85),
+        ScenarioLeg(east_m=0, north_m=50, height_m=45, gimbal_pitch_deg=-80),
+        ScenarioLeg(east_m=40, north_m=25, height_m=50, gimbal_pitch_deg=-80),
+        ScenarioLeg(east_m=0, north_m=0, height_m=45, gimbal_pitch_deg=-85),
     ),
     cars=3,
     people=3,

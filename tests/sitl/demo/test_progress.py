@@ -10,7 +10,7 @@ from rich.console import Console
 from localizer.map.cache.cache import TileCache
 from localizer.synth.world import WorldInfo
 from sitl.demo import assets
-from sitl.demo.progress import LogProgress, shown_progress
+from sitl.demo.progress import LogProgress
 
 
 def test_a_log_gets_a_line_per_phase_and_every_ten_seconds() -> None:
@@ -23,16 +23,6 @@ def test_a_log_gets_a_line_per_phase_and_every_ten_seconds() -> None:
     assert lines[0] == "   0 s   0 % taking off"
     assert [int(line.split()[0]) for line in lines] == [0, 10, 15, 25, 35, 45]
     assert lines[-1] == "  45 s 100 % GNSS denied"
-
-
-def test_what_is_no_terminal_gets_lines() -> None:
-    out = io.StringIO()
-    with shown_progress(Console(file=out, width=80)) as progress:
-        progress("starting the vehicle", 0.0)
-    assert "starting the vehicle" in out.getvalue()
-    with shown_progress(Console(file=io.StringIO(), force_terminal=True, width=80)) as progress:
-        progress("starting the vehicle", 0.0)
-    assert not isinstance(progress, LogProgress)
 
 
 def test_a_world_that_is_being_made_tells_how_far_it_is(tmp_path, monkeypatch) -> None:

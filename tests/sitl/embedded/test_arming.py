@@ -93,14 +93,6 @@ def test_modes_that_do_not_arm(bench):
     assert b.failures() == ["RTL mode not armable"]
 
 
-def test_refusals_are_sent_as_texts(bench):
-    b = guided(bench({"SIM_GPS1_ENABLE": 0}))
-    b.run(1)
-    assert b.vehicle.report_failures("Arm")
-    assert b.said("Arm: Gyros inconsistent")
-    assert b.said("Arm: Need Position Estimate")
-
-
 def test_checks_can_be_masked(bench, vision_only, home):
     b = guided(bench({**vision_only, "ARMING_CHECK": ((1 << 20) - 2) & ~(1 << 18)}), home)
     feed = b.vision()

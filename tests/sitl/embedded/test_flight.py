@@ -57,27 +57,6 @@ def test_vision_holds_the_vehicle_after_gps_is_gone(bench, gps_then_vision):
     assert b.vehicle.estimator.position_valid
 
 
-def test_switching_source_sets_moves_the_vehicle_little(bench, gps_then_vision):
-    b = bench(gps_then_vision)
-    b.vision(offset=(1.0, 0.0, 0.0))
-    b.take_off(30.0)
-    here = b.truth
-    b.vehicle.estimator.sources.source_set = 2
-    b.run(20)
-    # The vehicle follows the new source, which is 1 m off, and no farther.
-    assert 0.5 < np.hypot(*(b.truth - here)[:2]) < 2.0
-
-
-def test_gps_loss_without_a_switch_lands_though_vision_flows(bench, gps_then_vision):
-    b = bench(gps_then_vision)
-    b.vision()
-    b.take_off(30.0)
-    killed = b.vehicle.time_s
-    b.vehicle.parameters.set("SIM_GPS1_ENABLE", 0)
-    b.run(12)
-    assert b.time_of("EKF Failsafe: changed to LAND Mode") - killed == pytest.approx(7.8, abs=0.8)
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_jammed_gps_fails_the_filter_within_seconds(bench, seed):
     """ardupilot.md: LAND after 4.6 s; how soon depends on when the receiver lies first."""

@@ -161,19 +161,6 @@ def _ended(pid: str) -> bool:
         return True
 
 
-def test_a_stopped_vehicle_leaves_no_process_behind():
-    with _Idle() as vehicle:
-        children = vehicle.processes
-        assert [c.poll() for c in children] == [None, None]
-    assert None not in [c.poll() for c in children]
-
-
-def test_no_endpoint_before_the_start():
-    vehicle = EmbeddedSitl(HOME)
-    with pytest.raises(VehicleProcessError, match="before it is started"):
-        _ = vehicle.gcs_endpoint
-
-
 def test_no_vehicle_at_the_endpoint():
     with pytest.raises(PilotError, match="no vehicle listens"):
         Pilot("tcp:127.0.0.1:9").link.connect(timeout_s=0.5)
@@ -228,10 +215,7 @@ def horizontal(a: Location, b: Location) -> float:
 
 def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
     parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
-    with (
-        real_time(),
-        open_vehicle(kind, HOME, VehicleSetup(30.0, parameters, SPEEDUP)) as vehicle,
-    ):
+    with real_time(), open_vehicle(kind, HOME, VehicleSetup(30.0, parameters, SPEEDUP)) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
             feed = TruthFeed(pilot, vehicle.companion_endpoint, FixModel(sigma_m=0.3))

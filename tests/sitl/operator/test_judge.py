@@ -16,28 +16,16 @@ from localizer.synth.world import WorldInfo
 from sitl.camera.world_camera import FrameLog
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
-from sitl.operator.follow_run import read_fixes
 from sitl.operator.followed import FollowedFix, follow_verdict
 from sitl.operator.judge import judge
-from sitl.operator.operator import Frames, SentWish
+from sitl.operator.operator import SentWish
 from sitl.operator.station import GeoReport, ReceivedMessages
 from sitl.operator.truth import GroundTruth, Pointed, all_pointed
-from sitl.operator.wishes import Wish, draw_wishes
+from sitl.operator.wishes import Wish
 from tests.companion.targets.scene import CAMERA, DOWN
 
 SECOND = 10**9
 PERIOD_NS = SECOND // 10
-
-
-def test_wishes_are_drawn_by_the_seed_alone_and_have_stops_between() -> None:
-    wishes = draw_wishes(5, 40)
-    assert wishes == draw_wishes(5, 40)
-    assert wishes != draw_wishes(6, 40)
-    kinds = [w.kind for w in wishes]
-    assert len(kinds) - kinds.count("stop") == 40
-    assert min(kinds.count(k) for k in ("point", "rectangle", "stop")) >= 5  # type: ignore[arg-type]
-    assert [w.at_s for w in wishes] == sorted(w.at_s for w in wishes)
-    assert all(0.0 < c < 1.0 for w in wishes for c in w.coordinates)
 
 
 @pytest.fixture
@@ -96,9 +84,7 @@ def heard(witness: GroundTruth, points: dict[int, Pointed], **other: Any) -> Rec
     return ReceivedMessages(geo=[replace(geo, **other)])
 
 
-def test_right_reports_are_no_problem(
-    witness: GroundTruth, asked: list[SentWish], tmp_path: Path
-) -> None:
+def test_right_reports_are_no_problem(witness, asked, tmp_path):
     points = all_pointed(witness, asked)
     rows = [row(p, s, (0.2, 0.0, 0.1)) for p in points.values() for s in np.arange(0.0, 12.0, 0.2)]
     verdict = judge(witness, asked, heard(witness, points), reports(tmp_path / "t.csv", rows))
@@ -119,18 +105,14 @@ def test_right_reports_are_no_problem(
         (lambda p, q: [], "without a report and without a word"),
     ],
 )
-def test_each_fault_of_a_report_is_a_problem(
-    fault: Any, problem: str, witness: GroundTruth, asked: list[SentWish], tmp_path: Path
-) -> None:
+def test_each_fault_of_a_report_is_a_problem(fault, problem, witness, asked, tmp_path):
     points = all_pointed(witness, asked)
     rows = [*fault(points[1], points[2]), row(points[2], 1.0)]
     verdict = judge(witness, asked, heard(witness, points), reports(tmp_path / "t.csv", rows))
     assert any(problem in found for found in verdict.problems), verdict.problems
 
 
-def test_what_comes_over_the_link_is_judged_too(
-    witness: GroundTruth, asked: list[SentWish], tmp_path: Path
-) -> None:
+def test_what_comes_over_the_link_is_judged_too(witness, asked, tmp_path):
     points = all_pointed(witness, asked)
     path = reports(tmp_path / "t.csv", [row(p, 1.0) for p in points.values()])
     for other, problem in (
@@ -142,17 +124,6 @@ def test_what_comes_over_the_link_is_judged_too(
     deaf = judge(witness, asked, ReceivedMessages(), path, "KeyError: 'x'")
     assert "nothing came over the link" in deaf.problems
     assert any("KeyError" in found for found in deaf.problems)
-
-
-def test_the_log_of_frames_is_read_while_it_grows(tmp_path: Path) -> None:
-    with FrameLog(tmp_path / "frames.csv") as log:
-        frames = Frames(tmp_path / "frames.csv")
-        assert frames.newest_before(SECOND) is None
-        for k in range(3):
-            log.add(k, k * PERIOD_NS + 7, Pose.identity(), k * PERIOD_NS)
-        assert frames.newest_before(SECOND) == (2, 2 * PERIOD_NS)
-        assert frames.newest_before(2 * PERIOD_NS - 1) == (1, PERIOD_NS)
-        frames.close()
 
 
 @pytest.fixture
@@ -199,28 +170,3 @@ def test_each_way_of_losing_it_is_told(chase: Chase) -> None:
     gap = [f for f in fixes(chase) if not chase.hidden_ns()[0][0] < f.time_ns < late]
     assert any("after a roof" in why for why in follow_verdict(gap, chase, end_ns).why)
     assert not follow_verdict([], chase, end_ns).is_followed
-
-
-def test_a_flight_s_record_is_judged_like_the_fixes_that_it_holds(
-    chase: Chase, tmp_path: Path
-) -> None:
-    told = fixes(chase)
-    rows: list[dict[str, Any]] = []
-    for number, some in ((1, told), (2, told[:3])):
-        for fix in some:
-            assert fix.velocity is not None
-            names = ("east", "north", "up")
-            place = {f"{a}_m": x for a, x in zip(names, fix.position, strict=True)}
-            velocity = {f"velocity_{a}": x for a, x in zip(names, fix.velocity, strict=True)}
-            cov = {f"cov_{k}": 0.04 * (k[0] == k[1]) for k in ("ee", "en", "eu", "nn", "nu", "uu")}
-            seen = {"visibility": "seen" if fix.is_seen else "hidden"}
-            head = {"exposure_time_ns": fix.time_ns, "target_id": f"ground station {number}"}
-            rows.append({**head, **place, **velocity, **cov, **seen})
-    read = read_fixes(reports(tmp_path / "targets.csv", rows), 1)
-    assert len(read) == len(told)
-    end_ns = chase.begins_ns() + 60 * SECOND
-    verdict, expected = follow_verdict(read, chase, end_ns), follow_verdict(told, chase, end_ns)
-    assert verdict.is_followed
-    assert verdict.nees == pytest.approx(expected.nees)
-    assert verdict.velocity_p95_mps == pytest.approx(0.0, abs=1e-6)
-    assert verdict.hidden_s == expected.hidden_s

@@ -114,9 +114,7 @@ def test_an_interrupted_suite_ends_and_flies_no_more(folders: Path) -> None:
     _all_is_over(folders)
 
 
-def test_a_suite_that_is_interrupted_while_it_starts_ends_too(
-    folders: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_suite_that_is_interrupted_while_it_starts_ends_too(folders, monkeypatch):
     class Interrupted(ProcessPoolExecutor):
         def submit(self, *arguments: Any, **more: Any) -> Any:
             if self._processes:

@@ -17,7 +17,8 @@ from sitl.suite.loop.case import LoopCase, load_loop_cases
 from sitl.suite.loop.flight import LoopAssets, fly
 from sitl.suite.loop.judge import judge
 
-FLOWN = tuple(case for case in load_loop_cases() if case.ci)
+# At 45 m instead of 80: the climb is flown in real time.
+FLOWN = tuple(case.model_copy(update={"height_m": 45.0}) for case in load_loop_cases() if case.ci)
 
 
 def another_place(folder: Path) -> Path:

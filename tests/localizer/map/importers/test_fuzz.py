@@ -15,10 +15,7 @@ from localizer.map.cache.cache import decode_tile, encode_tile
 from localizer.map.importers.gltf import read_gltf
 from localizer.map.importers.tiles3d import ContentFile, read_tileset
 
-FUZZ = settings(
-    max_examples=80,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+FUZZ = settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 FLIPS = st.lists(st.tuples(st.integers(0, 10**6), st.integers(1, 255)), min_size=1, max_size=8)
 NAMES = """root asset children content uri transform geometricError boundingVolume box refine
 version meshes primitives attributes POSITION indices accessors bufferViews nodes mesh scenes"""

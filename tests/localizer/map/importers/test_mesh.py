@@ -12,7 +12,6 @@ from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.map.building.cutting import shelves
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.georeference import Georeference, ecef_from_crs, read_georeference
 from localizer.render.numba_raster import NumbaRenderer
@@ -86,20 +85,6 @@ def test_tiles_show_their_part_of_the_texture(cache, make):
         assert np.abs(100 - green / 255.0 * 200 - points[:, 1]).max() < 4
 
 
-def test_made_levels_show_the_same_surface(cache, make):
-    root = int(cache.index.tile_start[0])
-    points = cache.load_tile(root).world_from_tile.apply(cache.load_tile(root).positions)
-    error = points[:, 2] - make.height(points[:, 0], points[:, 1])
-    assert np.median(np.abs(error)) < 0.1
-    camera = Camera.from_fov(64, 64, 40)
-    fine, coarse = Pose(DOWN, np.array([20.0, -30, 80])), Pose(DOWN, np.array([20.0, -30, 4000]))
-    with TileStreamer(cache) as streamer:
-        renderer = NumbaRenderer(streamer, threads=1)
-        near = renderer.render(fine, camera, wait=True)
-        far = renderer.render(coarse, Camera.from_fov(64, 64, 0.83), wait=True)
-    assert np.abs(near.rgb.astype(int) - far.rgb).mean() < 6
-
-
 def test_obj_with_odm_offsets(tmp_path, make, build):
     positions, uvs, faces = make.patch(0, 0, 60, 6)
     cv2.imwrite(str(tmp_path / "m.png"), picture(128))
@@ -168,16 +153,6 @@ def test_numbers_that_would_lead_kernels_astray_are_named(
     (tmp_path / "m.obj").write_text("\n".join(lines))
     with pytest.raises(MapSourceError, match=told):
         build(tmp_path / "m.obj", georeference=Georeference(origin=make.origin), **DATUM)
-
-
-def test_packed_rectangles_do_not_overlap():
-    sizes = np.random.default_rng(0).integers(1, 60, (300, 2))
-    places, (width, height) = shelves(sizes)
-    canvas = np.zeros((height, width), int)
-    for (x, y), (w, h) in zip(places, sizes, strict=True):
-        canvas[y : y + h, x : x + w] += 1
-    assert canvas.max() == 1
-    assert canvas.mean() > 0.7
 
 
 @pytest.mark.real

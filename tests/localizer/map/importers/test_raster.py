@@ -95,12 +95,6 @@ def test_heights_agree_with_the_dsm(cache):
     assert np.abs(error[~block]).max() < 0.05
 
 
-def test_nodata_stays_empty(cache):
-    inside = surface(cache, [LEFT + 10.0, LEFT + 50.0], [TOP - 10.0, TOP - 50.0])
-    assert np.isnan(inside[0])
-    assert np.isfinite(inside[1])
-
-
 def test_the_picture_lies_on_the_right_ground(cache):
     spot = LEFT + 100.0, TOP - 110.0
     ground = ecef_from_crs(UTM, np.array([[*spot, float(height(*spot))]]))
@@ -157,12 +151,6 @@ def test_a_geographic_dsm_goes_to_utm(tmp_path, build, rasters):
     cache = build([moved, ortho], **DATUM)
     east, north = LEFT + np.array([100.0, 120.0]), TOP - np.array([110.0, 30.0])
     assert np.abs(surface(cache, east, north) - height(east, north)).max() < 0.3
-
-
-def test_amsl_heights_are_lifted(rasters, build):
-    cache = build(rasters, geoid_separation_m=48.0, vertical_datum="amsl")
-    found = surface(cache, [LEFT + 100.0], [TOP - 110.0])
-    assert found[0] == pytest.approx(height(LEFT + 100.0, TOP - 110.0) + 48, abs=0.05)
 
 
 def test_what_is_missing_is_said(rasters, build, tmp_path):

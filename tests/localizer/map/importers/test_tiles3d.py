@@ -16,7 +16,6 @@ from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.importers.gltf import read_gltf
-from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import read_tileset
 
 
@@ -207,24 +206,6 @@ def test_missing_children_leave_the_parent_in_view(tmp_path, make, build):
     # The leaf's parent keeps its own surface: its other three children are left out.
     assert cache.manifest.tiles == 17
     assert int((cache.index.child_count == 0).sum()) == 13
-
-
-def test_amsl_heights_are_lifted_by_the_separation(source, make, build, cache):
-    rules = ImportRules(trusted=frozenset({"geoid"}))
-    lifted = build(source, vertical_datum="amsl", geoid_separation_m=20.0, rules=rules)
-    assert "EGM96's at 47.2000, 8.2000 is 47.75 m" in lifted.manifest.warnings[0]
-    raised = lifted.manifest.origin.height_m - cache.manifest.origin.height_m
-    assert raised == pytest.approx(20, abs=1e-3)
-    assert np.allclose(world_vertices(lifted), world_vertices(cache), atol=2e-3)
-
-
-def test_origin_can_be_chosen(source, make, build):
-    from localizer.geometry.geo import Geodetic
-
-    cache = build(source, origin=Geodetic(47.2, 8.2, 400.0))
-    points = world_vertices(cache)
-    z = make.height(points[:, 0], points[:, 1]) + 30
-    assert np.abs(points[:, 2] - z).max() < 1e-3
 
 
 def test_the_geoid_separation_is_computed_and_compared(tmp_path, make):

@@ -19,7 +19,7 @@ from localizer.map.importers.rules import ImportRules
 from localizer.map.inspection.alignment import alignment_of
 from localizer.map.inspection.check import Grade, MapUse, check_map, seams_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
-from localizer.map.inspection.usable import largest_rectangle, usable_part
+from localizer.map.inspection.usable import usable_part
 from tests.localizer.map.conftest import write_tileset
 
 FINE = MapUse(120.0, 0.004)
@@ -146,14 +146,6 @@ def test_of_a_map_with_bad_edges_the_usable_middle_is_named(cache):
         lies = found.south < at.latitude_deg < found.north
         assert (lies and found.west < at.longitude_deg < found.east) is inside
     assert usable_part(mosaic, np.ones_like(faulty), 120.0, cache.frame) is None
-
-
-def test_the_largest_rectangle_is_found_among_others():
-    good = np.zeros((6, 8), bool)
-    good[0:2, 0:3] = good[1:6, 4:7] = good[5] = True
-    assert largest_rectangle(good) == (1, 6, 4, 7)
-    assert largest_rectangle(~good | good) == (0, 6, 0, 8)
-    assert largest_rectangle(np.zeros((3, 3), bool)) is None
 
 
 def built_from(folder, make, *, up="y", trusted=(), image=None, materials=None):

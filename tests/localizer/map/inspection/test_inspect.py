@@ -11,22 +11,13 @@ import trimesh
 from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.tile import TileMesh
 from localizer.map.inspection.inspect import (
     camera_pose,
     depth_picture,
     export_glb,
-    levels,
     render_view,
     verify,
 )
-
-
-def test_levels(cache):
-    rows = levels(cache)
-    assert [r.tiles for r in rows] == [1, 4, 16]
-    assert [r.geometric_error_m for r in rows] == [40, 20, 0]
-    assert rows[0].gsd_m == pytest.approx(2 * rows[1].gsd_m, rel=0.05)
 
 
 def test_verify_whole_and_damaged(cache, tmp_path):
@@ -45,15 +36,6 @@ def test_verify_whole_and_damaged(cache, tmp_path):
     assert f"tile {inner[0]}" in result.damaged[0]
     assert len(result.holes) == 1
     assert result.holes[0].area_m2 == pytest.approx(100 * 100, rel=0.05)
-
-
-def test_camera_pose_looks_where_it_is_told(cache):
-    o = cache.manifest.origin
-    pose = camera_pose(cache, o.latitude_deg, o.longitude_deg, o.height_m + 50, 90.0, -30.0)
-    forward = pose.rotation[:, 2]
-    assert forward == pytest.approx([np.cos(np.radians(30)), 0, -0.5], abs=1e-9)
-    assert pose.rotation[:, 0] == pytest.approx([0, -1, 0], abs=1e-9)  # right is south
-    assert pose.translation == pytest.approx([0, 0, 50], abs=1e-6)
 
 
 def test_render_view_and_outside(cache):
@@ -77,16 +59,6 @@ def test_export_is_the_same_surface(cache, tmp_path, make):
     error = points[:, 1] - make.height(points[:, 0], -points[:, 2])
     assert np.abs(error).max() < 1e-3
     assert export_glb(cache, tmp_path / "coarse.glb", level=0) == 128
-
-
-def test_export_keeps_texture_orientation(cache, tmp_path):
-    export_glb(cache, tmp_path / "out.glb", level=0)
-    (geometry,) = trimesh.load_scene(tmp_path / "out.glb").geometry.values()
-    mesh: TileMesh = cache.load_tile(0)
-    order = np.lexsort(np.round(geometry.vertices, 2).T)
-    points = mesh.world_from_tile.apply(mesh.positions)
-    ours = np.lexsort(np.round(np.stack([points[:, 0], points[:, 2], -points[:, 1]], -1), 2).T)
-    assert geometry.visual.uv[order][:, 1] == pytest.approx(1 - mesh.uvs[ours][:, 1], abs=1e-4)
 
 
 def test_a_level_or_a_place_that_the_map_does_not_have_is_named(cache, tmp_path):

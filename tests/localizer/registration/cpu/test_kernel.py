@@ -26,7 +26,6 @@ from localizer.registration.cpu.reference import (
     linearize,
     pose_tangent_map,
     project,
-    projection_jacobian,
     retract,
 )
 from localizer.registration.hypotheses import generate_hypotheses
@@ -54,14 +53,6 @@ def swarm(scene, problems, prior):
     return camera_from_local(R, c, origin)
 
 
-def test_local_frame_round_trip(scene, problems):
-    origin, _ = problems
-    R, t = local(scene.true, origin)
-    rotations, centres = world_from_camera(R[None], t[None], origin)
-    np.testing.assert_allclose(rotations[0], scene.true.rotation, atol=1e-15)
-    np.testing.assert_allclose(centres[0], scene.true.translation, atol=1e-12)
-
-
 def test_projection_of_anchors_meets_their_pixels(scene, problems):
     """Level coordinates follow the half-pixel rule: image pixel u is index u / stride - 0.5."""
     origin, levels = problems
@@ -69,36 +60,6 @@ def test_projection_of_anchors_meets_their_pixels(scene, problems):
     for problem, level in zip(levels, scene.query.levels, strict=True):
         _, uv = project(problem, R, t)
         np.testing.assert_allclose((uv + 0.5) * level.stride, scene.anchors.pixels, atol=2e-3)
-
-
-def test_projection_jacobian_is_the_derivative_of_the_projection(scene, problems):
-    origin, levels = problems
-    R, t = local(scene.true, origin)
-    x, _ = project(levels[2], R, t)
-    analytic = projection_jacobian(levels[2], x, t)
-    for axis, h in enumerate([1e-4] * 3 + [1e-6] * 3):
-        step = np.zeros(6)
-        step[axis] = h
-        _, plus = project(levels[2], *retract(R, t, step))
-        _, minus = project(levels[2], *retract(R, t, -step))
-        np.testing.assert_allclose(analytic[:, :, axis], (plus - minus) / (2 * h), atol=1e-5)
-
-
-def test_feature_jacobians_are_the_derivative_of_the_residuals(scene, problems):
-    """Exact inside a bilinear cell; anchors that change cell within the step are left out."""
-    origin, levels = problems
-    R, t = local(scene.true, origin)
-    model = linearize(levels[1], R, t, SETTINGS)
-    _, uv = project(levels[1], R, t)
-    inside = model.visible & (np.abs(uv - np.round(uv)).min(axis=1) > 0.01)
-    assert inside.sum() > 100
-    for axis, h in enumerate([1e-4] * 3 + [1e-6] * 3):
-        step = np.zeros(6)
-        step[axis] = h
-        plus = linearize(levels[1], *retract(R, t, step), SETTINGS).residuals
-        minus = linearize(levels[1], *retract(R, t, -step), SETTINGS).residuals
-        numeric = (plus - minus)[inside] / (2 * h)
-        np.testing.assert_allclose(model.jacobians[inside, :, axis], numeric, atol=1e-5)
 
 
 def test_feature_jacobians_are_autograds(scene, problems):

@@ -15,7 +15,6 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -149,12 +148,6 @@ def faulty(emulator: Emulator) -> Kernels:
     source = f'-DKERNEL_SOURCE="{EMULATION / "faulty.cu"}"'
     library = build(EMULATION / "kernels.cpp", source, "-DFAULTY")
     return emulator.device.load(f"emulated:{library}".encode())
-
-
-@pytest.fixture
-def make_emulated() -> Callable[..., CudaBackend]:
-    """In place of `CudaBackend`: a backend whose kernels are compiled for the emulation."""
-    return partial(CudaBackend, compile=emulated_kernels)
 
 
 @pytest.fixture

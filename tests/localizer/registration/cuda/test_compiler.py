@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 
 from localizer.registration.cuda import compiler
-from localizer.registration.cuda.compiler import cache_directory, compile_kernels
+from localizer.registration.cuda.compiler import compile_kernels
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
 from localizer.registration.cuda.layout import macros
 from localizer.registration.cuda.steps import KERNELS
@@ -103,21 +103,3 @@ def test_layouts_that_differ_do_not_compile(tmp_path, monkeypatch):
 def test_an_unknown_architecture_is_an_error(tmp_path):
     with pytest.raises(CudaError, match="sm_11"):
         compile_kernels(4, False, (1, 1), tmp_path)
-
-
-def test_where_images_are_kept(monkeypatch, tmp_path):
-    monkeypatch.setenv("PILOT_CACHE", str(tmp_path))
-    assert cache_directory() == tmp_path / "cuda"
-    monkeypatch.delenv("PILOT_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/elsewhere")
-    assert str(cache_directory()) == "/elsewhere/pilot-companion/cuda"
-
-
-def test_the_sources_are_shipped():
-    """Package data: what the compiler reads must be in the wheel."""
-    from importlib.resources import files
-
-    names = {file.name for file in files("localizer.registration.cuda").iterdir()}
-    assert {"jngo.cu", "layout.cuh", "pose.cuh", "anchors.cuh", "refine.cuh", "schedule.cuh"} <= (
-        names
-    )
