@@ -51,8 +51,6 @@ def test_a_good_deployment(map_cache, feed):
     }
     assert all(findings[name].ok for name in ("map", "localizer", "camera"))
     assert findings["localizer"].found.startswith("tiny")
-        ("tiny (onnxruntime, ", "tiny-int8 (onnxruntime, ")
-    )
     assert "numba" in findings["localizer"].found
     assert findings["camera"].found == "160x120, 20.0 Hz"
     assert "tiles" in findings["map"].found
