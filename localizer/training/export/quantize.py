@@ -1,8 +1,7 @@
-"""`tiny` with its costly convolutions in eight bits, for processors with 8-bit dot products.
+"""`tiny` with encoder and decoder in eight bits, for processors with 8-bit dot products.
 
-Half of the network's time is the decoder's four dense 3 x 3 convolutions. They alone are quantized
-(activations to one scale each, weights to one a channel); the image, the fixed orientation
-channels, the encoder and the unit length stay in float32.
+Activations get one scale each, weights one a channel. The first convolution, the fixed orientation
+channels, the last convolutions and the unit length stay in float32.
 """
 
 from __future__ import annotations
@@ -12,14 +11,16 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import onnx
+from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from localizer.errors import ModelError
 from localizer.features.extractor import OnnxExtractor, read_model_info
 from localizer.types import Image
 
-_DECODER = "/merge"  # in the names of the convolutions and of their ReLUs
+_QUANTIZED = ("/stage", "/lateral", "/down", "/merge")  # in names of convolutions and ReLUs
 _LEAST_COSINE = 0.99  # of the features to the float32 ones, mean of an image's level
 
 
@@ -32,18 +33,42 @@ class _Images(CalibrationDataReader):  # type: ignore[misc]
         return None if image is None else {"image": image[None]}
 
 
+def _join(graph: onnx.GraphProto, first: str, second: str) -> None:
+    """One convolution instead of two of the same input, where both are there: the same values."""
+    nodes = {node.name: node for node in graph.node}
+    if not {first, second} <= nodes.keys():
+        return
+    values = {i.name: i for i in graph.initializer}
+    one, other = nodes[first], nodes[second]
+    parts = [numpy_helper.to_array(values[n.input[1]]) for n in (one, other)]
+    for a, b in zip(one.input[1:], other.input[1:], strict=True):
+        both = np.concatenate([numpy_helper.to_array(values[n]) for n in (a, b)])
+        values[a].CopyFrom(numpy_helper.from_array(both, a))
+        graph.initializer.remove(values[b])
+    sizes = numpy_helper.from_array(np.array([len(p) for p in parts]), f"{first}/sizes")
+    graph.initializer.append(sizes)
+    split = onnx.helper.make_node("Split", [f"{first}/both", sizes.name],
+                                  [one.output[0], other.output[0]], axis=1)  # fmt: skip
+    one.output[0] = f"{first}/both"
+    graph.node.insert(list(graph.node).index(one) + 1, split)
+    graph.node.remove(other)
+
+
 def quantize(model: Path, out: Path, images: Sequence[Image]) -> float:
     """Write the quantized `model` and its JSON; returns the least mean cosine of any level of the
     images (each (H, W, 3) uint8), whose activations set the scales, to the features of `model`.
     """
     info = read_model_info(model)
-    names = [node.name for node in onnx.load(str(model)).graph.node
-             if node.op_type in ("Conv", "Relu") and _DECODER in node.name]  # fmt: skip
+    graph = onnx.load(str(model))
+    names = [node.name for node in graph.graph.node if node.op_type in ("Conv", "Relu")
+             and any(part in node.name for part in _QUANTIZED)]  # fmt: skip
     if not names or not images:
         raise ModelError(f"{model}: quantizing needs a network of `tiny` and shards, got "
                          f"{len(names)} of its convolutions and {len(images)} images")  # fmt: skip
+    for k in range(len(info.levels)):
+        _join(graph.graph, f"/network/features.{k}/Conv", f"/network/share.{k}/Conv")
     quantize_static(
-        str(model), str(out), _Images(images), quant_format=QuantFormat.QDQ, per_channel=True,
+        graph, str(out), _Images(images), quant_format=QuantFormat.QDQ, per_channel=True,
         activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, nodes_to_quantize=names,
     )  # fmt: skip
     described = info.model_dump(mode="json") | {
