@@ -209,7 +209,6 @@ class RecordConfig(StrictModel):
     snapshot_interval_s: float | None = Field(
         10.0, ge=0.001, le=86400, description="interval of kept frames; null: none"
     )
-    mcap: bool = Field(False, description="also write record.mcap (extra `mcap`)")
 
 
 class KlvConfig(StrictModel):

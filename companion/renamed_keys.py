@@ -37,6 +37,7 @@ REMOVED = {
     "bridge.camera.horizontal_fov_deg": "it follows from camera.model",
     "bridge.camera.zoom_rate_hz": "it follows from camera.zoom",
     "bridge.targets.rate_hz": "it is targets.rate_hz",
+    "record.mcap": "`companion export RECORD --mcap` writes it after the flight",
     "localizer.feature_threads": "it follows from localizer.threads",
 }
 """Path: why it has no effect any more. Constants of the program (see above) need no entry."""

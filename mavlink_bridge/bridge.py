@@ -68,8 +68,6 @@ class Bridge:
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
     on_alert: called likewise with every alert for the operator.
-    on_vehicle_text: called likewise with every STATUSTEXT of the autopilot (severity, text, sender
-    as "system/component"), long ones in their parts.
     clock: CLOCK_MONOTONIC, ns; for a recorded flight, which `play` and `tick` go through instead of
     `start`, the time in the record.
     Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
@@ -83,7 +81,6 @@ class Bridge:
         on_track: Callable[[TrackRequest], None] | None = None,
         on_hint: Callable[[PlaceHint], bool] | None = None,
         on_alert: Callable[[Alert], None] = lambda _alert: None,
-        on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._config, self._clock = config, clock
@@ -120,7 +117,6 @@ class Bridge:
             ),
             enable,
             LookAt(config, geoid_separation_m, self.report_alert),
-            on_vehicle_text,
             clock,
         )
         self._fc = FlightControllerEnd(shared)

@@ -209,8 +209,6 @@ class FlightControllerEnd:
         elif kind == "STATUSTEXT":
             if not getattr(message, "chunk_seq", 0):  # a longer text's middle begins anyhow
                 self.sources.on_text(str(message.text))
-            sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
-            self._shared.on_vehicle_text(int(message.severity), str(message.text), sender)
         elif kind == "RC_CHANNELS" and self._shared.enable is not None:
             self._shared.enable.channels(self._tracker.snapshot(time_ns).rc_channels_us)
 

@@ -44,7 +44,6 @@ class Shared:
     watch: VehicleWatch
     enable: InjectionEnable | None
     look: LookAt
-    on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
     clock: Callable[[], int] = monotonic_ns
     target_numbers: Iterator[int] = field(default_factory=clicked_numbers)
     """Of clicked targets, over all links; none is given twice."""

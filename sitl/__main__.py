@@ -40,21 +40,21 @@ from sitl.demo.scenario import (
 from sitl.demo.script import FlightError
 from sitl.errors import SimulationError
 from sitl.operator.follow_run import fly_follows
-from sitl.operator.run import fly_clicks, summary
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
 from sitl.suite.loop.report import as_data, markdown, print_loop_row, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
-from sitl.suite.report import print_row, print_table, write_report
+from sitl.suite.report import markdown as suite_table
+from sitl.suite.report import print_row, write_report
 from sitl.suite.runner import run_suite
 from sitl.vehicles.process import VehicleKind
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
-    "companion", "companion.log", "companion.yaml", "errors.png", "flight.tlog", "frames.csv",
-    "frames_report.csv", "latest", "overlay-*", "report.html", "report.json", "tracks.png",
-    "truth.tum", "vehicle.csv", "vehicle.log",
+    "companion", "companion.log", "companion.yaml", "flight.tlog", "frames.csv",
+    "frames_report.csv", "latest", "report.html", "report.json", "truth.tum", "vehicle.csv",
+    "vehicle.log",
 )  # fmt: skip
 
 _IDEAL = "a map that shares geometry and texture with the world, a perfect camera, no errors drawn"
@@ -181,7 +181,7 @@ def suite(
     """Fly every scenario and compare with what ArduPilot was measured to do; exit 1: one fails."""
     cases, (console, options) = load_cases(only or (), scenarios), _runner(fc, out)
     rows = run_suite(cases, options.vehicles, jobs, seed, lambda row: print_row(console, row))
-    print_table(console, rows)
+    console.print(escape(suite_table(rows)))
     write_report(rows, out)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
@@ -205,21 +205,6 @@ def loop(
     )
     rows = fly_loop(cases, options, lambda row: print_loop_row(console, row))
     console.print(escape(markdown(rows)))
-    raise typer.Exit(0 if all(row.ok for row in rows) else 1)
-
-
-@app.command()
-def targets(
-    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
-    out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-targets"),
-    seeds: Annotated[str, typer.Option(help="world, errors and clicks: 5, or 5..7")] = "5..7",
-    clicks: Annotated[int, typer.Option(min=1, max=100, help="in each flight")] = 14,
-    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
-) -> None:
-    """Fly an operator who clicks, drags and stops; hold every report against what he pointed at."""
-    console, options = _runner(fc, out, seeds, worlds)
-    rows = fly_clicks(options, clicks)
-    console.print_json(json.dumps(summary(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 

@@ -1,6 +1,6 @@
 """The documentation's generated parts, written anew.
 
-    python -m benchmarks.site            # command line, configuration, API; tables of results
+    python -m benchmarks.site            # command line, configuration, API, alerts; results
     python -m benchmarks.site --check    # ends with 1 and names what is not of today
     python -m benchmarks.site --figures  # of the results pages
     python -m benchmarks.site --pictures report    # the README's, of `make demo`'s report folder
@@ -15,11 +15,12 @@ from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing
 from benchmarks.common.named_errors import named_errors
+from benchmarks.site.alerts import alerts_page
+from benchmarks.site.api import api_page
 from benchmarks.site.figures import draw_all
 from benchmarks.site.kept import DATA, with_tables
 from benchmarks.site.pages import command_page, configuration_page
 from benchmarks.site.pictures import keep
-from localizer.api_page import page as api_page
 
 _ROOT = Path(__file__).parents[2]
 
@@ -35,6 +36,7 @@ def pages() -> dict[Path, str]:
         reference / "cli.md": command_page(),
         reference / "configuration.md": configuration_page(),
         reference / "api.md": api_page(),
+        reference / "alerts.md": alerts_page(),
     }
 
 

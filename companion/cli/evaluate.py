@@ -18,7 +18,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.errors import ConfigError
-from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import sequence_of
 from companion.reporting.report import write_page
@@ -38,7 +37,6 @@ from localizer.evaluation.sequences import (
     PriorMode,
     Sequence,
     csv_rows,
-    error_arrays,
     evaluate,
     worst_first,
 )
@@ -46,6 +44,7 @@ from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.trajectory import StampedPose, write_tum
+from localizer.pictures import write_rgb
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.render.base import MapRenderer
@@ -266,24 +265,12 @@ def _write_overlays(
     renderer: MapRenderer,
     camera: Camera,
 ) -> None:
-    """The worst frames over the map rendered at their estimated poses, and the errors of all."""
+    """The worst frames beside the map rendered at their estimated poses."""
     undistort = Undistorter(data.camera, camera)
     for i in _shown(frames):
-        f, estimate = frames[i], frames[i].estimate
+        estimate = frames[i].estimate
         if estimate is None:
             continue
         view = renderer.render(estimate.world_from_camera, camera, wait=True)
         video = undistort(data.frame(i))
-        error = f"{_text(f.translation_error_m, 2)} m {_text(f.rotation_error_deg, 2)} deg"
-        caption = f"{f.name}: {'rejected' if f.translation_error_m is None else error}"
-        save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
-    number = np.arange(len(frames), dtype=np.float64)
-    position, rotation = error_arrays(frames)
-    plot_errors(
-        folder / "errors.png",
-        [
-            ErrorSeries("position", number, position, "3-D position error, m"),
-            ErrorSeries("rotation", number, rotation, "rotation error, °"),
-        ],
-        abscissa="frame",
-    )
+        write_rgb(folder / f"overlay-{i:04d}.png", np.hstack([video, view.rgb]))

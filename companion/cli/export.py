@@ -31,7 +31,7 @@ def export_command(
     console = Console()
     with shown_steps(Console(stderr=True)) as say:
         say(f"reading {record}")
-        from companion.reporting.mcap_export import export_mcap
+        from companion.export.mcap_export import export_mcap
 
         written = export_mcap(record, out, tlog, lambda n: say(f"{n} rows written"))
     for note in written.notes:

@@ -1,4 +1,4 @@
-"""An MCAP file (https://mcap.dev) with Foxglove's schemas: written row by row, in flight or after.
+"""An MCAP file (https://mcap.dev) with Foxglove's schemas: written row by row.
 
 Topics: /vision/pose, /vision/location, /tf, /camera/image, /camera/calibration, /targets,
 /targets/map, /autopilot/location, /gnss/location, /events, /mavlink/text, /diagnostics.
@@ -25,8 +25,7 @@ _PROFILE = ""  # Foxglove's schemas need none
 
 class McapFile:
     """Takes a flight's rows. clock_offset_ns: from CLOCK_MONOTONIC to UTC; camera: of the pictures,
-    None leaves out its calibration. A file that is not closed has no index: readers that stream and
-    `mcap recover` take it.
+    None leaves out its calibration.
     """
 
     def __init__(self, path: Path, clock_offset_ns: int, camera: Camera | None) -> None:
@@ -39,10 +38,6 @@ class McapFile:
         self._channels: dict[str, int] = {}
         self.messages = 0
         """How many were written, of all topics; a row can be several."""
-
-    def row(self, table: str, row: Row) -> None:
-        """A row of one of the record's tables."""
-        {"estimates": self.estimate, "targets": self.target, "events": self.event}[table](row)
 
     def estimate(self, row: Row) -> None:
         """A row of ``estimates.csv``: its diagnostics, and where it is accepted the pose."""
@@ -72,11 +67,6 @@ class McapFile:
             self.put("/camera/calibration", calibration, time_ns)
         self.put("/camera/image", messages.image(jpeg, time_ns), time_ns)
 
-    def text(self, text: str, severity: int, sender: str, time_ns: int) -> None:
-        """A line of MAVLink's STATUSTEXT, of the autopilot or the companion's own."""
-        utc_ns = self._utc_ns(time_ns)
-        self.put("/mavlink/text", messages.status_text(text, severity, sender, utc_ns), utc_ns)
-
     def put(self, topic: str, message: Any, time_ns: int) -> None:
         """A message of Foxglove's schemas, at its time in UTC."""
         kind = type(message)
@@ -91,10 +81,6 @@ class McapFile:
         self._writer.add_attachment(
             time_ns, time_ns, path.name, "application/json", plain_bytes(path)
         )
-
-    def flush(self) -> None:
-        """Hand what is written to the operating system; a begun chunk stays."""
-        self._file.flush()
 
     def close(self) -> None:
         """Write the index and close."""

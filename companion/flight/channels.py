@@ -57,7 +57,5 @@ class Channels:
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
     alerts: Channel[[Alert]] = field(default_factory=Channel)
     """Every alert that the operator was told, on any thread."""
-    vehicle_texts: Channel[[int, str, str]] = field(default_factory=Channel)
-    """Every line (MAV_SEVERITY, text, sender) of the autopilot, on a MAVLink link's thread."""
     events: Channel[[str, str]] = field(default_factory=Channel)
     """What happens (level, text) and is told nobody in flight: for log and record, any thread."""

@@ -105,7 +105,6 @@ def _bridge(making: BuildContext) -> Bridge:
         on_track=making.channels.clicks.send,
         on_hint=lambda hint: search().hint_at(hint),
         on_alert=making.channels.alerts.send,
-        on_vehicle_text=making.channels.vehicle_texts.send,
         clock=making.clock,
     )
     bridge.set_map_id(readable_map_hash(making.config.map) or "")
@@ -142,10 +141,8 @@ def _record(making: BuildContext) -> RecordKeeper:
         # What the operator was told belongs in the record; the bridge has logged it.
         def told(of: Alert) -> None:
             recorder.event(_level(severity(of)), text(of), of.id.value)
-            recorder.text(severity(of), text(of), "companion")
 
         channels.alerts.subscribe(told)
-        channels.vehicle_texts.subscribe(recorder.text)
     return keeper
 
 

@@ -9,9 +9,9 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
@@ -36,7 +36,6 @@ _FLUSH_S = 1.0
 _CLOSE_S = 5.0
 MANIFEST_NAME = "record.json"
 LATEST_NAME = "latest"
-MCAP_NAME = "record.mcap"
 
 ESTIMATE_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
@@ -52,7 +51,6 @@ TARGET_COLUMNS = (
     "cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu", "elsewhere", "visibility",
 )  # fmt: skip
 EVENT_COLUMNS = ("time_ns", "level", "text", "alert")
-_COLUMNS = {"estimates": ESTIMATE_COLUMNS, "targets": TARGET_COLUMNS, "events": EVENT_COLUMNS}
 
 
 def fresh_folder(folder: Path) -> Path:
@@ -76,7 +74,7 @@ def remove_empty(folder: Path) -> None:
     with contextlib.suppress(OSError):
         if any(len(t.read_text().splitlines()) > 1 for t in tables if t.exists()):
             return
-        for path in (*tables, folder / MANIFEST_NAME, folder / MCAP_NAME):
+        for path in (*tables, folder / MANIFEST_NAME):
             path.unlink(missing_ok=True)
         if snapshots.exists():
             snapshots.rmdir()
@@ -151,37 +149,13 @@ def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-class RecordStream(Protocol):
-    """A second form of the record, written along with the tables (`companion.export`)."""
-
-    def row(self, table: str, row: Mapping[str, Any]) -> None:
-        """A row of that table, by its columns."""
-        ...
-
-    def image(self, jpeg: bytes, exposure_time_ns: int) -> None:
-        """A snapshot."""
-        ...
-
-    def text(self, text: str, severity: int, sender: str, time_ns: int) -> None:
-        """A line of MAVLink text (MAV_SEVERITY), heard at a time of CLOCK_MONOTONIC."""
-        ...
-
-    def flush(self) -> None:
-        """Hand what is written to the operating system."""
-        ...
-
-    def close(self) -> None:
-        """Finish it."""
-        ...
-
-
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder, and the accepted
     estimates as a trajectory (`TrajectoryFiles`, made at the first of them).
 
     Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted. So is what
     the disk does not take (full, gone): the flight goes on without its record, and on_failure is
-    called once, in the recorder's thread, with the reason. stream: takes the same, if given.
+    called once, in the recorder's thread, with the reason.
     """
 
     def __init__(
@@ -189,10 +163,8 @@ class Recorder:
         config: RecordConfig,
         frame: LocalFrame,
         on_failure: Callable[[str], None] = lambda _: None,
-        stream: RecordStream | None = None,
     ) -> None:
         folder = config.folder
-        self._stream = stream
         self._snapshots = folder / "snapshots"
         self._interval_ns = (config.snapshot_interval_s or 0.0) * 1e9
         self._next_snapshot_ns = 0.0
@@ -205,7 +177,7 @@ class Recorder:
         self._on_failure = on_failure
         self._failed = False
         self._folder = folder
-        self._files: list[TextIO | TrajectoryFiles | RecordStream] = []
+        self._files: list[TextIO | TrajectoryFiles] = []
         self._trajectory: TrajectoryFiles | None = None
         try:
             self._snapshots.mkdir(parents=True, exist_ok=True)
@@ -216,8 +188,6 @@ class Recorder:
             }
         except OSError as error:
             raise _unwritable(folder, error) from error
-        if stream is not None:
-            self._files.append(stream)
         # A daemon: a disk that does not respond must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -238,14 +208,6 @@ class Recorder:
         """Record something that happened, at the current time. alert: its identifier, if any."""
         row = (time.monotonic_ns(), level, text, alert)
         self._put("events", lambda: row)
-
-    def text(self, severity: int, text: str, sender: str) -> None:
-        """Record a line of MAVLink text, now; the tables have the companion's own as events, the
-        stream takes all of them.
-        """
-        if self._stream is not None:
-            row = (text, severity, sender, time.monotonic_ns())
-            self._put("text", lambda: row)
 
     def snapshot(self, frame: Frame) -> None:
         """Keep the frame's image, named by its exposure time, if it is time for one."""
@@ -301,25 +263,16 @@ class Recorder:
                 self._write_picture(frame)
             finally:
                 self._written(frame)
-        elif name == "text":
-            if self._stream is not None:
-                self._stream.text(*row())
         elif name == "trajectory":
             (estimate,) = row()
             self._append(estimate)
         elif name:
-            values = tuple(row())
-            self._writers[name].writerow(values)
-            if self._stream is not None:
-                self._stream.row(name, dict(zip(_COLUMNS[name], values, strict=True)))
+            self._writers[name].writerow(row())
 
     def _write_picture(self, frame: Frame) -> None:
         # Not imwrite, which does not tell why it could not.
         _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
-        data = jpeg.tobytes()
-        (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(data)
-        if self._stream is not None:
-            self._stream.image(data, frame.exposure_time_ns)
+        (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(jpeg.tobytes())
 
     def _append(self, estimate: PoseEstimate) -> None:
         if self._trajectory is None:
@@ -353,21 +306,6 @@ class Recorder:
                 self._on_failure(getattr(error, "strerror", None) or str(error))
 
 
-def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | None:
-    """Open ``record.mcap``. None, with a warning, if that fails: the tables hold the record."""
-    try:
-        from companion.export.mcap_file import McapFile
-
-        record.folder.mkdir(parents=True, exist_ok=True)
-        camera = config.camera.model.camera()
-        return McapFile(record.folder / MCAP_NAME, process_utc().utc_ns(0), camera)
-    except ImportError as error:
-        _log.warning("no record.mcap: install pilot-companion[mcap] (%s)", error)
-    except OSError as error:
-        _log.warning("no record.mcap: %s", error)
-    return None
-
-
 class RecordKeeper:
     """The record of one process, if the disk takes one (this may be a restart in the air).
 
@@ -389,8 +327,7 @@ class RecordKeeper:
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
-            stream = _live_mcap(config, record) if record.mcap else None
-            self.recorder = Recorder(record, self._frame, self.failed, stream)
+            self.recorder = Recorder(record, self._frame, self.failed)
             self.folder = record.folder
             write_manifest(record.folder, config)
         except DiskFaultError as error:

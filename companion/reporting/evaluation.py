@@ -27,7 +27,6 @@ from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
 
 _TEXT = ("name", "state", "status", "problem")
-_SHEETS = 3  # pictures side by side on an overlay sheet: video, render, checkerboard
 
 
 def evaluation_report(folder: Path, say: Say = silent) -> Report:
@@ -123,17 +122,15 @@ def _sheet(
 
 
 def _overlays(folder: Path) -> tuple[Overlay, ...]:
-    """The sheets that `companion eval` wrote of the worst frames, taken apart again."""
+    """The worst frames as `companion eval` wrote them: video and map side by side."""
     sheets = []
     for path in sorted(folder.glob("overlay-*.png")):
         try:
             rgb = read_image(path)
         except (StreamDecodeError, OSError):
             continue
-        width = rgb.shape[1] // _SHEETS
-        body = rgb[22:]  # under the caption
-        number = path.stem.removeprefix("overlay-")
-        sheets.append(Overlay(body[:, :width], body[:, width : 2 * width], f"frame {number}"))
+        video, render = np.array_split(rgb, 2, axis=1)
+        sheets.append(Overlay(video, render, f"frame {path.stem.removeprefix('overlay-')}"))
     return tuple(sheets)
 
 

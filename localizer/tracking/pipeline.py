@@ -256,11 +256,6 @@ class Localizer:
         return self._fusion.attitude_bias.bias
 
     @property
-    def map_height_sigma_m(self) -> float:
-        """Spread of the heights that the map does not have, as the images so far show it."""
-        return self._fusion.height_error.sigma_m
-
-    @property
     def reference_age_s(self) -> float:
         """Largest usable age of a reference view, seconds."""
         return self._config.integrity.reference_age_s

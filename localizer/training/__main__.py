@@ -98,26 +98,11 @@ def quantize(
     out: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) that set the scales.")],
 ) -> None:
-    """Write a model's costly convolutions in eight bits, for processors with VNNI."""
-    from localizer.training.export.from_published import shard_images
+    """Write a model in eight bits, for processors with AVX-512 VNNI."""
     from localizer.training.export.quantize import quantize as write
 
-    cosine = write(model, out, list(shard_images(shards)))
+    cosine = write(model, out, shards)
     typer.echo(f"{out}: least mean cosine to {model} {cosine:.4f}")
-
-
-@app.command("make-trainable")
-def make_trainable(
-    model: Annotated[Path, typer.Argument(help="Published ONNX model of this network.")],
-    out: Annotated[Path, typer.Argument(help="Checkpoint to write, for a run's warm_start.")],
-    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
-) -> None:
-    """Make a published model trainable again."""
-    from localizer.training.checkpoint import write_checkpoint
-    from localizer.training.export.from_published import shard_images, trainable_network
-
-    network = trainable_network(model, list(shard_images(shards)))
-    write_checkpoint(out, {"average": network.state_dict()})
 
 
 @app.command()

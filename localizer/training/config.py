@@ -26,7 +26,6 @@ _MOST_WORKERS = 1024  # processes or threads
 _MOST_STEPS = 10**9
 _Side = Annotated[int, Field(gt=0, le=8192)]  # of an image, pixels
 _Weight = Annotated[float, Field(ge=0.0, le=1000.0)]  # of a loss; less than 0 would be learned
-_Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Error = Annotated[float, Field(ge=0.0, le=1000.0)]  # pixels
 
 
@@ -35,9 +34,7 @@ class _Frozen(BaseModel):
 
 
 class _PlacesSection(_Frozen):
-    """What every place and visit is made of. styles: share of the days that look like one of
-    `places.styles`; workers: processes that make them.
-    """
+    """What every place and visit is made of. workers: processes that make them."""
 
     first_seed: int = Field(ge=1000, lt=2**31)
     scenes: int = Field(gt=0, lt=2**31)
@@ -45,23 +42,8 @@ class _PlacesSection(_Frozen):
     photo_groups: tuple[str, ...]
     photo_share: float = Field(ge=0.0, le=1.0)
     light_variety: bool
-    styles: _Share = 0.0
     appearance: bool
     workers: int = Field(gt=0, le=_MOST_WORKERS)
-
-
-class HardSection(_Frozen):
-    """A share of the samples from pairs that are aligned badly; see `training.data.hard`."""
-
-    share: float = Field(gt=0.0, lt=1.0)
-    ranks: tuple[_Share, _Share]
-    every_steps: int = Field(gt=0, le=_MOST_STEPS)
-
-    @model_validator(mode="after")
-    def _ranks_rise(self) -> HardSection:
-        if self.ranks[0] >= self.ranks[1]:
-            raise ValueError(f"ranks {self.ranks} do not rise")
-        return self
 
 
 class DataSection(_PlacesSection):
@@ -71,7 +53,6 @@ class DataSection(_PlacesSection):
 
     shards: Path
     image: tuple[_Side, _Side] = (256, 192)
-    hard: HardSection | None = None
     initial_scenes: int = Field(gt=0, lt=2**31)
     scenes_per_step: float = Field(ge=0.0, le=1e6)
     worlds: int = Field(ge=0, lt=2**31)
@@ -110,20 +91,11 @@ Data = Annotated[
 ]
 
 
-class SizeSection(_Frozen):
-    """A stage of the curriculum over sizes; see `training.data.sizes`."""
-
-    first_step: int = Field(ge=0, le=_MOST_STEPS)
-    width: _Side
-    crop: tuple[_Side, _Side]
-    batch: int = Field(gt=0, le=65536)
-
-
 class OptimizerSection(_Frozen):
     """Steps and step sizes. The rate warms up, stays, and falls to zero as a cosine over the last
     `decay_steps`, so that a run can be made longer or shorter until its decay begins. Eq. 3 comes
     in at `alignment_first_step`. Levels of at most `whole_map_cells` are searched whole by the
-    contrast. `sizes`, where there are any, say in place of `batch` and `crop` what a step takes.
+    contrast.
     """
 
     steps: int = Field(gt=0, le=_MOST_STEPS)
@@ -131,7 +103,6 @@ class OptimizerSection(_Frozen):
     mixed_precision: bool
     batch: int = Field(gt=0, le=65536)
     crop: tuple[_Side, _Side]
-    sizes: tuple[SizeSection, ...] = ()
     anchors: int = Field(ge=32)
     learning_rate: float = Field(ge=1e-9, le=1.0)
     warmup_steps: int = Field(ge=0, le=_MOST_STEPS)
@@ -150,24 +121,18 @@ class OptimizerSection(_Frozen):
     def _decay_fits(self) -> OptimizerSection:
         if self.decay_steps > self.steps:
             raise ValueError(f"decay_steps {self.decay_steps} exceeds steps {self.steps}")
-        for crop in (self.crop, *(size.crop for size in self.sizes)):
-            if crop[0] * crop[1] < 2 * self.anchors:
-                raise ValueError(f"crop {crop} has too few pixels for {self.anchors} anchors")
-        if self.sizes and min(size.first_step for size in self.sizes) > 0:
-            raise ValueError("sizes: none begins at first_step 0")
+        if self.crop[0] * self.crop[1] < 2 * self.anchors:
+            raise ValueError(f"crop {self.crop} has too few pixels for {self.anchors} anchors")
         return self
 
 
 class TrainConfig(_Frozen):
-    """A whole run. warm_start: checkpoint whose averaged weights are the first ones; kept_steps:
-    every so many steps the checkpoint is also kept under the step's name, for a scaling curve.
-    """
+    """A whole run. warm_start: checkpoint whose averaged weights are the first ones."""
 
     name: str = Field(pattern=r"^\w[\w.-]*$")  # of files
     seed: int = Field(ge=0, lt=2**31)
     output: Path
     checkpoint_steps: int = Field(gt=0, le=_MOST_STEPS)
-    kept_steps: int | None = Field(default=None, gt=0, le=_MOST_STEPS)
     warm_start: Path | None = None
     model: NetworkConfig
     data: Data
@@ -175,22 +140,12 @@ class TrainConfig(_Frozen):
 
     @model_validator(mode="after")
     def _crop_fits(self) -> TrainConfig:
-        width, height = self.data.image
-        _fits(self.optimizer.crop, (width, height))
-        for size in self.optimizer.sizes:
-            if isinstance(self.data, LiveSection):
-                raise ValueError("sizes: need pairs on disk, not live ones")
-            if size.width > width:
-                raise ValueError(f"sizes: width {size.width} exceeds the image's {width}")
-            _fits(size.crop, (size.width, round(height * size.width / width)))
+        crop, image = self.optimizer.crop, self.data.image
+        if any(side % 8 for side in crop):
+            raise ValueError(f"crop {crop} has a side that is not divisible by 8")
+        if crop[0] > image[0] or crop[1] > image[1]:
+            raise ValueError(f"crop {crop} exceeds the image {image}")
         return self
-
-
-def _fits(crop: tuple[int, int], image: tuple[int, int]) -> None:
-    if any(side % 8 for side in crop):
-        raise ValueError(f"crop {crop} has a side that is not divisible by 8")
-    if crop[0] > image[0] or crop[1] > image[1]:
-        raise ValueError(f"crop {crop} exceeds the image {image}")
 
 
 def load_config(path: Path) -> TrainConfig:

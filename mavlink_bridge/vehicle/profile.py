@@ -36,8 +36,6 @@ class FirmwareProfile:
     max_delay_ms: float
     messages: tuple[InjectionMessage, ...]
     odometry_frame: int
-    delay_parameter: str
-    gps_delay_parameter: str  # {n}: the receiver, gps_id + 1
     least_lag: bool = False
     position_delta: bool = False
     known: bool = True
@@ -57,8 +55,6 @@ ARDUPILOT = FirmwareProfile(
     max_delay_ms=250.0,
     messages=_ARDUPILOT_MESSAGES,
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
-    delay_parameter="VISO_DELAY_MS",
-    gps_delay_parameter="GPS{n}_DELAY_MS",
     least_lag=True,
     position_delta=True,
 )
@@ -70,8 +66,6 @@ ARDUPILOT_SQRT = FirmwareProfile(
     max_delay_ms=250.0,
     messages=_ARDUPILOT_MESSAGES,
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
-    delay_parameter="VISO_DELAY_MS",
-    gps_delay_parameter="GPS{n}_DELAY_MS",
     least_lag=True,
     position_delta=True,
 )
@@ -82,8 +76,6 @@ PX4 = FirmwareProfile(
     max_delay_ms=300.0,
     messages=("vision_position_estimate", "odometry", "global_position_sensor"),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_NED,
-    delay_parameter="EKF2_DELAY_MAX",
-    gps_delay_parameter="EKF2_GPS_DELAY",
 )
 # The cube-root entry overstates the error in every formula below 3 m, so it is the safe one.
 GENERIC = FirmwareProfile(
@@ -93,8 +85,6 @@ GENERIC = FirmwareProfile(
     max_delay_ms=250.0,
     messages=("vision_position_estimate",),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
-    delay_parameter="VISO_DELAY_MS",
-    gps_delay_parameter="GPS{n}_DELAY_MS",
     known=False,
 )
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import multiprocessing
 import queue
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,7 +18,6 @@ from types import TracebackType
 from typing import Literal
 
 import cv2
-import numpy as np
 
 from companion.geometry import Mount
 from localizer.geometry.camera import Camera
@@ -81,14 +79,11 @@ class WorldCameraConfig:
 class CameraStatistics:
     """What the process did. skipped: exposures left out because it was behind or paused. lost:
     datagrams of the stream.
-
-    stage_ms: (p50, p95) of render, distort, appearance and encode.
     """
 
     frames: int
     skipped: int
     sent_bytes: int
-    stage_ms: dict[str, tuple[float, float]]
     lost: int = 0
 
 
@@ -264,7 +259,6 @@ class _Studio:
         self._track = PoseTrack()
         self._paused = self._stopped = False
         self._frames = self._skipped = 0
-        self._stages: dict[str, list[float]] = {}
 
     def __enter__(self) -> _Studio:
         return self
@@ -340,18 +334,10 @@ class _Studio:
             self._detector.observe(view, stamp_ns)
         self._log.add(self._frames, stamp_ns, exposure.world_from_camera, time_ns)
         self._frames += 1
-        for name, value in exposure.stage_ms.items():
-            self._stages.setdefault(name, []).append(value)
 
     def _send(self, waiting: _Waiting) -> None:
-        start = time.perf_counter()
         self._sender.send(waiting.image, waiting.exposure_ns, waiting.stamped_ns)
-        self._stages.setdefault("encode", []).append(1e3 * (time.perf_counter() - start))
 
     def _statistics(self) -> CameraStatistics:
-        stages = {
-            name: (float(np.percentile(values, 50)), float(np.percentile(values, 95)))
-            for name, values in self._stages.items()
-        }
         lost = self._link.lost if self._link is not None else 0
-        return CameraStatistics(self._frames, self._skipped, self._sender.sent_bytes, stages, lost)
+        return CameraStatistics(self._frames, self._skipped, self._sender.sent_bytes, lost)

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import csv
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,7 +57,6 @@ class Exposure:
     depth: Float32
     time_ns: int
     world_from_camera: Pose
-    stage_ms: dict[str, float]
     pose_of_row: Callable[[float], Pose]
 
 
@@ -112,24 +110,15 @@ class WorldCamera:
             away_ns = round((row + 0.5 - self.camera.height / 2) * self._row_ns)
             return shaken.at(time_ns + away_ns) or pose
 
-        start = time.perf_counter()
         view = self._render(pose, time_ns)
-        rendered = time.perf_counter()
         if self._row_ns:
             motion = row_motion(pose, pose_of_row, self.camera.height)
             image, depth = self._lens.roll(view.rgb, view.depth, motion)
         else:
             image, depth = self._lens.distort(view.rgb), self._lens.distort_depth(view.depth)
-        bent = time.perf_counter()
         length_px, angle_deg = self._blur(shaken, pose, depth, time_ns)
         image = self._sensor.apply(image, depth, length_px, angle_deg)
-        done = time.perf_counter()
-        stages = {
-            "render": 1e3 * (rendered - start),
-            "distort": 1e3 * (bent - rendered),
-            "appearance": 1e3 * (done - bent),
-        }
-        return Exposure(image, depth, time_ns, pose, stages, pose_of_row)
+        return Exposure(image, depth, time_ns, pose, pose_of_row)
 
     def _render(self, pose: Pose, time_ns: int) -> RenderedView:
         extra = []

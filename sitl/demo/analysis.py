@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.offline.tables import Columns, poses
+from companion.reporting.figures import nearest
 from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
 from localizer.geometry.pose import Array
 
-_MATCH_NS = 2_000_000
 _CHI2_95 = 5.991  # of two degrees of freedom
 
 
@@ -30,30 +30,24 @@ class FrameErrors:
     processed: np.ndarray
 
 
-def frame_errors(
-    truth: Columns, estimates: Columns, span_ns: tuple[int, int], tolerance_ns: int = _MATCH_NS
-) -> FrameErrors:
+def frame_errors(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> FrameErrors:
     """Match estimates to exposed frames by exposure time and measure them."""
     inside = (truth["exposure_time_ns"] >= span_ns[0]) & (truth["exposure_time_ns"] <= span_ns[1])
     times = truth["exposure_time_ns"][inside]
     true_poses = [p for p, keep in zip(poses(truth), inside, strict=True) if keep]
-    estimated = poses(estimates) if len(estimates) else []
-    stamps = np.asarray(estimates.get("exposure_time_ns", np.empty(0, np.int64)))
-    accepted = np.asarray(estimates.get("accepted", np.empty(0))) > 0
-    n = len(times)
-    translation, horizontal, rotation = (np.full(n, np.nan) for _ in range(3))
-    processed = np.zeros(n, bool)
-    for i, (time_ns, pose) in enumerate(zip(times, true_poses, strict=True)):
-        if not len(stamps):
-            break
-        k = int(np.argmin(np.abs(stamps - time_ns)))
-        if abs(int(stamps[k]) - int(time_ns)) > tolerance_ns:
-            continue
-        processed[i] = True
-        if accepted[k]:
-            translation[i], rotation[i] = pose.distance_to(estimated[k])
-            horizontal[i] = np.hypot(*(estimated[k].translation - pose.translation)[:2])
-    return FrameErrors(times, translation, horizontal, rotation, processed)
+    translation, horizontal, rotation = (np.full(len(times), np.nan) for _ in range(3))
+    found = np.full(len(times), -1)
+    if estimates:
+        order = np.argsort(estimates["exposure_time_ns"])
+        found = nearest(np.asarray(estimates["exposure_time_ns"])[order], times)
+        estimated, accepted = poses(estimates), np.asarray(estimates["accepted"]) > 0
+        for i in np.flatnonzero(found >= 0):
+            k = order[found[i]]
+            if accepted[k]:
+                translation[i], rotation[i] = true_poses[i].distance_to(estimated[k])
+                off = estimated[k].translation - true_poses[i].translation
+                horizontal[i] = np.hypot(*off[:2])
+    return FrameErrors(times, translation, horizontal, rotation, found >= 0)
 
 
 def localization_summary(errors: FrameErrors) -> LocalizationMetrics:
@@ -88,17 +82,17 @@ class Spread:
 
 def ekf_errors(
     vehicle: Columns, span_ns: tuple[int, int], shift_m: tuple[float, float, float] = (0, 0, 0)
-) -> tuple[np.ndarray, Array, Array]:
-    """(times, horizontal error, vertical error) of the autopilot's position against the truth, or
-    against where a map shows the truth that is shifted east, north and up.
+) -> Array:
+    """Horizontal errors of the autopilot's position against the truth, or against where a map shows
+    the truth that is shifted east, north and up.
     """
     t = vehicle["time_ns"]
     inside = (t >= span_ns[0]) & (t <= span_ns[1])
-    d = [
+    east, north = (
         vehicle[f"ekf_{a}_m"][inside] - vehicle[f"{a}_m"][inside] - s
-        for a, s in zip(("east", "north", "up"), shift_m, strict=True)
-    ]
-    return t[inside], np.hypot(d[0], d[1]), np.abs(d[2])
+        for a, s in zip(("east", "north"), shift_m[:2], strict=True)
+    )
+    return np.asarray(np.hypot(east, north))
 
 
 @dataclass(frozen=True)
@@ -116,10 +110,10 @@ def bound_figures(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) 
     """Of the accepted estimates in the span, by their horizontal errors; None without any. The
     ellipse is that of the east and north sigmas that were reported.
     """
-    rows, nearest = _matched(truth, estimates, span_ns)
+    rows, found = _matched(truth, estimates, span_ns)
     if not len(rows):
         return BoundFigures(None, None, Spread(None, None, None))
-    errors = [estimates[f"{a}_m"][rows] - truth[f"{a}_m"][nearest] for a in ("east", "north")]
+    errors = [estimates[f"{a}_m"][rows] - truth[f"{a}_m"][found] for a in ("east", "north")]
     scaled = [
         e / estimates[f"sigma_{a}_m"][rows] for e, a in zip(errors, ("east", "north"), strict=True)
     ]
@@ -135,18 +129,13 @@ def _matched(
     truth: Columns, estimates: Columns, span_ns: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows of accepted estimates in the span, and of the truth at their exposure."""
-    none = np.zeros(0, np.int64)
-    stamps = np.asarray(truth["exposure_time_ns"])
-    if not len(estimates) or not len(stamps):
-        return none, none
-    accepted = np.asarray(estimates["accepted"]) > 0
+    if not estimates:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     times = np.asarray(estimates["exposure_time_ns"])
-    rows = np.flatnonzero(accepted & (times >= span_ns[0]) & (times <= span_ns[1]))
-    after = np.clip(np.searchsorted(stamps, times[rows]), 1, max(len(stamps) - 1, 1))
-    nearest = np.where(times[rows] - stamps[after - 1] < stamps[after] - times[rows],
-                       after - 1, after)  # fmt: skip
-    known = np.abs(stamps[nearest] - times[rows]) < _MATCH_NS
-    return rows[known], nearest[known]
+    inside = (times >= span_ns[0]) & (times <= span_ns[1])
+    rows = np.flatnonzero((np.asarray(estimates["accepted"]) > 0) & inside)
+    found = nearest(np.asarray(truth["exposure_time_ns"]), times[rows])
+    return rows[found >= 0], found[found >= 0]
 
 
 def target_errors(

@@ -104,21 +104,3 @@ class ComputingRates:
             f"this computer did not keep up: {', '.join(said)}, load {self.load:.1f} on "
             f"{os.cpu_count() or 1} processors; end other work, or fly configs/demo_small.yaml"
         )
-
-
-def latency_warning(latency_ms: Spread, delay_ms: float) -> str | None:
-    """A line if more than 5 per cent of the estimates come later than the bridge sends them.
-
-    latency_ms: from exposure to estimate. delay_ms: ``bridge.injection.delay_ms``, the age at which
-    a fix is sent and which VISO_DELAY_MS tells the EKF.
-    """
-    limit = min(delay_ms, _MAX_LATENCY_MS)
-    p95 = latency_ms.p95
-    if p95 is None or p95 <= limit:
-        return None
-    return (
-        f"exposure to estimate takes {p95:.0f} ms at p95, above {limit:.0f} ms "
-        f"(bridge.injection.delay_ms {delay_ms:.0f}, ArduPilot's limit {_MAX_LATENCY_MS:.0f}): "
-        "later fixes are older than delay_ms, and beyond its limit only extrapolated ones "
-        "are sent; give the companion more processor, lower localizer.width or raise the delay"
-    )

@@ -92,7 +92,6 @@ _DEFAULTS: dict[str, tuple[float, int]] = {
     "SERVO9_FUNCTION": (0, INT16),
     "SERVO10_FUNCTION": (0, INT16),
     "SERVO11_FUNCTION": (0, INT16),
-    "RC8_OPTION": (0, INT16),
     "SYSID_THISMAV": (1, INT16),
     "SIM_GPS1_ACC": (0.5, REAL32),
     "SIM_GPS1_ENABLE": (1, INT8),

@@ -12,7 +12,6 @@ from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.statustext import StatusText, TextLog
 from sitl.ground.tracks import (
-    Array,
     EkfSample,
     GimbalState,
     LeastLatencyClock,
@@ -47,7 +46,6 @@ class VehicleRecord:
         self._boot_ms = 0
         self._attitude_ms: int | None = None
         self.ekf_flags = 0
-        self._subscribers: list[Callable[[Truth], None]] = []
         self._truth: SampleTrack[Truth] = SampleTrack(_SECONDS_KEPT * 50)
         self._gimbal: SampleTrack[GimbalState] = SampleTrack(_SECONDS_KEPT * 50)
         self._ekf: SampleTrack[EkfSample] = SampleTrack(_SECONDS_KEPT * 25)
@@ -114,24 +112,12 @@ class VehicleRecord:
         truth, gimbal = self._truth.newest, self._gimbal.newest
         return min(truth.time_ns, gimbal.time_ns) if truth and gimbal else None
 
-    def truth_track(self) -> list[Truth]:
-        """Everything recorded of the true state."""
-        return self._truth.all()
-
-    def gimbal_track(self) -> list[GimbalState]:
-        """Everything recorded of the gimbal."""
-        return self._gimbal.all()
-
-    def ekf_track(self) -> list[EkfSample]:
-        """Everything recorded of the EKF's position."""
-        return self._ekf.all()
-
     def ekf_pairs(self) -> Iterator[tuple[EkfSample, Location]]:
         """Every position that the EKF reported, with where the vehicle truly was then."""
         # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
-        truth = self.truth_track()
+        truth = self._truth.all()
         times = np.array([t.boot_s for t in truth])
-        for sample in self.ekf_track():
+        for sample in self._ekf.all():
             i = int(np.searchsorted(times, sample.boot_s))
             if sample.location is None or not 0 < i < len(times):
                 continue
@@ -139,19 +125,6 @@ class VehicleRecord:
             t = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
             leg = a.ned_of(b)
             yield sample, a.offset(t * leg[0], t * leg[1], t * leg[2])
-
-    def ekf_errors(self, since_ns: int = 0, until_ns: int = 1 << 62) -> Array:
-        """NED errors (N, 3) in metres of the EKF's positions against the truth of their times."""
-        errors = [
-            true.ned_of(sample.location)
-            for sample, true in self.ekf_pairs()
-            if sample.location is not None and since_ns <= sample.time_ns <= until_ns
-        ]
-        return np.array(errors, dtype=np.float64).reshape(-1, 3)
-
-    def subscribe(self, callback: Callable[[Truth], None]) -> None:
-        """Call back with every new true state, from the reading thread: be quick."""
-        self._subscribers.append(callback)
 
     # --- messages ----------------------------------------------------------------------------
 
@@ -193,8 +166,6 @@ class VehicleRecord:
             np.array([message.vn, message.ve, message.vd]),
         )
         self._truth.add(truth)
-        for callback in self._subscribers:
-            callback(truth)
 
     def _take_gimbal(self, message: Any, _received_ns: int) -> None:
         self._gimbal.add(

@@ -1,1 +1,1 @@
-"""A simulated operator who clicks at what he sees, and what comes of his clicks."""
+"""A simulated operator who clicks at a car, and what comes of it."""

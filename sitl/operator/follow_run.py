@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +15,7 @@ from companion.targets.detections import clicked_name
 from sitl.demo.budget import draw_errors
 from sitl.errors import SimulationError
 from sitl.operator.followed import FollowedFix, FollowVerdict, follow_verdict
-from sitl.operator.operator import LATE_S, LATE_SIGMA_S
-from sitl.operator.pursuer import SECONDS, Pursuer
+from sitl.operator.pursuer import LATE_S, LATE_SIGMA_S, SECONDS, Pursuer
 from sitl.suite.loop.case import LoopCase
 from sitl.suite.loop.flight import fly
 from sitl.suite.loop.runner import RunOptions, loop_assets
@@ -94,9 +91,8 @@ def _flown(kind: VehicleKind, draw: int, options: RunOptions, seed: int) -> Foll
         return FollowRow(kind, seed, draw, error=f"{type(error).__name__}: {error}")
     assert pursuer.chase is not None
     targets = folder / "companion" / "targets.csv"
-    texts = [text for _, text in pursuer.heard.texts]
     fixes = read_fixes(targets, pursuer.number) if targets.exists() else []
-    verdict = follow_verdict(fixes, pursuer.chase, pursuer.end_ns, texts)
+    verdict = follow_verdict(fixes, pursuer.chase, pursuer.end_ns)
     if pursuer.failure:
         verdict = replace(verdict, is_followed=False, why=(pursuer.failure, *verdict.why))
     begin_ns = pursuer.chase.begins_ns()
@@ -120,15 +116,8 @@ def _fix(table: dict[str, np.ndarray], k: int) -> FollowedFix:
         np.array([table[f"{a}_m"][k] for a in ("east", "north", "up")]),
         np.array([[ee, en, eu], [en, nn, nu], [eu, nu, uu]]),
         velocity if np.isfinite(velocity).all() else None,
-        None,  # not in the record
         str(table["visibility"][k]) == "seen",
     )
-
-
-def summary(rows: Sequence[FollowRow]) -> dict[str, Any]:
-    """How many of the flights followed their car."""
-    flown = [row for row in rows if row.verdict is not None]
-    return {"flights": len(rows), "flown": len(flown), "followed": sum(row.ok for row in rows)}
 
 
 def line_of(row: FollowRow) -> str:

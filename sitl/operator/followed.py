@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ _SETTLED_S = 3.0  # after the click its motion is measured
 
 @dataclass(frozen=True)
 class FollowedFix:
-    """One report. position: (3,) m, velocity: (3,) m/s or None, map ENU, with their covariances;
+    """One report. position: (3,) m with its covariance, velocity: (3,) m/s or None, map ENU;
     is_seen: found in its picture, not carried on by its motion.
     """
 
@@ -27,36 +27,26 @@ class FollowedFix:
     position: Array
     covariance: Array
     velocity: Array | None
-    velocity_covariance: Array | None
     is_seen: bool
 
 
 @dataclass(frozen=True)
 class FollowVerdict:
-    """seen_until_s: after the click; hidden_s: longest time without being seen. Errors horizontal:
-    of what was seen, settled; nees: of two dimensions, mean, with the share inside 95 %. foreign:
-    reports as seen farther than 4 m from the car.
+    """Errors horizontal, of what was seen, settled, with the share inside their 95 % bound. back_s:
+    after each roof's end; foreign: reports as seen farther than 4 m from the car.
     """
 
     is_followed: bool
     reports: int
     seen: int
-    seen_until_s: float
     back_s: tuple[float, ...]
-    hidden_s: float
     foreign: int
     p50_m: float
     p95_m: float
     max_m: float
     inside_percent: float
-    nees: float
-    velocity_told_percent: float
     velocity_p95_mps: float
-    velocity_nees: float
-    velocity_inside_percent: float
-    hidden_inside_percent: float
-    texts: tuple[str, ...] = ()
-    why: tuple[str, ...] = field(default=())
+    why: tuple[str, ...] = ()
     errors_m: tuple[float, ...] = ()
     times_s: tuple[float, ...] = ()
 
@@ -64,9 +54,7 @@ class FollowVerdict:
 _CHI2_95 = 5.991  # of two degrees of freedom
 
 
-def follow_verdict(
-    fixes: Sequence[FollowedFix], chase: Chase, end_ns: int, texts: Sequence[str] = ()
-) -> FollowVerdict:
+def follow_verdict(fixes: Sequence[FollowedFix], chase: Chase, end_ns: int) -> FollowVerdict:
     """Judge one target's reports against the car of a chase, from the click until `end_ns`."""
     begin_ns = chase.begins_ns()
     off = np.array([(f.position - chase.car.position_at(f.time_ns))[:2] for f in fixes])
@@ -80,7 +68,6 @@ def follow_verdict(
     back = [_back_s(times[is_own], (b - begin_ns) * 1e-9) for _, b in chase.hidden_ns()
             if b < end_ns]  # fmt: skip
     last_s = float(times[is_own].max()) if is_own.any() else 0.0
-    gaps = np.diff(times[is_own]) if is_own.sum() > 1 else np.array([np.inf])
     until_s = (end_ns - begin_ns) * 1e-9
     why = []
     if until_s - last_s > _LAST_S:
@@ -89,31 +76,23 @@ def follow_verdict(
     foreign = int((seen & (errors > _OFF_M)).sum())
     if foreign:
         why.append(f"{foreign} reports are of something else")
-    speeds, honest = _velocities(fixes, chase, settled)
-    hidden = ~seen
+    speeds = _velocities(fixes, chase, settled)
     return FollowVerdict(
-        not why, len(fixes), int(seen.sum()), last_s, tuple(back), float(gaps.max()), foreign,
-        *_spread(errors[settled]), _share(nees[settled]), _mean(nees[settled]),
-        100.0 * len(speeds) / max(int(settled.sum()), 1),
-        float(np.quantile(speeds, 0.95)) if len(speeds) else float("nan"),
-        _mean(honest), _share(honest), _share(nees[hidden]), tuple(texts), tuple(why),
+        not why, len(fixes), int(seen.sum()), tuple(back), foreign, *_spread(errors[settled]),
+        _share(nees[settled]), float(np.quantile(speeds, 0.95)) if len(speeds) else float("nan"),
+        tuple(why),
         tuple(float(e) for e in errors), tuple(float(t) for t in times),
     )  # fmt: skip
 
 
-def _velocities(
-    fixes: Sequence[FollowedFix], chase: Chase, chosen: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Errors of the horizontal velocity (m/s) and what they are of their covariance, squared."""
-    off, honest = [], []
-    for fix, is_chosen in zip(fixes, chosen, strict=True):
-        if not is_chosen or fix.velocity is None:
-            continue
-        error = (fix.velocity - chase.car.velocity_at(fix.time_ns))[:2]
-        off.append(float(np.linalg.norm(error)))
-        if fix.velocity_covariance is not None:
-            honest.append(_nees(error, fix.velocity_covariance))
-    return np.array(off), np.array(honest)
+def _velocities(fixes: Sequence[FollowedFix], chase: Chase, chosen: NDArray[np.bool_]) -> Array:
+    """Errors of the horizontal velocity, m/s."""
+    off = [
+        np.linalg.norm((fix.velocity - chase.car.velocity_at(fix.time_ns))[:2])
+        for fix, is_chosen in zip(fixes, chosen, strict=True)
+        if is_chosen and fix.velocity is not None
+    ]
+    return np.array(off)
 
 
 def _nees(error: Array, covariance: Array) -> float:
@@ -135,7 +114,3 @@ def _spread(errors: Array) -> tuple[float, float, float]:
 
 def _share(nees: Array) -> float:
     return 100.0 * float(np.mean(nees <= _CHI2_95)) if len(nees) else float("nan")
-
-
-def _mean(nees: Array) -> float:
-    return float(np.minimum(nees, 1e4).mean()) if len(nees) else float("nan")

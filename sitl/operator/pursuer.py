@@ -19,11 +19,11 @@ from sitl.camera.movers import Mover
 from sitl.camera.world_camera import FRAME_COLUMNS
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import Chase, make_chase, pursuit
-from sitl.operator.operator import LATE_S
-from sitl.operator.station import ReceivedMessages, Station
+from sitl.operator.station import Station
 from sitl.suite.loop.flight import ParticipantContext
 
 FOLLOWED_S = 60.0
+LATE_S, LATE_SIGMA_S = 0.25, 0.03  # exposure to click, of a link whose delay was measured
 LEAD_S = 110.0  # from the world's beginning to the click: take-off and shadow flight need 40 to 100
 SECONDS = LEAD_S - 30.0 + FOLLOWED_S + 3.0
 _STEER_NS = 400_000_000
@@ -67,7 +67,6 @@ class Pursuer:
         self._stop = threading.Event()
         self.chase: Chase | None = None
         self.number = 0
-        self.heard = ReceivedMessages()
         self.failure = ""
         self.end_ns = 0
         self.late_s = 0.0
@@ -90,7 +89,6 @@ class Pursuer:
 
     def _run(self, cabin: ParticipantContext) -> None:
         station = Station(cabin.vehicle.spare_endpoint, cabin.vehicle.check)
-        self.heard = station.heard
         chase = self.chase
         assert chase is not None
         begin_ns = chase.begins_ns()
@@ -143,6 +141,6 @@ class Pursuer:
         time.sleep(max(LATE_S - (time.monotonic_ns() - frame_ns) * 1e-9, 0.0))
         self.late_s = (time.monotonic_ns() - frame_ns) * 1e-9
         x, y = (np.asarray(pixel) + hand) / size
-        result, self.number = station.ask("point", (float(x), float(y)))
+        result, self.number = station.track(float(x), float(y))
         if result != 0:
             raise RuntimeError(f"the click was answered by {result}")

@@ -15,7 +15,7 @@ from mavlink_bridge import BridgeConfig
 from mavlink_bridge.config import StrictModel
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.checks import Check
-from sitl.suite.simulated_localizer import FixModel, RawMessage
+from sitl.suite.simulated_localizer import FixModel
 from sitl.vehicles.launch import (
     GPS_OFF,
     SPEEDS,
@@ -109,18 +109,6 @@ class CaseEvent(StrictModel):
             for name, value in due.items()
         }
 
-    @property
-    def label(self) -> str:
-        """For the plot."""
-        parts = [f"{k}={v}" for k, v in {**self.fixes, **self.vehicle, **self.ramp}.items()]
-        if self.reset:
-            parts.append("reset")
-        if self.source_set is not None:
-            parts.append(f"set {self.source_set}")
-        if self.reboot:
-            parts.append("reboot")
-        return ", ".join(parts)
-
 
 class GroundSetup(StrictModel):
     """What is done before take-off. doctor: wrong parameters are found and mended by
@@ -132,8 +120,8 @@ class GroundSetup(StrictModel):
 
 
 class Case(StrictModel):
-    """One scenario. Exactly one of bridge (our bridge's configuration, without the connection) and
-    raw (a bare MAVLink sender) injects. monitor: watches what goes to our bridge.
+    """One scenario. bridge: its configuration, without the connection; integrity_monitor: watches
+    what goes to it.
 
     ci: among the few that every test run flies on the embedded vehicle.
     """
@@ -143,37 +131,24 @@ class Case(StrictModel):
     ci: bool = False
     vehicle: VehicleSpec
     fixes: FixModel = FixModel()
-    bridge: dict[str, Any] | None = None
+    bridge: dict[str, Any]
     integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
-    raw: RawMessage | None = None
     flight: Flight = Flight()
     before: GroundSetup = GroundSetup()
     timeline: tuple[CaseEvent, ...] = ()
     expect: tuple[Annotated[Check, Field(discriminator="check")], ...] = Field(min_length=1)
 
     @property
-    def via(self) -> str:
-        """Who injects."""
-        return "bridge" if self.raw is None else "raw"
-
-    @property
     def is_honest(self) -> bool:
         """Whether the monitor watches, and has nothing to find."""
         f = self.fixes
         wrong = f.rotation_deg or f.yaw_error_deg or f.offset_north_m or f.silent or f.frozen
-        watched = (
-            self.bridge is not None and self.integrity_monitor.enabled and not self.flight.ground
-        )
+        watched = self.integrity_monitor.enabled and not self.flight.ground
         return watched and not wrong and not self.timeline
 
     @model_validator(mode="after")
     def _is_whole(self) -> Case:
-        if (self.bridge is None) == (self.raw is None):
-            raise ValueError("give exactly one of `bridge` and `raw`")
-        if self.bridge is not None:
-            BridgeConfig.model_validate(self.bridge)
-        elif self.before != GroundSetup():
-            raise ValueError("`before` needs the bridge")
+        BridgeConfig.model_validate(self.bridge)
         if list(self.timeline) != sorted(self.timeline, key=lambda e: e.at_s):
             raise ValueError("timeline: events must be in the order of at_s")
         ends_s = self.flight.seconds

@@ -20,14 +20,13 @@ from sitl.ground.pilot import Pilot
 from sitl.suite.case import Case, CaseEvent
 from sitl.suite.doctor import consult
 from sitl.suite.record import CaseRecord, Text, VehicleSample
-from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink, TruthFeed
+from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink
 from sitl.vehicles.launch import VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
 
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID_M = 47.3
 _AUTOPILOT = 1
-_RAW_SPEEDUP = 2.0  # as the reference was flown; our bridge lives in real time
 _GYROS_SETTLED_S = 27.0  # ArduPilot SITL refuses to arm before about 25 s
 _SETTLE_S = 3.0
 _REBOOT_S = 60.0  # within which the ports of the next boot are open; a tenth of a second is usual
@@ -41,9 +40,7 @@ _ARMING_TRIES = 3
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
     """Fly a scenario on a vehicle; SimulationError when it could not be flown at all."""
     with ExitStack() as stack:
-        speedup = 1.0 if case.raw is None else _RAW_SPEEDUP
-        parameters = case.vehicle.all_parameters()
-        setup = VehicleSetup(parameters=parameters, speedup=speedup, seed=seed)
+        setup = VehicleSetup(parameters=case.vehicle.all_parameters(), seed=seed)
         vehicle = open_vehicle(kind, HOME, setup)
         return _CaseFlight(case, stack.enter_context(vehicle), stack, seed).run()
 
@@ -59,8 +56,8 @@ class _CaseFlight:
         self._record = CaseRecord()
         self._pilots: list[Pilot] = []
         self._pilot = self._connect()
-        self._bridge: Bridge | None = None
-        self._feed: BridgeFeed | TruthFeed
+        self._bridge: Bridge
+        self._feed: BridgeFeed
         self._model: FixModel = case.fixes
         self._start_ns = 0
         side = case.flight.side_m
@@ -92,8 +89,7 @@ class _CaseFlight:
             self._record.refusals = self._refusals()
         for pilot in self._pilots:
             self._collect(pilot)
-        if self._bridge is not None:
-            self._record.counters = self._bridge.counters()
+        self._record.counters = self._bridge.counters()
         self._record.pace = slowest_pace(self._ticks)
         self._record.stall_s = longest_stall(self._ticks)
         return self._record
@@ -116,20 +112,14 @@ class _CaseFlight:
                 pilot.wait_ready()
         if spec.origin_north_m is not None:
             pilot.set_origin(HOME.offset(spec.origin_north_m, 0.0, 0.0))
-        elif self._case.raw is not None and not spec.receiver:
-            pilot.set_origin(HOME)
 
     def _wait_for_gyros(self) -> None:
         pilot = self._pilot
         pilot.link.wait(lambda: pilot.record.time_s > _GYROS_SETTLED_S, 60.0, "the gyros to settle")
 
     def _inject(self) -> None:
-        case, endpoint = self._case, self._vehicle.companion_endpoint
-        if case.raw is not None:
-            self._feed = TruthFeed(self._pilot, endpoint, case.fixes, case.raw, seed=self._seed)
-            self._stack.callback(self._feed.close)
-            return
-        config = bridge_config(case, endpoint)
+        case = self._case
+        config = bridge_config(case, self._vehicle.companion_endpoint)
         if case.before.doctor:
             self._record.doctor = consult(config)
             boots = self._vehicle.boots
@@ -188,9 +178,7 @@ class _CaseFlight:
 
     def _happen(self) -> None:
         while self._waiting and self._waiting[0].at_s <= self._now_s:
-            event = self._waiting.pop(0)
-            self._record.events.append((self._now_s, event.label))
-            self._do(event)
+            self._do(self._waiting.pop(0))
 
     def _ramp_on(self) -> None:
         event, begun_s, due_s = self._ramp or (None, 0.0, math.inf)
@@ -221,14 +209,13 @@ class _CaseFlight:
         self._pilot.link.close()
         self._vehicle.restart()
         self._pilot = self._connect()
-        if isinstance(self._feed, BridgeFeed):
-            self._feed.pilot = self._pilot
+        self._feed.pilot = self._pilot
 
     def _sample(self) -> None:
         pilot = self._pilot
         north, east, _ = HOME.ned_of(pilot.record.truth.location)
         self._ticks.append((self._now_s, pilot.record.time_s))
-        counters = self._bridge.counters() if self._bridge is not None else {}
+        counters = self._bridge.counters()
         self._record.samples.append(
             VehicleSample(
                 self._now_s,
@@ -282,20 +269,11 @@ class _CaseFlight:
             )
             for t in pilot.record.texts
         ]
-        truth = pilot.record.truth_track()
-        times = np.array([t.boot_s for t in truth])
-        true = np.array([HOME.ned_of(t.location)[:2] for t in truth]).reshape(-1, 2)
-        for sample in pilot.record.ekf_track():
+        for sample, true in pilot.record.ekf_pairs():
             at_s = self._seconds(sample.time_ns)
-            i = int(np.searchsorted(times, sample.boot_s))
-            if at_s < 0 or sample.location is None or not 0 < i < len(times):
-                continue
-            share = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
-            ekf = np.array(HOME.ned_of(sample.location)[:2])
-            north, east = ekf - (true[i - 1] + share * (true[i] - true[i - 1]))
-            record.errors.append((at_s, float(north), float(east)))
-            north, east = ekf - true[i - 1]
-            record.unpaired.append((at_s, float(north), float(east)))
+            if at_s >= 0 and sample.location is not None:
+                north, east, _ = true.ned_of(sample.location)
+                record.errors.append((at_s, north, east))
 
 
 def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:
@@ -328,7 +306,7 @@ def bridge_config(case: Case, connection: str) -> BridgeConfig:
     """The scenario's bridge, on a connection: injecting, with home as its origin where there is no
     receiver to give one.
     """
-    settings: dict[str, Any] = {"mode": "inject", **(case.bridge or {})}
+    settings: dict[str, Any] = {"mode": "inject", **case.bridge}
     if not case.vehicle.receiver:
         settings.setdefault(
             "origin",

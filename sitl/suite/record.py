@@ -69,7 +69,6 @@ class Doctor:
 class CaseRecord:
     """errors: (seconds, north, east) of every EKF position against the truth of its time.
 
-    unpaired: as errors, against the newest truth that had arrived, as the reference measured.
     refusals: texts of the last refused arming; None when nobody tried or it was accepted.
     pace: simulated seconds per second that it should have been, at the slowest over ten seconds;
     below 1 the machine was too slow, and the autopilot's clock ran slow against the bridge's.
@@ -77,10 +76,8 @@ class CaseRecord:
     """
 
     errors: list[tuple[float, float, float]] = field(default_factory=list)
-    unpaired: list[tuple[float, float, float]] = field(default_factory=list)
     samples: list[VehicleSample] = field(default_factory=list)
     texts: list[Text] = field(default_factory=list)
-    events: list[tuple[float, str]] = field(default_factory=list)
     refusals: list[str] | None = None
     doctor: Doctor | None = None
     counters: Figures = field(default_factory=dict)
@@ -95,11 +92,7 @@ class CaseRecord:
 
     def horizontal(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
         """Horizontal EKF errors (N,) in metres within a span of seconds."""
-        return _norms(self.errors, from_s, to_s)
-
-    def as_reference(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
-        """As `horizontal`, paired as the reference paired."""
-        return _norms(self.unpaired, from_s, to_s)
+        return np.array([np.hypot(n, e) for t, n, e in self.errors if from_s <= t <= to_s])
 
     def north(self, from_s: float, to_s: float) -> Array:
         """North EKF errors (N,) in metres within a span of seconds."""
@@ -109,7 +102,3 @@ class CaseRecord:
         """The first sample at or after a time; the last one where there is none."""
         later = [s for s in self.samples if s.at_s >= seconds]
         return later[0] if later else (self.samples[-1] if self.samples else None)
-
-
-def _norms(rows: list[tuple[float, float, float]], from_s: float, to_s: float) -> Array:
-    return np.array([np.hypot(n, e) for t, n, e in rows if from_s <= t <= to_s])

@@ -175,4 +175,4 @@ def _row(future: Future[ReportRow], case: Case, kind: VehicleKind) -> ReportRow:
 
 def _expected_s(case: Case) -> float:
     flight = case.flight
-    return flight.seconds or 4 * (flight.side_m / 10.0 + 5.0) / (2.0 if case.raw else 1.0)
+    return flight.seconds or 4 * (flight.side_m / 10.0 + 5.0)

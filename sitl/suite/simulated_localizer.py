@@ -1,39 +1,28 @@
 """A localizer made of the simulator's truth: noise, rate, latency, and faults switched in flight.
 
-`BridgeFeed` gives its fixes to our bridge, through the bridge's public interface. `TruthFeed` sends
-MAVLink by itself on the companion's port, for what the autopilot does when nobody guards it.
+`BridgeFeed` gives its fixes to our bridge, through the bridge's public interface.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
-from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from pymavlink import mavutil
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import VisionFix
 from mavlink_bridge import quaternion as quat
 from sitl.embedded.physics.rotation import matrix, quaternion
 from sitl.geodesy import Location
-from sitl.ground.connection import silence
 from sitl.ground.pilot import Pilot
 from sitl.ground.tracks import Truth
 
-_COMPONENT = 197
-_GPS_EPOCH_S = 1.4e9  # an arbitrary GPS time at boot
-_LOCAL_FRD, _BODY_FRD = 20, 12
-_IGNORE_VELOCITY = 8 | 16 | 32
 _ODOMETRY_SCALE = 0.1  # that the odometry claims
 _FROZEN_SHARE = 0.2  # of sigma_m
-_HALF_TICK_S = 0.005  # truth comes in whole ticks: what is due within half of one is due
 
 Vector = tuple[float, float, float]
 
@@ -63,20 +52,6 @@ class FixModel(BaseModel):
     silent: bool = False
     frozen: bool = False
     odometry_scale: float | None = Field(None, gt=-0.5, lt=1.0)
-
-
-class RawMessage(BaseModel):
-    """What `TruthFeed` sends. claimed_sigma_m: None sends NaN covariance."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    message: Literal["vision_position_estimate", "odometry", "gps_input"] = (
-        "vision_position_estimate"
-    )
-    claimed_sigma_m: float | None = Field(None, gt=0)
-    attitude: bool = True
-    gps_velocity: bool = False
-    quality: int = Field(80, ge=-1, le=100)
 
 
 @dataclass(frozen=True)
@@ -205,159 +180,6 @@ class BridgeFeed:
             velocity_ned=None if measured is None else seen.velocity_ned,
             velocity_sigma_mps=measured or 0.3,
             scale_sigma=None if self._left is None else _ODOMETRY_SCALE,
-        )
-
-
-@dataclass(frozen=True)
-class _Due:
-    due_s: float
-    taken_s: float
-    seen: Observation
-    reset_counter: int
-
-
-class TruthFeed:
-    """Sends MAVLink fixes on the companion's port, in simulated time, while it is open.
-
-    origin: of the positions; None: the EKF's, as the pilot read it.
-    """
-
-    def __init__(
-        self,
-        pilot: Pilot,
-        endpoint: str,
-        model: FixModel | None = None,
-        message: RawMessage | None = None,
-        origin: Location | None = None,
-        seed: int = 0,
-    ) -> None:
-        self._pilot, self._origin = pilot, origin
-        self._model, self._message = model or FixModel(), message or RawMessage()
-        self._observer = Observer(seed)
-        self._queue: deque[_Due] = deque()
-        self._next_s = self._beat_s = 0.0
-        self._resets = 0
-        self.sent = 0
-        self._link = mavutil.mavlink_connection(
-            endpoint,
-            source_system=1,
-            source_component=_COMPONENT,
-            dialect="ardupilotmega",
-            robust_parsing=True,
-        )
-        silence(self._link)
-        pilot.record.subscribe(self._on_truth)
-
-    def change(self, model: FixModel, *, reset: bool = False) -> None:
-        """Another model from now on; reset: with the next reset_counter on its first fix."""
-        self._resets += reset
-        self._model = model
-
-    def close(self) -> None:
-        """Send nothing more."""
-        self._model = self._model.model_copy(update={"silent": True})
-        self._queue.clear()
-        self._link.close()
-
-    def _on_truth(self, truth: Truth) -> None:
-        with contextlib.suppress(OSError):
-            self._drain()
-            if truth.boot_s - self._beat_s >= 1.0:
-                self._beat_s = truth.boot_s
-                self._link.mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4)
-            if truth.boot_s + _HALF_TICK_S >= self._next_s:
-                self._next_s = max(self._next_s + 1.0 / self._model.rate_hz, truth.boot_s)
-                self._observe(truth)
-            while self._queue and self._queue[0].due_s <= truth.boot_s + _HALF_TICK_S:
-                self._send(self._queue.popleft())
-
-    def _drain(self) -> None:
-        # What the vehicle sends must be read, or its port stalls.
-        while self._link.recv_msg() is not None:
-            pass
-
-    def _observe(self, truth: Truth) -> None:
-        origin, model = self._origin or self._pilot.record.origin, self._model
-        if origin is None or model.silent:
-            return
-        seen = self._observer.observe(truth, origin, model)
-        due_s = truth.boot_s + self._observer.latency_s(model)
-        self._queue.append(_Due(due_s, truth.boot_s, seen, self._resets % 256))
-
-    def _send(self, due: _Due) -> None:
-        self.sent += 1
-        send = {
-            "vision_position_estimate": self._send_vision,
-            "odometry": self._send_odometry,
-            "gps_input": self._send_gps,
-        }
-        send[self._message.message](due)
-
-    def _covariance(self) -> list[float]:
-        """Upper triangle for ArduPilot 4.7: error = cbrt(c0² + c6² + c11²)."""
-        claimed = self._message.claimed_sigma_m
-        if claimed is None:
-            return [math.nan] * 21
-        covariance = [0.0] * 21
-        for i in (0, 6, 11):
-            covariance[i] = math.sqrt(claimed**3 / 3)
-        return covariance
-
-    def _send_vision(self, due: _Due) -> None:
-        angles = due.seen.roll_pitch_yaw if self._message.attitude else (math.nan,) * 3
-        self._link.mav.vision_position_estimate_send(
-            round(due.taken_s * 1e6),
-            *due.seen.position_ned,
-            *angles,
-            self._covariance(),
-            due.reset_counter,
-        )
-
-    def _send_odometry(self, due: _Due) -> None:
-        q = quaternion(*due.seen.roll_pitch_yaw)
-        body = matrix(q).T @ np.array(due.seen.velocity_ned)
-        self._link.mav.odometry_send(
-            round(due.taken_s * 1e6),
-            _LOCAL_FRD,
-            _BODY_FRD,
-            *due.seen.position_ned,
-            [float(v) for v in q],
-            *_three(body),
-            0.0,
-            0.0,
-            0.0,
-            self._covariance(),
-            [math.nan] * 21,
-            due.reset_counter,
-            mavlink.MAV_ESTIMATOR_TYPE_VISION,
-            self._message.quality,
-        )
-
-    def _send_gps(self, due: _Due) -> None:
-        origin = self._origin or self._pilot.record.origin
-        if origin is None:
-            return
-        where = origin.offset(*due.seen.position_ned)
-        week, seconds = divmod(_GPS_EPOCH_S + due.taken_s, 604_800.0)
-        accuracy = 1.5 * self._model.sigma_m
-        self._link.mav.gps_input_send(
-            round(due.taken_s * 1e6),
-            0,
-            0 if self._message.gps_velocity else _IGNORE_VELOCITY,
-            round(seconds * 1000),
-            int(week),
-            3,
-            round(where.latitude_deg * 1e7),
-            round(where.longitude_deg * 1e7),
-            where.altitude_m,
-            0.8,
-            1.0,
-            *due.seen.velocity_ned,
-            0.3,
-            max(accuracy, 0.3),
-            max(accuracy, 0.5),
-            12,
-            0,
         )
 
 

@@ -42,7 +42,8 @@ def test_an_old_name_is_read_with_a_warning(old: str, caplog: pytest.LogCaptureF
     assert not caplog.text
 
 
-ALONE = [key for key in REMOVED if "signing" not in key and not key.startswith("prior")]
+INSIDE = ("prior", "record", "bridge.signing", "bridge.ground_signing")
+ALONE = [key for key in REMOVED if not key.startswith(INSIDE)]
 
 
 @pytest.mark.parametrize("old", [*ALONE, *CONSTANTS])
@@ -51,6 +52,13 @@ def test_a_removed_setting_is_left_out_with_a_warning(old, caplog):
         assert config(nested(old, 0.5)) == config({})
     assert "has no effect since 0.2" in caplog.text
     assert caplog.text.count("remove it") == 1
+
+
+def test_a_removed_setting_beside_others(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        found = config({"record": {"folder": "flight", "mcap": True}})
+    assert found == config({"record": {"folder": "flight"}})
+    assert "record.mcap has no effect since 0.2" in caplog.text
 
 
 def test_an_old_section_with_an_old_key(caplog: pytest.LogCaptureFixture) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import localizer
-from localizer.api_page import page
+from benchmarks.site.api import api_page
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,16 +31,9 @@ def test_importing_the_package_imports_no_kernel_and_no_network():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_the_api_page_is_made_from_todays_docstrings():
-    docs = ROOT / "docs" / "reference" / "api.md"
-    assert docs.read_text(encoding="utf-8") == page(), (
-        "python -m localizer.api_page docs/reference/api.md"
-    )
-
-
 def test_the_page_begins_with_what_the_example_does():
     """Its ten lines are the example's, which a test runs."""
     example = (ROOT / "examples" / "localize_photo.py").read_text(encoding="utf-8")
-    snippet = page().split("```python\n", 1)[1].split("```", 1)[0].splitlines()
+    snippet = api_page().split("```python\n", 1)[1].split("```", 1)[0].splitlines()
     assert len(snippet) == 8
     assert [line for line in snippet[1:] if line not in example.splitlines()] == []

@@ -83,8 +83,6 @@ class Flight:
         self.tracked: list[TrackRequest] = []
         self.hinted: list[PlaceHint] = []
 
-        self.vehicle_texts: list[tuple[int, str, str]] = []
-
         shared = Shared(
             config,
             GEOID,
@@ -98,7 +96,6 @@ class Flight:
             VehicleWatch(self.alerts.append, clock=lambda: self.now_ns),
             enable,
             LookAt(config, GEOID, self.alerts.append),
-            lambda *told: self.vehicle_texts.append(told),
             lambda: self.now_ns,
         )
         self.shared = shared

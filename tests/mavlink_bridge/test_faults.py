@@ -518,12 +518,3 @@ def test_no_origin_is_set_while_the_gate_is_closed(monkeypatch: pytest.MonkeyPat
     flight.run(10.0)
     assert flight.origin is not None
     assert flight.vision()
-
-
-def test_what_the_autopilot_says_is_handed_on_and_what_others_say_is_not(monkeypatch):
-    flight = Flight(monkeypatch)
-    flight.run(2.0)
-    for component in (1, 191):
-        text = mavlink.MAVLink_statustext_message(4, f"lane switch {component}".encode())
-        flight.say(text, component=component)
-    assert flight.vehicle_texts == [(4, "lane switch 1", "1/1")]

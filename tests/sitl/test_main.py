@@ -49,7 +49,7 @@ def test_a_file_in_the_folders_place_is_named(tmp_path, command):
 
 def test_an_earlier_report_is_replaced(tmp_path):
     (tmp_path / "report" / "companion").mkdir(parents=True)
-    (tmp_path / "report" / "overlay-0.jpg").touch()
+    (tmp_path / "report" / "report.html").touch()
     with pytest.raises(RuntimeError, match="flying"):
         _run("demo", "--out", tmp_path / "report")
     assert not (tmp_path / "report").exists()

@@ -94,14 +94,10 @@ def light_scene(
     light: SkyLight,
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
-    *,
-    sunlit: Float32 | None = None,
-    glow: Float32 | None = None,
 ) -> LitScene:
     """Shade the scene with sun, sky and cast shadows, and build what the ray marcher needs.
 
     texel_cells: size of a sample of the baked texture; above one it is coarser than the cells.
-    sunlit, glow: (n, n), share of the sun that clouds let through, and lamps' own light.
     """
     height, cell = scene.height, scene.cell_m
     gy, gx = np.gradient(height, cell)
@@ -110,11 +106,7 @@ def light_scene(
     if light.direct > 0.0:
         sunny = cast_shadows(height, cell, sx, sy, sz, float(np.ptp(height)))
         cosine = cosine * cv2.GaussianBlur(sunny, (0, 0), 0.6)
-    if sunlit is not None:
-        cosine = cosine * sunlit
     shade = light.ambient * openness(height) + light.direct * cosine
-    if glow is not None:
-        shade = shade + glow
     texture = scene.albedo * shade[..., None].astype(np.float32)
     return textured(scene, texture, light, sky, texel_cells)
 

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 from localizer.errors import SequenceError
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
-from localizer.training.data.hard import HardPairs, Key
 from localizer.training.data.pairs import Pair, relative_pose
 from localizer.training.data.shards import read_shard
-from localizer.training.data.sizes import Size, draw_size, resized
 from localizer.training.losses import Batch
 from localizer.types import Float32, Image
 
@@ -28,16 +26,13 @@ _DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it n
 
 @dataclass(frozen=True)
 class LoaderConfig:
-    """pairs and anchors of a batch, crop size in pixels, whether queries get weather and sensor;
-    sizes: of a curriculum, which then say width, crop and batch.
-    """
+    """pairs and anchors of a batch, crop size in pixels, whether queries get weather and sensor."""
 
     batch: int
     anchors: int
     crop: tuple[int, int]
     appearance: bool
     cached_shards: int = 700
-    sizes: tuple[Size, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,12 +71,8 @@ class ShardStream:
         seed: int,
         rank: int = 0,
         generating: Future[None] | None = None,
-        hard: HardPairs | None = None,
     ) -> None:
         self._schedule, self._config = schedule, config
-        self._hard = hard
-        self._paths = {path.name: path for path in (*schedule.paths, *schedule.world_paths)}
-        self._drawn: dict[int, tuple[Key, ...]] = {}
         self._generating = generating
         self._closed = threading.Event()
         self._seed = (seed,) if rank == 0 else (seed, rank)
@@ -98,10 +89,6 @@ class ShardStream:
         self._next = (step + 1, self._pool.submit(self._make, step + 1))
         return current.result()
 
-    def drawn(self, step: int) -> tuple[Key, ...]:
-        """The pairs of a step's batch, which is asked once, after the batch."""
-        return self._drawn.pop(step)
-
     def close(self) -> None:
         """Stop preparing batches."""
         self._closed.set()
@@ -109,37 +96,21 @@ class ShardStream:
 
     def _make(self, step: int) -> Batch:
         rng = np.random.default_rng((*self._seed, step))
-        size = draw_size(step, self._config.sizes, rng)
-        config = self._config
-        if size is not None:
-            config = replace(config, crop=size.crop, batch=size.batch)
         samples: list[TrainingSample] = []
-        keys: list[Key] = []
-        for _ in range(_MOST_DRAWS * config.batch):
-            key = self._draw(step, rng)
-            if key is None:
+        for _ in range(_MOST_DRAWS * self._config.batch):
+            pairs = self._shard(self._schedule.draw(step, rng))
+            if not pairs:
                 continue
-            pair = self._shard(self._paths[key[0]])[key[1]]
-            made = crop_pair(pair if size is None else resized(pair, size.width), config, rng)
+            made = crop_pair(pairs[int(rng.integers(len(pairs)))], self._config, rng)
             if made is not None:
                 samples.append(made)
-                keys.append(key)
-            if len(samples) == config.batch:
-                self._drawn[step] = tuple(keys)
+            if len(samples) == self._config.batch:
                 return collate(samples)
         raise SequenceError(
             f"step {step}: hardly a pair of the run's shards has {self._config.anchors} anchors "
-            f"in a crop of {config.crop}: enlarge `crop`, or look at them "
+            f"in a crop of {self._config.crop}: enlarge `crop`, or look at them "
             "with `contact-sheet`"
         )
-
-    def _draw(self, step: int, rng: np.random.Generator) -> Key | None:
-        hard = None if self._hard is None else self._hard.draw(step, rng)
-        if hard is not None:
-            return hard
-        path = self._schedule.draw(step, rng)
-        pairs = self._shard(path)
-        return (path.name, int(rng.integers(len(pairs)))) if pairs else None
 
     def _shard(self, path: Path) -> list[Pair]:
         if path in self._cache:
@@ -147,12 +118,11 @@ class ShardStream:
             return self._cache[path]
         self._await(path)
         pairs = read_shard(path)
-        crops = [(s.width, s.crop[1]) for s in self._config.sizes] or [self._config.crop]
-        width, height = (max(sides) for sides in zip(*crops, strict=True))
+        width, height = self._config.crop
         if pairs and (pairs[0].camera.width < width or pairs[0].camera.height < height):
             size = f"{pairs[0].camera.width}x{pairs[0].camera.height}"
             raise SequenceError(
-                f"{path}: its images are {size}, less than `crop` or `sizes` ask: {width}x{height}"
+                f"{path}: its images are {size}, less than `crop` asks: {width}x{height}"
             )
         self._cache[path] = pairs
         if len(self._cache) > self._config.cached_shards:

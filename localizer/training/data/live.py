@@ -144,10 +144,6 @@ class LiveStream:
         for k, scene in enumerate((place.survey, *(day[0] for day in place.days))):
             self._pool.put(first + k, scene)
 
-    def show_places_of(self, other: LiveStream) -> None:
-        """Deal pairs of the places that another stream has made, as they are there now."""
-        self._places, self._pool = other._places, other._pool
-
     def pairs(
         self, step: int, count: int, rng: np.random.Generator, noise: torch.Generator
     ) -> Iterator[Pair]:

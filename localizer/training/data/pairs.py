@@ -8,7 +8,7 @@ weather and sensor are put on the query afterwards (`localizer.synth.appearance.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -34,7 +34,6 @@ from localizer.training.places.objects import new_buildings, parked_cars
 from localizer.training.places.photos import PhotoLibrary
 from localizer.training.places.place import TrainingPlace
 from localizer.training.places.seasons import season_shift
-from localizer.training.places.styles import LAMPS, STYLES, SUNNY, styled_ground, styled_light
 from localizer.types import Float32, Image
 
 SEASON, OUTDATED, COMBINED = "season", "outdated map", "combined"
@@ -71,8 +70,7 @@ class SceneConfig:
     there are lights; else drawn. motion: metres and
     degrees between the two views, exactly, instead of the training's mixture. shared_detail: the
     query repeats the map's fine texture and the map is nearly as sharp as the query; no flight is
-    like that, it is kept as the easier condition of earlier reports. styles: share of the drawn
-    days that have one of `STYLES`; 0 draws nothing, so that places stay as they were.
+    like that, it is kept as the easier condition of earlier reports.
     """
 
     cells: int = 1024
@@ -86,19 +84,17 @@ class SceneConfig:
     conditions: tuple[str, ...] = ()
     motion: tuple[float, float] | None = None
     shared_detail: bool = False
-    styles: float = 0.0
 
 
 @dataclass(frozen=True)
 class FlightDay:
     """The day of a flight: weather or light (of `CONDITIONS`), buildings gone and new, vegetation
-    of another season (None: drawn), and one of `STYLES` or None.
+    of another season (None: drawn).
     """
 
     weather: str
     outdated: bool
     season: bool | None
-    style: str | None = None
 
 
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
@@ -113,7 +109,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             if config.conditions:
                 visit = visit_of(rng, config.conditions[k // config.queries_per_light])
             else:
-                visit = draw_visit(rng, config.styles)
+                visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
             lived, season = lived_scene(rng, place, visit, fixed, config.shared_detail)
         pair = draw_views(rng, survey, lived, config)
@@ -141,14 +137,9 @@ def draw_place(
     return generated_place(rng, n, cell), "generated"
 
 
-def draw_visit(rng: np.random.Generator, styles: float = 0.0) -> FlightDay:
-    """The day of a training flight. styles: as of `SceneConfig`."""
-    visit = FlightDay(draw_condition(rng), bool(rng.random() < 0.4), None)
-    if styles > 0.0 and rng.random() < styles:
-        style = str(rng.choice(STYLES))
-        weather = "night" if style == LAMPS else "day" if style in SUNNY else visit.weather
-        return replace(visit, weather=weather, style=style)
-    return visit
+def draw_visit(rng: np.random.Generator) -> FlightDay:
+    """The day of a training flight."""
+    return FlightDay(draw_condition(rng), bool(rng.random() < 0.4), None)
 
 
 def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
@@ -209,9 +200,6 @@ def lived_scene(
     if not shared_detail:
         albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
         land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
-    if visit.style is not None:
-        ground = styled_ground(land.albedo, place, visit.style, rng)
-        land = Land(land.height, ground, land.cell_m)
     if outdated:
         prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
         prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
@@ -223,12 +211,6 @@ def lived_scene(
         direct = 0.5  # moonlight
     elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
     sun = _sun(rng, elevation, direct)
-    if visit.style is not None and light is None:
-        styled = styled_light(sun, place, visit.style, rng)
-        sky = (0.03, 0.03, 0.05) if visit.style == LAMPS else _sky(rng, condition)
-        return light_scene(
-            compose(land, prisms), styled.light, sky, sunlit=styled.sunlit, glow=styled.glow
-        ), season
     return light_scene(compose(land, prisms), light or sun, _sky(rng, condition)), season
 
 
@@ -255,13 +237,11 @@ def draw_condition(rng: np.random.Generator) -> str:
 
 
 def visit_of(rng: np.random.Generator, condition: str) -> FlightDay:
-    """The visit of a test condition: a weather or one of `STYLES` alone, `SEASON` or `OUTDATED` on
-    a day, or any weather together with both (`COMBINED`).
+    """The visit of a test condition: a weather alone, `SEASON` or `OUTDATED` on a day, or any
+    weather together with both (`COMBINED`).
     """
     if condition == COMBINED:
         return FlightDay(str(rng.choice(CONDITIONS)), True, True)
-    if condition in STYLES:
-        return FlightDay("night" if condition == LAMPS else "day", False, False, condition)
     if condition in (SEASON, OUTDATED):
         return FlightDay("day", condition == OUTDATED, condition == SEASON)
     return FlightDay(condition, False, False)

@@ -7,30 +7,21 @@ from dataclasses import replace
 
 from localizer.training.config import DataSection, LiveSection, TrainConfig
 from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream
-from localizer.training.data.hard import HardPairs, HardShare
 from localizer.training.data.live import LivePlan, LiveStream
 from localizer.training.data.pairs import SceneConfig
 from localizer.training.data.seeds import FIRST_WORLD_SEED
 from localizer.training.data.shards import PhotoSource, shard_path, world_shard_paths
-from localizer.training.data.sizes import Size
 from localizer.training.distributed import TrainingProcess
 
 
 def open_stream(
-    config: TrainConfig,
-    workers: TrainingProcess,
-    generating: Future[None] | None,
-    hard: HardPairs | None = None,
+    config: TrainConfig, workers: TrainingProcess, generating: Future[None] | None
 ) -> ShardStream | LiveStream:
-    """The batches of one process of a run. generating: what writes missing shards alongside; hard:
-    what the run found hard, of `hard_pairs`.
-    """
+    """The batches of one process of a run. generating: what writes missing shards alongside."""
     data, o = config.data, config.optimizer
     loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
     if isinstance(data, DataSection):
-        sizes = tuple(Size(s.first_step, s.width, s.crop, s.batch) for s in o.sizes)
-        loader = replace(loader, sizes=sizes)
-        return ShardStream(schedule(data), loader, config.seed, workers.rank, generating, hard)
+        return ShardStream(schedule(data), loader, config.seed, workers.rank, generating)
     plan = LivePlan(
         data.first_seed, data.scenes, data.active, data.steps_per_scene, data.flight_days
     )
@@ -38,13 +29,6 @@ def open_stream(
         plan, scene_config(data), photo_source(data), loader, config.seed, workers.device,
         rank=workers.rank, count=workers.count, workers=data.workers,
     )  # fmt: skip
-
-
-def hard_pairs(data: DataSection | LiveSection) -> HardPairs | None:
-    """What remembers a run's hard pairs, if it asks for them."""
-    if not isinstance(data, DataSection) or data.hard is None:
-        return None
-    return HardPairs(HardShare(data.hard.share, data.hard.ranks, data.hard.every_steps))
 
 
 def schedule(data: DataSection) -> Schedule:
@@ -63,9 +47,7 @@ def schedule(data: DataSection) -> Schedule:
 
 def scene_config(data: DataSection | LiveSection) -> SceneConfig:
     """What the generator needs of a run's configuration."""
-    scenes = SceneConfig(
-        photo_share=data.photo_share, light_variety=data.light_variety, styles=data.styles
-    )
+    scenes = SceneConfig(photo_share=data.photo_share, light_variety=data.light_variety)
     width, height = data.image
     scenes = replace(scenes, width=width, height=height)
     return scenes if isinstance(data, DataSection) else replace(scenes, cells=data.cells)

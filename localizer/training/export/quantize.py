@@ -18,6 +18,9 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 
 from localizer.errors import ModelError
 from localizer.features.extractor import OnnxExtractor, read_model_info
+from localizer.synth.appearance.model import apply_appearance, sample_appearance
+from localizer.training.data.batches import tamed
+from localizer.training.data.shards import read_shard
 from localizer.types import Image
 
 _QUANTIZED = ("/stage", "/lateral", "/down", "/merge")  # in names of convolutions and ReLUs
@@ -31,6 +34,15 @@ class _Images(CalibrationDataReader):  # type: ignore[misc]
     def get_next(self) -> dict[str, Image] | None:
         image = next(self._left, None)
         return None if image is None else {"image": image[None]}
+
+
+def _images(shards: Sequence[Path]) -> Iterator[Image]:
+    for k, path in enumerate(shards):
+        rng = np.random.default_rng(k)
+        for pair in read_shard(path)[:1]:
+            look = tamed(sample_appearance(rng), pair.query_depth)
+            yield pair.reference
+            yield apply_appearance(pair.query, pair.query_depth, look, rng)
 
 
 def _join(graph: onnx.GraphProto, first: str, second: str) -> None:
@@ -54,10 +66,12 @@ def _join(graph: onnx.GraphProto, first: str, second: str) -> None:
     graph.node.remove(other)
 
 
-def quantize(model: Path, out: Path, images: Sequence[Image]) -> float:
-    """Write the quantized `model` and its JSON; returns the least mean cosine of any level of the
-    images (each (H, W, 3) uint8), whose activations set the scales, to the features of `model`.
+def quantize(model: Path, out: Path, shards: Sequence[Path]) -> float:
+    """Write the quantized `model` and its JSON. The activations of the first pair of each of the
+    shards, a reference and a degraded query, set the scales; returns the least mean cosine of any
+    level of these images to the features of `model`.
     """
+    images = list(_images(shards))
     info = read_model_info(model)
     graph = onnx.load(str(model))
     names = [node.name for node in graph.graph.node if node.op_type in ("Conv", "Relu")

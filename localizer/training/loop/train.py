@@ -14,15 +14,13 @@ from torch import Tensor, nn
 from localizer.errors import ModelError
 from localizer.training.checkpoint import fill, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
-from localizer.training.data.batches import ShardStream
-from localizer.training.data.streams import hard_pairs, open_stream
+from localizer.training.data.streams import open_stream
 from localizer.training.distributed import TrainingProcess
 from localizer.training.loop.log import append
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 
 _log = logging.getLogger(__name__)
-_LOST = 3.0  # of its begin: a pair that ended this far off counts as no worse than another
 
 
 class Trainer:
@@ -55,7 +53,6 @@ class Trainer:
             lr=config.optimizer.learning_rate,
             weight_decay=config.optimizer.weight_decay,
         )
-        self.hard = hard_pairs(config.data)
         self.step = 0
         self.seconds = self.core_seconds = 0.0  # by the clock, and of the processor
         self._resume()
@@ -74,16 +71,13 @@ class Trainer:
         if steps is not None:
             last = min(last, self.step + steps)
         self.config.output.mkdir(parents=True, exist_ok=True)  # its error now, not after hours
-        stream = open_stream(self.config, self.workers, generating, self.hard)
+        stream = open_stream(self.config, self.workers, generating)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
         core_began = time.process_time() - self.core_seconds
         try:
             while self.step < last:
-                row, errors = self._train_step(stream.batch(self.step))
-                rows.append(row)
-                if self.hard is not None and isinstance(stream, ShardStream):
-                    self.hard.note(self.step, stream.drawn(self.step), errors)
+                rows.append(self._train_step(stream.batch(self.step)))
                 self.step += 1
                 self.seconds = time.monotonic() - began
                 self.core_seconds = time.process_time() - core_began
@@ -94,12 +88,12 @@ class Trainer:
         finally:
             stream.close()
 
-    def _train_step(self, batch: Batch) -> tuple[dict[str, float], list[float]]:
+    def _train_step(self, batch: Batch) -> dict[str, float]:
         o = self.config.optimizer
         batch = Batch(*(t.to(self.device) for t in vars(batch).values()))
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.step, o)
-        loss, parts, errors = self._loss(batch)
+        loss, parts = self._loss(batch)
         self.optimizer.zero_grad()
         loss.backward()
         parameters = [*self.model.parameters(), self.log_scale]
@@ -110,10 +104,10 @@ class Trainer:
             self._update_average()
         else:
             _log.warning("step %d skipped: gradient is not finite", self.step)
-        return parts | {"loss": float(loss.detach()), "gradient": float(norm)}, errors.tolist()
+        return parts | {"loss": float(loss.detach()), "gradient": float(norm)}
 
-    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float], Tensor]:
-        """The loss, its parts, and how far off each pair ends, as a share of its begin."""
+    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """The loss and its parts."""
         o = self.config.optimizer
         pairs = batch.points.shape[0]
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
@@ -121,7 +115,6 @@ class Trainer:
         ramp = alignment_ramp(self.step, o)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         total, parts = batch.points.new_zeros(()), {}
-        left = batch.points.new_zeros(pairs)
         strides = self.model.strides
         for k, ((features, confidence), stride) in enumerate(zip(levels, strides, strict=True)):
             at = batch.reference_pixels / stride
@@ -142,8 +135,7 @@ class Trainer:
             parts[f"contrast_{k}"] = float(contrast.detach())
             parts[f"alignment_{k}"] = float(alignment.detach())
             parts[f"error_px_{k}"] = float(error.mean())
-            left += (error / max(o.start_error_px[k], 1e-3)).clamp(max=_LOST) / len(strides)
-        return total, parts, left
+        return total, parts
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (10 + self.step))
@@ -157,27 +149,20 @@ class Trainer:
                     mean.copy_(value)
 
     def _save(self, *, at_the_end: bool) -> None:
-        kept = self.config.kept_steps is not None and self.step % self.config.kept_steps == 0
         due = at_the_end or self.step % self.config.checkpoint_steps == 0
-        if self.workers.rank > 0 or not (kept or due):
+        if self.workers.rank > 0 or not due:
             return
-        if kept:
-            name = f"{self.config.name}-{self.step:06d}.pt"
-            write_checkpoint(self.checkpoint.with_name(name), self._state())
-        write_checkpoint(self.checkpoint, self._state())
-
-    def _state(self) -> dict[str, object]:
-        return {
+        state = {
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),
             "log_scale": self.log_scale.detach(),
             "optimizer": self.optimizer.state_dict(),
-            "hard": None if self.hard is None else self.hard.state(),
             "step": self.step,
             "seconds": self.seconds,
             "core_seconds": self.core_seconds,
             "config": self.config.model_dump(mode="json"),
         }
+        write_checkpoint(self.checkpoint, state)
 
     def _resume(self) -> None:
         if not self.checkpoint.exists():
@@ -191,8 +176,6 @@ class Trainer:
             self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.seconds = int(state["step"]), float(state["seconds"])
             self.core_seconds = float(state.get("core_seconds", self.seconds))
-            if self.hard is not None and state.get("hard"):
-                self.hard.restore(state["hard"])
         except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(
                 f"{self.checkpoint}: no state to continue from ({type(error).__name__}: {error}); "

@@ -160,23 +160,6 @@ def fuse(model: nn.Module) -> nn.Module:
     return model
 
 
-def multiply_adds(model: nn.Module, height: int, width: int) -> int:
-    """Multiply-adds of the convolutions for one image."""
-    total = 0
-
-    def count(module: nn.Module, _inputs: object, output: Tensor) -> None:
-        nonlocal total
-        if isinstance(module, nn.Conv2d):
-            total += output[0].numel() * module.weight[0].numel()
-
-    hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, nn.Conv2d)]
-    with torch.no_grad():
-        model(torch.zeros(1, 3, height, width))
-    for hook in hooks:
-        hook.remove()
-    return total
-
-
 def _unit(inputs: int, outputs: int, branches: int, stride: int) -> list[nn.Module]:
     """Depthwise 3 x 3, then pointwise."""
     return [

@@ -1,17 +1,16 @@
-"""How the vehicle moves: along a straight leg, at a velocity or straight down; and its heading."""
+"""How the vehicle moves: along a straight leg or straight down; and its heading."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import atan2, cos, hypot, radians
+from math import atan2, cos, hypot
 
 import numpy as np
 
 from sitl.embedded.control.controller import Carrot, ControlLimits, PositionController, Vector
-from sitl.embedded.control.mode import RcInput
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.physics.dynamics import GRAVITY, MASS, MOTOR_MAX, TICK_S
+from sitl.embedded.physics.dynamics import TICK_S
 from sitl.embedded.physics.rotation import Array, euler, quaternion
 
 _LAND_FINAL_HEIGHT = 10.0  # m; below it LAND_SPEED
@@ -28,10 +27,8 @@ class Guidance:
     estimator: Estimator
     controller: PositionController = field(default_factory=PositionController)
     carrot: Carrot | None = None
-    velocity_target: Vector | None = None
     speed_override: float | None = None
     yaw_target: float | None = None
-    yaw_rate: float | None = None
     landing: bool = False
     returning: bool = False
 
@@ -98,42 +95,20 @@ class Guidance:
         gap = sum((a - b) ** 2 for a, b in zip(end, self.estimator.position, strict=True)) ** 0.5
         return self.carrot.arrived and gap < radius
 
-    def stabilize(self, rc: RcInput) -> Array:
-        """Attitude quaternion and thrust (5,) from the sticks."""
-        self.controller.turn(self.controller.yaw_rad + radians(90.0) * rc.yaw * TICK_S, TICK_S)
-        lean = radians(30.0)
-        q = quaternion(rc.roll * lean, rc.pitch * lean, self.controller.yaw_rad)
-        # Half throttle hovers, as with a learnt MOT_THST_HOVER.
-        hover = MASS * GRAVITY
-        top = 4 * MOTOR_MAX - hover
-        thrust = (
-            2 * rc.throttle * hover if rc.throttle < 0.5 else hover + (2 * rc.throttle - 1) * top
-        )
-        return np.array([*q, thrust])
-
     def steer(self, home_down: float, *, level_when_lost: bool) -> Array:
-        """Attitude quaternion and thrust (5,) that follow the carrot (or a velocity, or straight
-        down), holding the heading target. home_down: of home, NED metres; level_when_lost: stay
+        """Attitude quaternion and thrust (5,) that follow the carrot (or straight down), holding
+        the heading target. home_down: of home, NED metres; level_when_lost: stay
         level without a position, and let the wind take the vehicle.
         """
         limits, position = self.limits, self.estimator.position
-        if self.yaw_rate is not None:
-            self.yaw_target = self.controller.yaw_rad + self.yaw_rate * TICK_S
         if self.yaw_target is not None:
             self.controller.turn(self.yaw_target, TICK_S)
-        wanted: Vector
-        feedforward: Vector = (0.0, 0.0, 0.0)
-        if self.velocity_target is not None:
-            wanted = self.velocity_target
-            self.hold_here()
-        else:
-            carrot = self.carrot or Carrot(position, position)
-            carrot.move(position, limits, TICK_S)
-            feedforward = carrot.acceleration
-            error = tuple(a - b for a, b in zip(carrot.position, position, strict=True))
-            wanted = self.controller.velocity_for(
-                (error[0], error[1], error[2]), carrot.velocity, limits
-            )
+        carrot = self.carrot or Carrot(position, position)
+        carrot.move(position, limits, TICK_S)
+        error = tuple(a - b for a, b in zip(carrot.position, position, strict=True))
+        wanted = self.controller.velocity_for(
+            (error[0], error[1], error[2]), carrot.velocity, limits
+        )
         if self.landing:
             wanted = (wanted[0], wanted[1], self._landing_speed(home_down))
         roll, pitch, _ = euler(self.estimator.output[0:4])
@@ -142,7 +117,9 @@ class Guidance:
         )
         if not self.estimator.position_valid and level_when_lost:
             return np.array([*quaternion(0.0, 0.0, self.controller.yaw_rad), thrust])
-        lean = self.controller.horizontal(wanted, self.estimator.velocity, feedforward, TICK_S)
+        lean = self.controller.horizontal(
+            wanted, self.estimator.velocity, carrot.acceleration, TICK_S
+        )
         return np.array([*self.controller.lean(lean, self.yaw), thrust])
 
     def _landing_speed(self, home_down: float) -> float:

@@ -1,8 +1,7 @@
-"""Flight modes and stick positions."""
+"""Flight modes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 
 
@@ -24,13 +23,3 @@ class Mode(IntEnum):
     def armable(self) -> bool:
         """Whether the vehicle may be armed in it."""
         return self in (Mode.STABILIZE, Mode.GUIDED)
-
-
-@dataclass(frozen=True)
-class RcInput:
-    """Stick positions: -1 to 1, throttle 0 to 1."""
-
-    roll: float = 0.0
-    pitch: float = 0.0
-    yaw: float = 0.0
-    throttle: float = 0.0

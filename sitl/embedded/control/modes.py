@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from math import radians
 
@@ -12,7 +12,7 @@ import numpy as np
 from sitl.embedded.control import mission as mis
 from sitl.embedded.control.controller import Vector
 from sitl.embedded.control.guidance import Guidance
-from sitl.embedded.control.mode import Mode, RcInput
+from sitl.embedded.control.mode import Mode
 from sitl.embedded.ekf.ekf_check import EkfCheck
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.parameters import Parameters
@@ -47,7 +47,6 @@ class FlightModes:
     mode: Mode = Mode.STABILIZE
     armed: bool = False
     home: Location | None = None
-    rc: RcInput = field(default_factory=RcInput)
     on_ground: bool = True
     mission_index: int = 0
     _flying: bool = False
@@ -79,8 +78,6 @@ class FlightModes:
     def _enter(self, mode: Mode) -> None:
         self.mode = mode
         self._guidance.returning = mode is Mode.RTL
-        self._guidance.velocity_target = None
-        self._guidance.yaw_rate = None
         self._guidance.landing = mode is Mode.LAND
         self._guidance.yaw_target = None
         self._guidance.hold_here()
@@ -124,19 +121,7 @@ class FlightModes:
         """Fly to NED metres about the EKF origin in GUIDED."""
         if not self._guided:
             return False
-        self._guidance.velocity_target = None
-        self._guidance.yaw_rate = None
         self._guidance.fly(target)
-        if yaw_rad is not None:
-            self._guidance.yaw_target = yaw_rad
-        return True
-
-    def fly_velocity(self, velocity: Vector, yaw_rad: float | None, yaw_rate: float | None) -> bool:
-        """Fly at a NED velocity in GUIDED."""
-        if not self._guided:
-            return False
-        self._guidance.velocity_target = velocity
-        self._guidance.yaw_rate = yaw_rate
         if yaw_rad is not None:
             self._guidance.yaw_target = yaw_rad
         return True
@@ -158,7 +143,6 @@ class FlightModes:
         if relative:
             angle = self._guidance.yaw + (angle if direction >= 0 else -angle)
         self._guidance.yaw_target = wrap_pi(angle)
-        self._guidance.yaw_rate = None
 
     def change_speed(self, speed_m_s: float) -> bool:
         """MAV_CMD_DO_CHANGE_SPEED."""
@@ -173,11 +157,6 @@ class FlightModes:
         return self._flying
 
     @property
-    def speed_limit(self) -> float:
-        """Horizontal, m/s, of the present mode."""
-        return self._guidance.limits.speed
-
-    @property
     def target(self) -> Vector | None:
         """Where the vehicle is headed, NED metres about the origin."""
         return self._guidance.carrot.end if self._guidance.carrot else None
@@ -188,15 +167,11 @@ class FlightModes:
         """Attitude quaternion and total thrust (5,) for the next tick."""
         self._time = time_s
         self._set_home()
-        if not self.armed:
-            return np.array([*quaternion(0.0, 0.0, self._guidance.yaw), 0.0])
-        self._watch_ground()
-        if not self.armed:
-            return np.array([*quaternion(0.0, 0.0, self._guidance.yaw), 0.0])
+        if self.armed:
+            self._watch_ground()
         if self.mode is Mode.STABILIZE:
-            self._flying = not self.on_ground
-            return self._guidance.stabilize(self.rc)
-        if not self._flying:
+            self._flying = self.armed and not self.on_ground
+        if not (self.armed and self._flying) or self.mode is Mode.STABILIZE:  # sticks are down
             return np.array([*quaternion(0.0, 0.0, self._guidance.yaw), 0.0])
         if self.mode is Mode.AUTO:
             self._run_mission()
@@ -245,8 +220,7 @@ class FlightModes:
             self.notify(INFO, "Disarming motors")
             self.disarm()
         delay = self.parameters["DISARM_DELAY"]
-        idle = self.mode is not Mode.STABILIZE or self.rc.throttle < 0.05
-        if not self._flying and self.on_ground and idle and delay > 0:
+        if not self._flying and self.on_ground and delay > 0:
             if self._time - self._armed_since > delay:
                 self.notify(INFO, "Disarming motors")
                 self.disarm()

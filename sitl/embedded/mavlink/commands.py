@@ -7,7 +7,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
-from sitl.embedded.control.mode import Mode, RcInput
+from sitl.embedded.control.mode import Mode
 from sitl.embedded.mavlink.gimbal_commands import GimbalCommands
 from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
 from sitl.embedded.mavlink.navigation_commands import NavigationCommands
@@ -17,7 +17,6 @@ from sitl.embedded.mavlink.telemetry import TelemetryBuilder
 from sitl.embedded.severity import INFO, WARNING
 
 _FORCE_ARM = 21196.0
-_EKF_SOURCE_SET_OPTION = 90
 
 
 class Commands:
@@ -25,7 +24,6 @@ class Commands:
 
     def __init__(self, vehicle: Aircraft, telemetry: TelemetryBuilder) -> None:
         self._vehicle, self._telemetry = vehicle, telemetry
-        self._rc8: int | None = None
         navigation, gimbal = NavigationCommands(vehicle), GimbalCommands(vehicle)
         self._messages: dict[str, Handler] = {
             **navigation.messages,
@@ -40,7 +38,6 @@ class Commands:
             "VISION_POSITION_DELTA": self._position_delta,
             "GPS_INPUT": self._gps_input,
             "TIMESYNC": self._timesync,
-            "RC_CHANNELS_OVERRIDE": self._rc,
             "REQUEST_DATA_STREAM": self._data_stream,
         }
         m = mavlink
@@ -155,28 +152,7 @@ class Commands:
                 mavlink.MAVLink_timesync_message(self._vehicle.time_ms * 1_000_000, message.ts1)
             )
 
-    # --- RC, streams -------------------------------------------------------------------------
-
-    def _rc(self, _link: SerialPort, message: Any) -> None:
-        v = self._vehicle
-
-        def stick(value: int, old: float) -> float:
-            return old if value in (0, 65535) else min(max((value - 1500) / 500.0, -1.0), 1.0)
-
-        old = v.modes.rc
-        v.modes.rc = RcInput(
-            stick(message.chan1_raw, old.roll),
-            stick(message.chan2_raw, old.pitch),
-            stick(message.chan4_raw, old.yaw),
-            (stick(message.chan3_raw, 2 * old.throttle - 1) + 1) / 2,
-        )
-        channel = message.chan8_raw
-        if v.parameters["RC8_OPTION"] != _EKF_SOURCE_SET_OPTION or channel in (0, 65535):
-            return
-        position = 1 if channel < 1200 else 3 if channel > 1800 else 2
-        if position != self._rc8:
-            self._rc8 = position
-            self._vehicle.use_source(position)
+    # --- streams -----------------------------------------------------------------------------
 
     def _data_stream(self, link: SerialPort, message: Any) -> None:
         """REQUEST_DATA_STREAM, the old way: the groups of status, attitude and position."""

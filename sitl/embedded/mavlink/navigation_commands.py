@@ -21,8 +21,7 @@ from sitl.embedded.mavlink.handling import (
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.geodesy import Location
 
-_IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_YAW, _IGNORE_YAW_RATE = 7, 7 << 3, 1 << 10, 1 << 11
-_LOCAL_NED, _LOCAL_OFFSET_NED = 1, 7
+_IGNORE_POSITION, _IGNORE_YAW = 7, 1 << 10
 _SET_GLOBAL_ORIGIN = 611  # MAV_CMD_DO_SET_GLOBAL_ORIGIN, newer than pymavlink's dialect
 
 
@@ -33,7 +32,6 @@ class NavigationCommands:
         self._vehicle = vehicle
         self.messages: dict[str, Handler] = {
             "SET_GPS_GLOBAL_ORIGIN": self._set_origin_message,
-            "SET_POSITION_TARGET_LOCAL_NED": self._target_local,
             "SET_POSITION_TARGET_GLOBAL_INT": self._target_global,
             "MISSION_SET_CURRENT": self._mission_set_current,
         }
@@ -128,37 +126,9 @@ class NavigationCommands:
         yaw = None if isnan(command.param4) else radians(command.param4)
         return ACCEPTED if v.modes.go_to(location, yaw) else DENIED
 
-    def _target_local(self, _link: SerialPort, message: Any) -> None:
-        modes, here = self._vehicle.modes, self._vehicle.estimator.position
-        if message.coordinate_frame not in (_LOCAL_NED, _LOCAL_OFFSET_NED):
-            return
-        target = (message.x, message.y, message.z)
-        if message.coordinate_frame == _LOCAL_OFFSET_NED:
-            target = (here[0] + message.x, here[1] + message.y, here[2] + message.z)
-        yaw, rate = self._yaw_of(message)
-        if not message.type_mask & _IGNORE_POSITION:
-            modes.go_to_local(target, yaw)
-        elif not message.type_mask & _IGNORE_VELOCITY:
-            modes.fly_velocity((message.vx, message.vy, message.vz), yaw, rate)
-
     def _target_global(self, _link: SerialPort, message: Any) -> None:
-        modes = self._vehicle.modes
-        yaw, rate = self._yaw_of(message)
-        if not message.type_mask & _IGNORE_POSITION:
-            location = location_of(
-                self._vehicle.modes.home,
-                message.coordinate_frame,
-                message.lat_int,
-                message.lon_int,
-                message.alt,
-            )
-            if location is not None:
-                modes.go_to(location, yaw)
-        elif not message.type_mask & _IGNORE_VELOCITY:
-            modes.fly_velocity((message.vx, message.vy, message.vz), yaw, rate)
-
-    @staticmethod
-    def _yaw_of(message: Any) -> tuple[float | None, float | None]:
-        yaw = None if message.type_mask & _IGNORE_YAW else message.yaw
-        rate = None if message.type_mask & _IGNORE_YAW_RATE else message.yaw_rate
-        return yaw, rate
+        """A place to fly to; velocities are not followed."""
+        modes, frame = self._vehicle.modes, message.coordinate_frame
+        location = location_of(modes.home, frame, message.lat_int, message.lon_int, message.alt)
+        if location is not None and not message.type_mask & _IGNORE_POSITION:
+            modes.go_to(location, None if message.type_mask & _IGNORE_YAW else message.yaw)

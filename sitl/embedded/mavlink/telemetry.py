@@ -38,7 +38,6 @@ class TelemetryBuilder:
         self._builders: dict[int, Callable[[], Any]] = {
             m.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             m.MAVLINK_MSG_ID_SYS_STATUS: self._sys_status,
-            m.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
             m.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
             m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
             m.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._local_position,
@@ -56,7 +55,6 @@ class TelemetryBuilder:
             m.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: self._gimbal_attitude,
             m.MAVLINK_MSG_ID_GIMBAL_MANAGER_STATUS: self._gimbal_manager_status,
             m.MAVLINK_MSG_ID_GIMBAL_MANAGER_INFORMATION: self._gimbal_manager_information,
-            m.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: self._position_target,
         }
 
     def knows(self, message_id: int) -> bool:
@@ -112,9 +110,6 @@ class TelemetryBuilder:
         return mavlink.MAVLink_sys_status_message(
             present, present, healthy, 100, 12600, 1000, 100, 0, 0, 0, 0, 0, 0
         )
-
-    def _system_time(self) -> Any:
-        return mavlink.MAVLink_system_time_message(0, self._vehicle.time_ms)
 
     def _version(self) -> Any:
         major, minor, patch, kind = FIRMWARE_VERSION
@@ -295,15 +290,6 @@ class TelemetryBuilder:
         v = self._vehicle
         return mavlink.MAVLink_mission_current_message(
             v.modes.mission_index, max(0, len(v.mission.items) - 1)
-        )
-
-    def _position_target(self) -> Any | None:
-        v = self._vehicle
-        target = v.modes.target
-        if target is None:
-            return None
-        return mavlink.MAVLink_position_target_local_ned_message(
-            v.time_ms, 1, 0xDF8, *target, 0, 0, 0, 0, 0, 0, 0, 0
         )
 
     # --- gimbal ------------------------------------------------------------------------------

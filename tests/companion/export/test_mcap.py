@@ -13,15 +13,14 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mcap_protobuf")
 pytest.importorskip("foxglove_schemas_protobuf")
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from companion.cli.commands import app
 from companion.config import CompanionConfig, RecordConfig
 from companion.errors import RecordError, ReportError
+from companion.export.mcap_export import export_mcap
 from companion.flight.recorder import RecordKeeper
-from companion.reporting.mcap_export import export_mcap
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
@@ -56,8 +55,8 @@ def _diagnostics(path):
 def flight(tmp_path, small_assets):
     """Fly a record of two estimates, the second refused; returns its folder."""
 
-    def fly(*, mcap=False, close=True):
-        record = RecordConfig(folder=tmp_path / "flight", snapshot_interval_s=1.0, mcap=mcap)
+    def fly(*, close=True):
+        record = RecordConfig(folder=tmp_path / "flight", snapshot_interval_s=1.0)
         config = CompanionConfig(
             map=small_assets.map_cache, record=record,
             camera={"source": "udp://127.0.0.1:1", "model": MODEL},
@@ -79,7 +78,6 @@ def flight(tmp_path, small_assets):
             TargetFix("car", np.array([20.0, 5.0, 1.0]), np.eye(3), (3.0, 4.0), later_ns)
         )
         recorder.event("warning", "no fixes")
-        recorder.text(4, "EKF3 lane switch 1", "1/1")
         recorder.snapshot(Frame(np.full((48, 64, 3), 90, np.uint8), BEGIN_NS, camera, 0))
         if close:
             keeper.close()
@@ -182,32 +180,6 @@ def test_mavlink_text_and_the_autopilots_place_come_from_the_tlog(flight, tmp_pa
     assert len(moved["/mavlink/text"]) == 1
 
 
-def test_in_flight_the_same_is_written_and_a_loss_of_power_leaves_what_was_written(
-    flight, tmp_path
-):
-    keeper = flight(mcap=True)
-    live, _ = _read(keeper.folder / "record.mcap")
-    exported, _ = _read(export_mcap(keeper.folder, tmp_path / "again.mcap").path)
-    for topic in ("/vision/pose", "/targets", "/camera/calibration", "/events"):
-        ((schema, logged, said),) = live[topic]
-        ((again, later, read),) = exported[topic]
-        assert schema == again
-        assert abs(logged - later) < 1_000_000  # the two clocks are read once more
-        if topic == "/vision/pose":
-            assert str(said.pose) == str(read.pose)  # each file brings its own classes
-    whole = (keeper.folder / "record.mcap").read_bytes()
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(whole[: len(whole) - 900])  # within the index at its end
-    with cut.open("rb") as file:
-        seen = set()
-        try:
-            for _, channel, _ in NonSeekingReader(file).iter_messages(log_time_order=False):
-                seen.add(channel.topic)
-        except McapError:
-            pass
-    assert {"/vision/pose", "/camera/image", "/events"} <= seen
-
-
 def test_what_is_no_record_says_so_and_leaves_no_file(tmp_path):
     with pytest.raises(RecordError, match="not a flight's record"):
         export_mcap(tmp_path)
@@ -227,14 +199,6 @@ def test_the_command_asks_for_a_format_and_names_the_file(flight):
     # Two estimates, a target, an event, a picture: rows, of which some are several messages.
     assert f"{count} messages of 5 rows" in done.output
     assert "no MAVLink" in done.output  # the .tlog was never written
-
-
-def test_what_the_autopilot_said_stands_in_the_live_file_too(flight):
-    messages, _ = _read(flight(mcap=True).folder / "record.mcap")
-    ((schema, logged, said),) = messages["/mavlink/text"]
-    assert (schema, said.message, said.name) == ("foxglove.Log", "EKF3 lane switch 1", "1/1")
-    assert abs(logged - time.time_ns()) < 600e9
-    assert not (flight().folder / "text.csv").exists()
 
 
 def test_it_is_put_in_the_place_of_no_device_and_no_table(flight, tmp_path):

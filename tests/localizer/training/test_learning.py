@@ -21,7 +21,6 @@ from localizer.training.data.batches import LoaderConfig, collate, crop_pair  # 
 from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
-from localizer.training.export.from_published import shard_images, trainable_network  # noqa: E402
 from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer, perturbed  # noqa: E402
@@ -185,29 +184,8 @@ def test_export_is_checked_against_torch(config: TrainConfig, tmp_path: Path) ->
     assert [level.stride for level in extractor.info.levels] == [8, 4, 2]
     text = model.with_suffix(".json").read_text()
     assert str(config.data.shards) not in text
-    images = list(shard_images(sorted(config.data.shards.glob("*.npz"))))
     smaller = model.with_name("tiny-int8.onnx")
-    assert quantize(model, smaller, images) > 0.99
+    assert quantize(model, smaller, sorted(config.data.shards.glob("*.npz"))) > 0.99
     assert OnnxExtractor(smaller, threads=1).info.name == "tiny-int8"
     with pytest.raises(ModelError, match="0 images"):
         quantize(model, smaller, [])
-
-
-def test_a_published_model_becomes_trainable_again(config: TrainConfig, tmp_path: Path) -> None:
-    trainer = Trainer(config)
-    trainer.run(steps=3)
-    model = tmp_path / "model" / "tiny.onnx"
-    export(trainer.checkpoint, model)
-    rng = np.random.default_rng(0)
-    images = [rng.integers(0, 256, (64, 96, 3), dtype=np.uint8) for _ in range(4)]
-    network = trainable_network(model, images)
-    tensor = torch.from_numpy(np.stack(images).transpose(0, 3, 1, 2)).float() / 255.0
-    with torch.no_grad():
-        restored = network(tensor)
-        expected = trainer.average(tensor)
-        trained = network.train()(tensor)
-    for k, (features, confidence) in enumerate(restored):
-        torch.testing.assert_close(features, expected[k][0], atol=1e-3, rtol=0)
-        torch.testing.assert_close(confidence, expected[k][1], atol=1e-4, rtol=0)
-        # Batch statistics of the same images: about the same function.
-        assert float((features * trained[k][0]).sum(1).mean()) > 0.98

@@ -3,7 +3,7 @@ import pytest
 from companion.reporting.verdicts import advice, compared
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
-from sitl.demo.criteria import ComputingRates, FlightFigures, headline, judge, latency_warning
+from sitl.demo.criteria import ComputingRates, FlightFigures, headline, judge
 
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
@@ -36,18 +36,6 @@ def _missed(**changes):
 )
 def test_each_target_is_missed_for_its_own_reason(changes, missed):
     assert _missed(**changes) == missed
-
-
-@pytest.mark.parametrize(
-    ("p95", "delay", "warns"),
-    [(199, 200, False), (201, 200, True), (249, 300, False), (251, 300, True)],
-)
-def test_late_estimates_are_told_against_the_delay_and_the_filters_limit(p95, delay, warns):
-    text = latency_warning(Spread(100.0, p95, 900.0), delay)
-    assert (text is not None) is warns
-    if text is not None:
-        assert f"{p95} ms" in text
-        assert f"delay_ms {delay}" in text
 
 
 def test_what_was_won_is_said_first_and_with_its_figures():

@@ -79,8 +79,8 @@ def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_pat
     page = write_page(folder).read_text()
     assert "GNSS denied" in page
     assert "point A" in page
-    for name in ("tracks.png", "errors.png", "frames_report.csv", "overlay-0.png"):
-        assert (folder / name).stat().st_size > 0
+    assert "<figure" in page
+    assert (folder / "frames_report.csv").stat().st_size > 0
 
 
 class _BreaksOff(FlightScript):

@@ -1,15 +1,10 @@
-"""The API page, made from the docstrings: ``python -m localizer.api_page docs/reference/api.md``.
-
-A test holds the page equal to what this prints.
-"""
+"""The API page, made from the docstrings."""
 
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Iterator
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -18,7 +13,7 @@ import localizer
 
 _HEAD = """# API of `localizer`
 
-Made from the docstrings by `python -m localizer.api_page docs/reference/api.md`; do not edit.
+Made from the docstrings by `python -m benchmarks.site`; do not edit.
 Everything here is imported as `from localizer import NAME` and is stable; other names may change.
 Frames, heights and time: [architecture.md](../explanation/architecture.md). Angles:
 [angles.md](angles.md). Examples: [examples/](../../examples). One photo
@@ -39,7 +34,7 @@ with open_localizer(cache, camera) as localizer:
 """
 
 
-def page() -> str:
+def api_page() -> str:
     """The whole page."""
     parts = [_HEAD, *(_section(name, getattr(localizer, name)) for name in _documented())]
     errors = (getattr(localizer, name) for name in localizer.__all__ if _is_error(name))
@@ -123,7 +118,3 @@ def _text(value: Any) -> list[str]:
 
 def _flat(value: Any) -> str:
     return " ".join((inspect.getdoc(value) or "").split())
-
-
-if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")

@@ -1,13 +1,8 @@
-"""The reference page of all alerts, made from the catalogue.
-
-python -m companion.alerts.page docs/reference/alerts.md
-"""
+"""The reference page of all alerts, made from the catalogue."""
 
 from __future__ import annotations
 
 import re
-import sys
-from pathlib import Path
 
 from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
 from mavlink_bridge.alerts.catalogue import CATALOGUE, body, cleared
@@ -15,7 +10,7 @@ from mavlink_bridge.alerts.words import MapOffsetUse
 
 _HEAD = f"""# Alerts
 
-Made from the catalogue by `python -m companion.alerts.page`; do not edit. Every text begins with
+Made from the catalogue by `python -m benchmarks.site`; do not edit. Every text begins with
 `{PREFIX.strip()}`. The identifier stands in `events.csv` and `health.json`. *Output held*: nothing
 is sent. *Exclude and reset*: also, the next fix increments `reset_counter`. *Inhibit*: injection
 and the switch to vision do not start; injection that is running continues. *Event*: it happens once
@@ -38,7 +33,7 @@ _ACTIONS = {
 }
 
 
-def page() -> str:
+def alerts_page() -> str:
     """Its text, Markdown."""
     rows = "".join(_row(spec) for spec in CATALOGUE.values())
     meanings = "".join(
@@ -67,12 +62,3 @@ def _value(field: str, spec: AlertSpec) -> str:
         return f"[{MapOffsetUse.APPLIED}]"
     is_number = (isinstance(kind, str) and kind not in ("", "name")) or name == "ratio"
     return "N" if is_number else name.upper()
-
-
-def main() -> None:
-    """Write the page."""
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from companion.errors import ConfigError, RecordError, ReportError
-from companion.flight.recorder import MCAP_NAME
 from companion.offline.record import RecordTables, is_time_ns, read_record
 from companion.offline.tables import Columns
 from localizer.errors import LocalizerError
@@ -25,6 +24,7 @@ from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.tlog import read_tlog
 
 Step = tuple[int, Callable[[], None]]  # time (ns of UTC), what writes it
+MCAP_NAME = "record.mcap"
 _FIX_3D = 3
 
 

@@ -1,4 +1,4 @@
-"""The figure of angles.md can be drawn, and its page says what the conversions say."""
+"""The tables of angles.md say what the conversions say."""
 
 import pytest
 

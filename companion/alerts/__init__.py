@@ -1,1 +1,0 @@
-"""What is made of the alert catalogue (`mavlink_bridge.alerts`): its reference page."""
