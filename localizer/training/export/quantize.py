@@ -27,7 +27,7 @@ _QUANTIZED = ("/stage", "/lateral", "/down", "/merge")  # in names of convolutio
 _LEAST_COSINE = 0.99  # of the features to the float32 ones, mean of an image's level
 
 
-class _Images(CalibrationDataReader):  # type: ignore[misc]
+class _Images(CalibrationDataReader):
     def __init__(self, images: Sequence[Image]) -> None:
         self._left: Iterator[Image] = iter(images)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnxruntime as ort
 import pytest
 
 from localizer.errors import ModelError
@@ -94,9 +95,7 @@ def test_eight_bits_serve_where_they_are_faster(
     if flags:
         (tmp_path / "cpuinfo").write_bytes(b"flags : fpu " + flags)
     monkeypatch.setattr(providers, "_CPUINFO", tmp_path / "cpuinfo")
-    monkeypatch.setattr(
-        providers.ort, "get_available_providers", lambda: [*gpu, "CPUExecutionProvider"]
-    )
+    monkeypatch.setattr(ort, "get_available_providers", lambda: [*gpu, "CPUExecutionProvider"])
     monkeypatch.setattr(extractor, "OnnxExtractor", lambda model, **_: model)
     assert load_extractor().stem == name  # type: ignore[attr-defined]
 
