@@ -29,6 +29,8 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
 
 def made_folder(path: Path, option: str = "") -> Path:
     """The folder, made where it is missing. `ReportError` where it cannot be."""
+    if path.is_file():
+        raise ReportError(f"{option} {path}: is a file; give a folder".lstrip())
     with writing(path, option):
         path.mkdir(parents=True, exist_ok=True)
     return path

@@ -10,13 +10,16 @@ not fit to fly; 130 interrupted (`run` that was flying ends with 0).
 
 from __future__ import annotations
 
+import itertools
+import re
 import signal
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
+from typer.core import TyperGroup
 
 from companion.cli.before.calibrate import app as calibrate_app
 from companion.cli.before.init import init_command
@@ -36,12 +39,26 @@ from companion.cli.replay import replay_command
 from companion.cli.report import report_command
 from companion.cli.run import run_command
 from companion.cli.world import app as world_app
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ConfigError
 from companion.versions import versions
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
+
+class _Commands(TyperGroup):
+    """Refuses options that are no finite numbers: the ranges of options let `nan` pass."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        for option, value in itertools.pairwise(
+            arg for whole in args for arg in whole.split("=", 1)
+        ):
+            if option.startswith("--") and re.fullmatch(r"(?i)[+-]?(nan|inf(inity)?)", value):
+                raise ConfigError(f"{option} {value}: give a finite number")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="GNSS-denied navigation from video and a geo-referenced 3D map.",

@@ -19,7 +19,7 @@ from companion.offline.localize import (
     Sigmas,
     image_times,
     localize_images,
-    measured,
+    sensors_of,
 )
 from companion.sources.folder_source import list_images
 from companion.terminal.steps import COMPILES, shown_count, tally
@@ -117,7 +117,8 @@ def localize_command(
     )
     times = image_times(paths, rate_hz)
     known: Mapping[str, Pose] = {row.name: world_from_camera(row, cache.frame) for row in rows}
-    sensors = measured(paths, times, known)
+    dated = zip(paths, times, strict=True)
+    sensors = sensors_of({t: known[path.name] for path, t in dated if path.name in known})
     count = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
     with open_localizer(map_cache, intrinsics, config, sensors) as localizer, count as show:
         frame = localizer.frame

@@ -62,6 +62,10 @@ def build(
         str | None, typer.Option(help="of a DSM without a unit: m, ft or us-ft")
     ] = None,
     nodata: Annotated[float | None, typer.Option(help="of a DSM without a nodata tag")] = None,
+    flat_ground: Annotated[
+        float | None,
+        typer.Option(help="height of the ground, m, below an orthophoto without a DSM: a flat map"),
+    ] = None,
     attribution: Annotated[str | None, typer.Option(help="attribution of the source")] = None,
     imagery_date: Annotated[
         str | None, typer.Option(help="date of the imagery: 2024, 2024-06 or 2024-06-30")
@@ -103,9 +107,14 @@ def build(
     """Import a source into a tile cache; continues an interrupted build."""
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
+    from localizer.map.importers.raster_file import write_flat_ground
     from localizer.map.importers.rules import ImportRules
 
     rules = ImportRules.of(limit or (), trust or ())
+    if flat_ground is not None:
+        with writing(out, "--out"):
+            ground = out.with_name(f"{out.name}-ground.tif")
+            source = [write_flat_ground(source[0], flat_ground, ground), *source]
     try:
         with shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
             manifest = build_cache(

@@ -38,17 +38,14 @@ class Sigmas:
         return config.model_copy(update={"attitude": known, "height_sigma_m": self.height_m})
 
 
-def measured(
-    images: Sequence[Path], times_ns: Sequence[int], priors: Mapping[str, Pose]
-) -> AuxiliarySensors:
-    """The priors' attitude and height as the sensors of their images; times_ns: of the images."""
-    known = {t: priors[i.name] for i, t in zip(images, times_ns, strict=True) if i.name in priors}
+def sensors_of(poses: Mapping[int, Pose]) -> AuxiliarySensors:
+    """Attitude and height of poses, by the time of their image in ns, as sensors measure them."""
 
     def rotation_at(time_ns: int) -> Array | None:
-        return known[time_ns].rotation if time_ns in known else None
+        return poses[time_ns].rotation if time_ns in poses else None
 
     def height_at(time_ns: int) -> float | None:
-        return float(known[time_ns].translation[2]) if time_ns in known else None
+        return float(poses[time_ns].translation[2]) if time_ns in poses else None
 
     return AuxiliarySensors(rotation_at=rotation_at, height_at=height_at)
 

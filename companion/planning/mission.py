@@ -22,6 +22,7 @@ __all__ = ["HeightAbove", "MissionPlace", "PlannedMission", "read_mission"]
 
 # ArduPilot counts its commands in a signed 16-bit number (AP_Mission, MIS_TOTAL).
 _MOST_ITEMS = 32_767
+_FIELDS = 12  # of a row of QGC WPL 110
 _MOST_BYTES = 16 << 20  # so many items take 8 MB
 _LANDING_PATTERNS = {
     "fwLandingPattern": mavlink.MAV_CMD_NAV_LAND,
@@ -46,6 +47,11 @@ def read_mission(path: Path) -> PlannedMission:
         raise MissionFileError(f"{path}: cannot be read: {error.strerror}") from error
     except MissionError as error:
         raise MissionFileError(f"{path}: {error}") from error
+    except json.JSONDecodeError as error:
+        raise MissionFileError(
+            f"{path}: its JSON breaks off at line {error.lineno} ({error.msg}); save the mission "
+            "again, or copy the file again"
+        ) from error
     # What a damaged or a foreign file raises while it is taken apart.
     except (
         ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError
@@ -136,10 +142,16 @@ def _waypoints(text: str) -> _Read:
     """Rows of index, current, frame, command, four parameters, latitude, longitude, altitude,
     autocontinue; row 0 is home.
     """
-    first, *lines = text.splitlines()
+    first, *lines = text.splitlines() or [""]
     if first.split() != ["QGC", "WPL", "110"]:
-        raise ValueError(f"it begins with {first[:20]!r}")
+        raise ValueError(f"it begins with {first[:20]!r}" if text.strip() else "it is empty")
     rows = [line.split() for line in lines if line.strip()]
+    for number, cells in enumerate(rows):
+        if len(cells) < _FIELDS:
+            raise MissionError(
+                f"row {number} has {len(cells)} of {_FIELDS} fields: the file breaks off; save the "
+                "mission again, or copy the file again"
+            )
     numbers = _numbers([int(cells[0]) for cells in rows[1:]])
     items: _Items = []
     for number, cells in zip([0, *numbers], rows, strict=False):

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import FootageError
 from companion.geometry import (
@@ -48,12 +50,13 @@ _GIMBAL_AGE_S = 1.0
 
 @dataclass(frozen=True)
 class LogTrack:
-    """What a log says. track: UTC nanoseconds; triggers_ns: of camera feedback (CAM, TRIG), UTC;
-    has_gimbal: whether a gimbal's angles are in it; notes: what was assumed.
+    """What a log says. track: UTC nanoseconds; exposures: where the camera was and looked at each
+    (CAM, else TRIG; CAMERA_FEEDBACK), in order of time; has_gimbal: whether a gimbal's angles are
+    in it; notes: what was assumed.
     """
 
     track: Track
-    triggers_ns: tuple[int, ...]
+    exposures: tuple[Telemetry, ...]
     has_gimbal: bool
     notes: tuple[str, ...]
 
@@ -65,7 +68,12 @@ class _LogRows:
     positions: list[tuple[int, float, float, float, float]]
     attitudes: list[tuple[int, float, float, float]]
     gimbals: list[tuple[int, GimbalAngles]]
-    triggers: list[int]
+    feedback: list[tuple[int, Any]]
+
+    @cached_property
+    def gimbal_times(self) -> np.ndarray:
+        """(G,) int64, once all are read."""
+        return np.array([g[0] for g in self.gimbals], dtype=np.int64)
 
 
 def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
@@ -86,38 +94,68 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
             f"{path.name} has no gimbal's angles: the camera is taken as fixed to the airframe, "
             f"pitch {fixed_pitch_deg:g} degrees"
         )
-    return LogTrack(Track(samples), tuple(sorted(raw.triggers)), bool(raw.gimbals), tuple(notes))
+    track = Track(samples)
+    exposures = tuple(_exposures(raw, track, fixed_pitch_deg))
+    return LogTrack(track, exposures, bool(raw.gimbals), tuple(notes))
+
+
+def _exposures(raw: _LogRows, track: Track, fixed_pitch_deg: float) -> Iterator[Telemetry]:
+    """Of the first camera; what was asked for counts only where no exposure is logged. Two links to
+    the ground bring each message twice.
+    """
+    kinds = [(m.flags == mavlink.CAMERA_FEEDBACK_OPENLOOP, m.cam_idx) for _, m in raw.feedback]
+    told = {
+        (m.time_usec, m.img_idx): (time_ns, m)
+        for (time_ns, m), kind in zip(reversed(raw.feedback), reversed(kinds), strict=True)
+        if kind == min(kinds)
+    }
+    for time_ns, m in sorted(told.values(), key=lambda one: one[0]):
+        said = track.at(time_ns) or Telemetry()
+        if m.lat or m.lng:
+            own = _position(time_ns, m.lat * 1e-7, m.lng * 1e-7, m.alt_msl, m.alt_rel)
+            said = replace(said, position=own.position)
+        angles = [math.radians(a) for a in (m.roll, m.pitch, m.yaw)]
+        if all(map(math.isfinite, angles)):
+            view = _view(raw, time_ns, angles, fixed_pitch_deg)
+            said = replace(said, view=view, course_deg=m.yaw % 360.0)
+        yield replace(said, time_ns=time_ns)
 
 
 def _samples(raw: _LogRows, fixed_pitch_deg: float) -> Iterator[Telemetry]:
     positions = Track([_position(*row) for row in raw.positions])
     times = np.array([row[0] for row in raw.attitudes], dtype=np.int64)
     angles = np.unwrap(np.array([row[1:] for row in raw.attitudes]), axis=0)
-    gimbal_times = np.array([g[0] for g in raw.gimbals], dtype=np.int64)
     begin = max(int(positions.times_ns[0]), int(times[0]))
     end = min(int(positions.times_ns[-1]), int(times[-1]))
+    since = (times - times[0]).astype(np.float64)  # times of 1e18 ns do not fit a float
     for time_ns in range(begin, end + 1, round(1e9 * _STEP_S)):
         where = positions.at(time_ns)
         if where is None:
             continue
-        # Times of 1e18 ns do not fit a float: relative ones do.
-        since = (times - times[0]).astype(np.float64)
-        roll, pitch, yaw = (
-            float(np.interp(float(time_ns - int(times[0])), since, angles[:, k])) for k in range(3)
-        )
-        body = np.asarray(matrix_from_euler(roll, pitch, yaw))
-        gimbal, tilt = _gimbal(raw, gimbal_times, time_ns), _TILT_DEG
-        if gimbal is None and len(gimbal_times):
-            continue
-        if gimbal is None:
-            gimbal = GimbalAngles(0.0, math.radians(fixed_pitch_deg), 0.0, GimbalFrame.BODY)
-            tilt = _FIXED_TILT_DEG
-        attitude = camera_attitude(body, gimbal, Mount.from_degrees())
-        view = RecordedView(attitude, tilt, _HEADING_DEG)
-        yield replace(where, time_ns=time_ns, view=view, course_deg=math.degrees(yaw) % 360.0)
+        at = float(time_ns - int(times[0]))
+        now = [float(np.interp(at, since, angles[:, k])) for k in range(3)]
+        view = _view(raw, time_ns, now, fixed_pitch_deg)
+        if view is not None:
+            course_deg = math.degrees(now[2]) % 360.0
+            yield replace(where, time_ns=time_ns, view=view, course_deg=course_deg)
 
 
-def _gimbal(raw: _LogRows, times: np.ndarray, time_ns: int) -> GimbalAngles | None:
+def _view(
+    raw: _LogRows, time_ns: int, body_rad: Sequence[float], fixed_pitch_deg: float
+) -> RecordedView | None:
+    """By the body's roll, pitch and yaw; None while the log's gimbal says nothing."""
+    gimbal, tilt = _gimbal(raw, time_ns), _TILT_DEG
+    if gimbal is None and raw.gimbals:
+        return None
+    if gimbal is None:
+        gimbal = GimbalAngles(0.0, math.radians(fixed_pitch_deg), 0.0, GimbalFrame.BODY)
+        tilt = _FIXED_TILT_DEG
+    body = np.asarray(matrix_from_euler(*body_rad))
+    return RecordedView(camera_attitude(body, gimbal, Mount.from_degrees()), tilt, _HEADING_DEG)
+
+
+def _gimbal(raw: _LogRows, time_ns: int) -> GimbalAngles | None:
+    times = raw.gimbal_times
     if not len(times):
         return None
     near = int(np.argmin(np.abs(times - time_ns)))
@@ -128,7 +166,8 @@ def _position(
     time_ns: int, latitude: float, longitude: float, amsl: float, above: float
 ) -> Telemetry:
     heights = (Height(amsl, Datum.AMSL, _AMSL_M), Height(above, Datum.TAKEOFF, _TAKEOFF_M))
-    return Telemetry(time_ns, RecordedPosition(latitude, longitude, _GNSS_M, heights))
+    known = tuple(h for h in heights if math.isfinite(h.value_m))
+    return Telemetry(time_ns, RecordedPosition(latitude, longitude, _GNSS_M, known))
 
 
 def vehicle_messages(path: Path) -> Iterator[Dated]:
@@ -184,7 +223,7 @@ def _take(raw: _LogRows, kind: str, m: Any, time_ns: int) -> None:
         frame = GimbalFrame.EARTH if gimbal_in_earth_frame(m.flags) else GimbalFrame.HEADING
         raw.gimbals.append((time_ns, GimbalAngles(*_euler(m.q), frame)))
     elif kind == "CAMERA_FEEDBACK":
-        raw.triggers.append(time_ns)
+        raw.feedback.append((time_ns, m))
 
 
 def _euler(q: Sequence[float]) -> tuple[float, float, float]:

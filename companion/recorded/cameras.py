@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
 
 from companion.errors import FootageError
 from companion.recorded.flight import CameraGuess
 from companion.recorded.photo_tags import PhotoTags
+from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
+from localizer.geometry.camera_file import camera_numbers, read_numbers
 
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)  # the 35 mm equivalent compares diagonals (CIPA DCG-001)
 _NATIVE_ASPECT = 4.0 / 3.0  # of nearly all sensors in drones; 16:9 and 3:2 are cut out of them
@@ -39,6 +44,25 @@ def camera_of_tags(tags: PhotoTags) -> CameraGuess:
 def camera_given(camera: Camera, source: str) -> CameraGuess:
     """A model that the user gives."""
     return CameraGuess(camera, _GIVEN, source)
+
+
+def camera_of_file(path: Path) -> CameraGuess:
+    """A model that the user gives as a file. A lens model that folds the corners, but else moves
+    nothing by more than the focal length's sigma, is left out: one coefficient too many makes it.
+    """
+    try:
+        return camera_given(Camera.from_json(path), path.name)
+    except CameraError as error:
+        try:
+            camera = Camera(**camera_numbers(read_numbers(path)))
+        except (CameraError, ValueError, TypeError, OverflowError):
+            raise error from None
+        reach = 0.5 * min(camera.width / camera.fx, camera.height / camera.fy)
+        r = np.linspace(0.1, 1.0, 10) * reach
+        if not np.abs(camera.distorted(r, np.zeros(10))[0] / r - 1.0).max() <= 0.01 * _GIVEN:
+            raise
+        source = f"{path.name} without its distortion, which cannot be undone in the corners"
+        return camera_given(camera.without_distortion(), source)
 
 
 def equivalent_camera(width: int, height: int, focal_35mm: float, *, small: bool) -> Camera:

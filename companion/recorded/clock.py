@@ -1,7 +1,7 @@
-"""The offset between the clock of images and that of a log, found by motion.
+"""The offset between the clock of images and that of a log, by the log's exposures or by motion.
 
-Between two images, features move as the log's attitudes and positions say, over flat ground below
-the take-off height. The offset under which they do so best is the clocks'.
+Motion: between two images, features move as the log's attitudes and positions say, over flat ground
+below the take-off height. The offset under which they do so best is the clocks'.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.stats import binom
 
 from companion.recorded.flight import Datum, RecordedFrame, Telemetry, Track
 from companion.sources.folder_source import read_image
@@ -23,25 +24,45 @@ _WIDTH_PX = 640
 _FEATURES, _LEAST_MATCHES, _MOST_PAIRS = 1500, 25, 30
 _LONGEST_S = 3.0  # between two images of a pair: further apart they share too little ground
 _COARSE_S, _FINE_S = 0.2, 0.02
-_DECISIVE = 0.7  # of the typical residual: a clear minimum lies below it
+# Of a real flight's and made-up ones: a right offset leaves 0.1 to 0.7 degrees and is found by 4
+# pairs; in another flight's log these bounds let none of 1,029 searches by 4 to 15 pairs through.
+_LEAST_PAIRS, _MOST_LEFT_DEG = 4, 1.5
+_ALONE = 0.6  # of the second minimum: where the flight looks alike twice, both are as low
+_MOST_CHANCE = 0.003  # that a log of another flight fits so well somewhere in the reach
 _LEAST_HEIGHT_M = 5.0
+_LEAST_IMAGES = 4  # whose intervals are compared with those of exposures
+_ALIGNED = 8  # of the images, each in turn with every exposure
+_TAG_NS = 600_000_000  # EXIF's times may be whole seconds
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """offset_s: to be added to the images' times to be the log's. residual: of the features, as an
-    angle in degrees, at the offset and typically elsewhere. pairs: of images that told it.
+    """offset_s: to be added to the images' times to be the log's. residual_deg: of the features, as
+    an angle, there; second_deg: at the next best offset, infinite where there is none; pairs: of
+    images that told it; chance: of so low a residual at some offset of another flight's log.
     """
 
     offset_s: float
     residual_deg: float
-    elsewhere_deg: float
+    second_deg: float
     pairs: int
+    chance: float
 
     @property
     def is_decisive(self) -> bool:
-        """Whether one offset fits clearly better than others."""
-        return self.pairs >= 2 and self.residual_deg < _DECISIVE * self.elsewhere_deg
+        """Whether one offset alone fits, and that not by chance."""
+        fits = self.pairs >= _LEAST_PAIRS and self.residual_deg < _MOST_LEFT_DEG
+        is_alone = self.residual_deg < _ALONE * self.second_deg
+        return fits and is_alone and self.chance < _MOST_CHANCE
+
+    @property
+    def text(self) -> str:
+        """The figures."""
+        return (
+            f"{self.offset_s:+.2f} s by motion ({self.pairs} pairs of images, "
+            f"{self.residual_deg:.2f} degrees left, {self.second_deg:.2f} at the next best offset; "
+            f"by chance: {self.chance:.1g})"
+        )
 
 
 @dataclass(frozen=True)
@@ -66,17 +87,47 @@ def find_offset(
         return None
     frame = LocalFrame(Geodetic(origin.latitude_deg, origin.longitude_deg, 0.0))
     coarse = np.arange(reach_s[0], reach_s[1] + _COARSE_S / 2, _COARSE_S)
-    scores = np.array([_residual(pairs, track, frame, float(o)) for o in coarse])
+    residuals = np.array([_residuals(pairs, track, frame, float(o)) for o in coarse])
+    scores = np.array([_score(row) for row in residuals])
     if not np.isfinite(scores).any():
         return None
-    best = float(coarse[int(np.nanargmin(scores))])
-    fine = np.arange(best - _COARSE_S, best + _COARSE_S + _FINE_S / 2, _FINE_S)
-    close = np.array([_residual(pairs, track, frame, float(o)) for o in fine])
+    best = int(np.nanargmin(scores))
+    fine = coarse[best] + np.arange(-_COARSE_S, _COARSE_S + _FINE_S / 2, _FINE_S)
+    close = np.array([_score(_residuals(pairs, track, frame, float(o))) for o in fine])
     k = int(np.nanargmin(close))
-    typical = float(np.nanmedian(scores))
-    return ClockOffset(
-        float(fine[k]), float(np.degrees(close[k])), float(np.degrees(typical)), len(pairs)
-    )
+    outside = _outside(scores, best)
+    second = float(np.nanmin(scores[outside], initial=np.inf))
+    found = float(fine[k]), float(np.degrees(close[k])), float(np.degrees(second))
+    return ClockOffset(*found, len(pairs), _chance(residuals, outside, float(close[k])))
+
+
+def _outside(scores: Array, best: int) -> np.ndarray:
+    """Mask of the offsets that are not of the best one's valley: it ends where the score has come
+    halfway up to the typical one.
+    """
+    rim = 0.5 * (float(scores[best]) + float(np.nanmedian(scores)))
+    above = np.flatnonzero(scores > rim)
+    begin = int(max(above[above < best], default=-1))
+    end = int(min(above[above > best], default=len(scores)))
+    outside = np.isfinite(scores)
+    outside[begin + 1 : end] = False
+    return outside
+
+
+def _chance(residuals: Array, outside: np.ndarray, best: float) -> float:
+    """Of a median of so many pairs as low as the best: each pair's residual is so low at some share
+    of the other offsets, and as many valleys as wide as the best one's were looked at. Half of the
+    pairs count, because neighbours share an image.
+    """
+    elsewhere = residuals[outside]
+    known = np.isfinite(elsewhere)
+    if not known.any():
+        return 1.0
+    share = float((elsewhere[known] <= best).mean())
+    count = (residuals.shape[1] + 1) // 2
+    width = max(int((~outside).sum()), 1)
+    tail = float(binom.sf(count // 2, count, max(share, 1.0 / known.sum())))
+    return min(1.0, tail * len(residuals) / width)
 
 
 def _pairs(frames: Sequence[RecordedFrame], camera: Camera) -> list[_Pair]:
@@ -131,11 +182,13 @@ def _features(
     return scaled.rays(np.array([p.pt for p in points]) + 0.5), descriptors
 
 
-def _residual(pairs: Sequence[_Pair], track: Track, frame: LocalFrame, offset_s: float) -> float:
-    """Median angle (rad) between features and where the log has them; NaN outside the log."""
+def _residuals(pairs: Sequence[_Pair], track: Track, frame: LocalFrame, offset_s: float) -> Array:
+    """(P,) of each pair the median angle (rad) between features and where the log has them; NaN
+    outside the log.
+    """
     shift = round(1e9 * offset_s)
-    found = []
-    for pair in pairs:
+    found = np.full(len(pairs), np.nan)
+    for k, pair in enumerate(pairs):
         a, b = track.at(pair.begin_ns + shift), track.at(pair.end_ns + shift)
         first, second = _camera(a, frame), _camera(b, frame)
         if first is None or second is None:
@@ -147,10 +200,16 @@ def _residual(pairs: Sequence[_Pair], track: Track, frame: LocalFrame, offset_s:
             continue
         points = p + rays[down] * (height / rays[down, 2])[:, None]
         away = (points - q) @ S
-        seen = pair.second[down]
-        off = away[:, :2] / np.maximum(away[:, 2:], 1e-3) - seen[:, :2]
-        found.append(float(np.median(np.hypot(off[:, 0], off[:, 1]))))
-    return float(np.median(found)) if len(found) >= max(2, len(pairs) // 2) else float("nan")
+        off = away[:, :2] / np.maximum(away[:, 2:], 1e-3) - pair.second[down, :2]
+        found[k] = np.median(np.hypot(off[:, 0], off[:, 1]))
+    return found
+
+
+def _score(residuals: Array) -> float:
+    """Of one offset; NaN where less than half of the pairs lie in the log."""
+    known = residuals[np.isfinite(residuals)]
+    is_enough = len(known) >= max(2, len(residuals) // 2)
+    return float(np.median(known)) if is_enough else float("nan")
 
 
 def _camera(sample: Telemetry | None, frame: LocalFrame) -> tuple[Array, Array, float] | None:
@@ -163,3 +222,35 @@ def _camera(sample: Telemetry | None, frame: LocalFrame) -> tuple[Array, Array, 
     enu = frame.enu_from_geodetic(sample.position.latitude_deg, sample.position.longitude_deg, 0.0)
     place = np.asarray(NED_FROM_ENU @ np.asarray(enu))
     return sample.view.ned_from_camera, np.array([place[0], place[1], -height]), height
+
+
+def exposures_of(
+    times_ns: Sequence[int | None], exposures: Sequence[Telemetry]
+) -> tuple[Telemetry, ...] | None:
+    """Which of a log's exposures each image is. Their intervals tell it, where only one offset of
+    the clocks lets all images find one; of images without times their order, where there are as
+    many. None where that is not so.
+    """
+    if all(t is None for t in times_ns):
+        return tuple(exposures) if len(times_ns) == len(exposures) else None
+    times = np.array([t for t in times_ns if t is not None], dtype=np.int64)
+    at = np.array([e.time_ns for e in exposures], dtype=np.int64)
+    if not _LEAST_IMAGES <= len(times) == len(times_ns) <= len(at):
+        return None
+    aligned = np.linspace(0, len(times) - 1, _ALIGNED).round().astype(int)  # stamps are rough
+    fits = {
+        fit
+        for image in {int(k) for k in aligned}
+        for exposure in at
+        if (fit := _fit(times - times[image], at - exposure)) is not None
+    }
+    return tuple(exposures[k] for k in fits.pop()) if len(fits) == 1 else None
+
+
+def _fit(times: np.ndarray, at: np.ndarray) -> tuple[int, ...] | None:
+    """The exposure next to each image; None where an image has none of its own in its interval."""
+    after = np.clip(np.searchsorted(at, times), 1, max(len(at) - 1, 1))
+    near = np.where(times - at[after - 1] < at[after] - times, after - 1, after)
+    off = (at[near] - times).astype(np.float64)
+    is_close = np.abs(off - np.median(off)).max() <= _TAG_NS
+    return tuple(map(int, near)) if is_close and (np.diff(near) > 0).all() else None

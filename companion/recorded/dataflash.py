@@ -158,10 +158,19 @@ class _Dataflash:
         angles = (getattr(m, "Roll", 0.0), getattr(m, "Pitch", 0.0), yaw)
         return gimbal_message(ms, angles, earth=not math.isnan(earth))
 
-    def trigger_row(self, m: Any, _: int) -> Any:
-        return mavlink.MAVLink_camera_feedback_message(
-            int(m.TimeUS), 0, 0, int(getattr(m, "Img", 0)), 0, 0, 0, 0, 0, 0, 0, 0, 0
+    def camera_row(self, m: Any, _: int) -> Any:
+        """CAM says an exposure, TRIG that one was asked for."""
+        flag = (
+            mavlink.CAMERA_FEEDBACK_OPENLOOP
+            if m.get_type() == "TRIG"
+            else mavlink.CAMERA_FEEDBACK_PHOTO
         )
+        at = (round(m.Lat * 1e7), round(m.Lng * 1e7), m.Alt, getattr(m, "RelAlt", math.nan))
+        angles = (getattr(m, k[0], getattr(m, k, math.nan)) for k in ("Roll", "Pitch", "Yaw"))
+        return mavlink.MAVLink_camera_feedback_message(
+            int(m.TimeUS), 0, int(getattr(m, "I", 0)), int(getattr(m, "Img", 0)), *at, *angles,
+            0.0, flag,
+        )  # fmt: skip
 
 
 _ROWS: dict[str, Callable[[_Dataflash, Any, int], Any]] = {
@@ -170,6 +179,6 @@ _ROWS: dict[str, Callable[[_Dataflash, Any, int], Any]] = {
     "XKF1": _Dataflash.local_row, "NKF1": _Dataflash.local_row, "XKF4": _Dataflash.health_row,
     "NKF4": _Dataflash.health_row, "GPS": _Dataflash.receiver_row, "GPA": _Dataflash.accuracy_row,
     "IMU": _Dataflash.imu_row, "BARO": _Dataflash.pressure_row, "RFND": _Dataflash.range_row,
-    "ORGN": _Dataflash.origin_row, "MNT": _Dataflash.mount_row, "CAM": _Dataflash.trigger_row,
-    "TRIG": _Dataflash.trigger_row,
+    "ORGN": _Dataflash.origin_row, "MNT": _Dataflash.mount_row, "CAM": _Dataflash.camera_row,
+    "TRIG": _Dataflash.camera_row,
 }  # fmt: skip

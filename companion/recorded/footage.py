@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,8 +14,8 @@ import numpy as np
 
 from companion.errors import FootageError
 from companion.recorded.autopilot_log import LOG_SUFFIXES, LogTrack, read_autopilot_log
-from companion.recorded.cameras import camera_given, camera_of_tags, equivalent_camera
-from companion.recorded.clock import ClockOffset, find_offset
+from companion.recorded.cameras import camera_of_file, camera_of_tags, equivalent_camera
+from companion.recorded.clock import ClockOffset, exposures_of, find_offset
 from companion.recorded.flight import (
     CameraGuess,
     Kind,
@@ -32,7 +33,7 @@ from companion.recorded.photo_tags import (
     PhotoTags,
     read_photo_tags,
 )
-from companion.recorded.places_file import PLACES_SUFFIXES, is_places_file, read_places
+from companion.recorded.places_file import PLACES_SUFFIXES, read_places
 from companion.recorded.sequence import is_sequence, read_sequence
 from companion.recorded.subtitles import Subtitles, read_subtitles
 from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
@@ -80,6 +81,7 @@ def read_footage(
     """
     if not path.exists():
         raise FootageError(f"{path}: no such file or folder")
+    _check_files(options)
     if path.suffix.lower() in RAW_SUFFIXES:
         raise FootageError(f"{path}: raw photos are not read; give the JPEG of the same shot")
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
@@ -92,6 +94,22 @@ def read_footage(
     if options.places is None and options.log is None and is_sequence(path):
         return _read_sequence(path, options)
     return _read_folder(path, options, progress)
+
+
+def _check_files(options: FootageOptions) -> None:
+    """Whether each file that is given is one, and of its kind."""
+    given = {"--places": options.places, "--log": options.log, "--camera": options.camera}
+    for option, file in given.items():
+        if file is not None and not file.is_file():
+            fault = "is a folder; give the file" if file.is_dir() else "no such file"
+            raise FootageError(f"{option} {file}: {fault}")
+    if options.places is not None and options.places.suffix.lower() in LOG_SUFFIXES:
+        raise FootageError(f"--places {options.places}: is an autopilot's log; give it as --log")
+    if options.log is not None and options.log.suffix.lower() not in LOG_SUFFIXES:
+        raise FootageError(
+            f"--log {options.log}: no autopilot's log ({_list(LOG_SUFFIXES)}); a file with places "
+            "of photos is given as --places"
+        )
 
 
 def _list(suffixes: frozenset[str]) -> str:
@@ -135,6 +153,7 @@ def _read_photos(
     folder: Path, photos: Sequence[Path], options: FootageOptions, progress: Progress
 ) -> RecordedFlight:
     notes: list[str] = []
+    photos = _once(photos, notes)
     chosen = _spread(photos, options.frames)
     if len(chosen) < len(photos):
         notes.append(f"{len(chosen)} of {len(photos)} photos are used (--frames)")
@@ -166,13 +185,27 @@ def _read_photos(
     turned = sum(int(t.exif.get("Orientation") or 1) not in (0, 1) for t in tags)
     if turned:
         notes.append(f"{turned} photos are marked as rotated; they are used as the sensor saw them")
-    frames = _with_places(frames, _places_file(folder, tags, options), notes)
+    frames = _with_places(frames, _places_file(folder, tags, options, notes), notes)
     frames.sort(key=lambda f: f.time_ns if f.time_ns is not None else 0)
     log = _log_file(folder, options)
     beside = None
     if log is not None:
         frames, beside = _with_log(frames, camera.camera, log, options, notes, utc=True)
     return _flight(folder, "photos", frames, camera, notes, beside)
+
+
+def _once(photos: Sequence[Path], notes: list[str]) -> list[Path]:
+    """Each photograph once: the same file again is no second piece of evidence."""
+    sizes = Counter(photo.stat().st_size for photo in photos)
+    first: dict[object, Path] = {}
+    for photo in photos:
+        key: object = photo
+        if sizes[photo.stat().st_size] > 1:
+            key = hashlib.sha256(photo.read_bytes()).digest()
+        first.setdefault(key, photo)
+    if len(first) < len(photos):
+        notes.append(f"{len(photos) - len(first)} photos repeat others byte by byte: left out")
+    return list(first.values())
 
 
 def _flight(
@@ -203,8 +236,22 @@ def _of_one_camera(tags: Sequence[PhotoTags], notes: list[str]) -> list[PhotoTag
 
 
 def _photo_camera(folder: Path, tags: Sequence[PhotoTags], options: FootageOptions) -> CameraGuess:
-    given = _given_camera(folder, tags[0].width, tags[0].height, options)
-    return given if given is not None else camera_of_tags(tags[0])
+    width, height = tags[0].width, tags[0].height
+    given = _given_camera(folder, width, height, options)
+    if given is not None:
+        return given
+    try:
+        return camera_of_tags(tags[0])
+    except FootageError:
+        beside = [
+            file
+            for place in (folder, folder.parent)
+            for file in files_of(place, {".json", ".yaml", ".yml"})
+            if file.stem.lower().startswith("cam")
+        ]
+        if len(beside) != 1:
+            raise
+        return _camera_file(beside[0], width, height)
 
 
 def _given_camera(
@@ -217,22 +264,31 @@ def _given_camera(
     file = options.camera or folder / "camera.json"
     if options.camera is None and not file.is_file():
         return None
+    return _camera_file(file, width, height)
+
+
+def _camera_file(file: Path, width: int, height: int) -> CameraGuess:
     try:
-        camera = fitted_camera(width, height, Camera.from_json(file), str(file))
+        guess = camera_of_file(file)
+        return replace(guess, camera=fitted_camera(width, height, guess.camera, str(file)))
     except CameraError as error:
         raise FootageError(f"{error}; or give the field of view alone, as --fov DEGREES") from error
-    return camera_given(camera, file.name)
 
 
-def _places_file(folder: Path, tags: Sequence[PhotoTags], options: FootageOptions) -> Path | None:
+def _places_file(
+    folder: Path, tags: Sequence[PhotoTags], options: FootageOptions, notes: list[str]
+) -> Path | None:
     if options.places is not None:
         return options.places
     names = {t.path.name for t in tags} | {t.path.stem for t in tags}
-    candidates = [
-        f
-        for f in files_of(folder, PLACES_SUFFIXES)
-        if is_places_file(f) and names & read_places(f).keys()
-    ]
+    candidates = []
+    for file in files_of(folder, PLACES_SUFFIXES):
+        try:
+            if names & read_places(file).keys():
+                candidates.append(file)
+        except FootageError as error:
+            if file.suffix.lower() == ".csv":
+                notes.append(f"not used: {error}")
     if len(candidates) > 1:
         told = ", ".join(f.name for f in candidates)
         raise FootageError(f"{folder}: several files hold places of the photos: {told}; choose one "
@@ -284,15 +340,26 @@ def _with_log(
     """Telemetry from the log, at the images' times plus the clocks' offset."""
     log = read_autopilot_log(file, options.fixed_pitch_deg)
     notes.extend(log.notes)
-    if any(f.time_ns is None for f in frames):
+    is_dated = all(f.time_ns is not None for f in frames)
+    reach = _reach_s(frames, log, file, utc=utc) if is_dated else None
+    exposed = exposures_of([f.time_ns for f in frames], log.exposures) if utc else None
+    told: Sequence[Telemetry | None]
+    if exposed is not None:
+        told, ahead_ns = exposed, _exposure_ahead_ns(frames, exposed, file, notes)
+    elif reach is None:
         raise FootageError(
             f"{file}: the images have no times, so the log cannot be laid beside them; use "
             "photos whose tags say when they were taken, or a video"
         )
-    reach = _reach_s(frames, log, file, utc=utc)
-    found = find_offset(frames, camera, log.track, reach)
-    ahead_ns = round(1e9 * _offset(found, file, notes, utc=utc))
-    told = [log.track.at((frame.time_ns or 0) + ahead_ns) for frame in frames]
+    else:
+        if utc and log.exposures:
+            notes.append(
+                f"the {len(log.exposures)} exposures in {file.name} (CAM, TRIG) cannot be told "
+                "apart by the images' times: not used"
+            )
+        found = find_offset(frames, camera, log.track, reach)
+        ahead_ns = round(1e9 * _offset(found, file, notes, utc=utc))
+        told = [log.track.at((frame.time_ns or 0) + ahead_ns) for frame in frames]
     covered = sum(said is not None for said in told)
     if not covered:
         raise FootageError(
@@ -316,6 +383,21 @@ def _with_log(
     ]
     fixed_pitch_deg = None if log.has_gimbal else options.fixed_pitch_deg
     return moved, LogBeside(file, ahead_ns, fixed_pitch_deg)
+
+
+def _exposure_ahead_ns(
+    frames: Sequence[RecordedFrame], exposed: Sequence[Telemetry], file: Path, notes: list[str]
+) -> int:
+    """The log's clock less that of images whose exposures are in it; 0 for images without times."""
+    ahead = [
+        e.time_ns - f.time_ns
+        for f, e in zip(frames, exposed, strict=True)
+        if f.time_ns is not None and e.time_ns is not None
+    ]
+    ahead_ns = round(float(np.median(ahead))) if ahead else 0
+    by = f"times, {1e-9 * ahead_ns:+.2f} s apart" if ahead else "order, as they have no times"
+    notes.append(f"each image is one of {file.name}'s exposures (CAM, TRIG), by their {by}")
+    return ahead_ns
 
 
 def _apart_m(a: RecordedPosition, b: RecordedPosition) -> float:
@@ -347,19 +429,17 @@ def _reach_s(
 
 def _offset(found: ClockOffset | None, file: Path, notes: list[str], *, utc: bool) -> float:
     if found is not None and found.is_decisive:
-        notes.append(
-            f"clock of the images against {file.name}: {found.offset_s:+.2f} s, found by motion "
-            f"({found.pairs} pairs of images, {found.residual_deg:.2f} degrees left, "
-            f"{found.elsewhere_deg:.2f} at other offsets)"
-        )
+        notes.append(f"clock of the images against {file.name}: {found.text}")
         return found.offset_s
+    best = "" if found is None else f"; not decisive: {found.text}"
     if not utc:
         raise FootageError(
-            f"{file}: where the video lies in it cannot be found by motion: is it this flight's?"
+            f"{file}: where the video lies in it cannot be found by motion: is it this flight's, "
+            f"and does it show turns?{best}"
         )
     notes.append(
         f"the clock's offset against {file.name} cannot be found by motion: taken as zero, as "
-        "both are UTC"
+        f"both are UTC{best}"
     )
     return 0.0
 

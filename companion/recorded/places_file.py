@@ -53,18 +53,15 @@ def read_places(path: Path) -> dict[str, Telemetry]:
         rows = rows[1:]
     else:
         columns = {"name": 0, "longitude": 1, "latitude": 2, "amsl": 3}
-    places = dict(_place(row, columns, f"{path}:{number}") for number, row in rows)
+    places: dict[str, Telemetry] = {}
+    for number, row in rows:
+        name, said = _place(row, columns, f"{path}:{number}")
+        if name in places:
+            raise FootageError(f"{path}:{number}: a second line of {name}; leave the right one")
+        places[name] = said
     if not places:
         raise FootageError(f"{path}: holds no place; expected lines of: name longitude latitude")
     return places
-
-
-def is_places_file(path: Path) -> bool:
-    """Whether a text file holds places of photos."""
-    try:
-        return bool(read_places(path))
-    except FootageError:
-        return False
 
 
 def _rows(lines: list[str]) -> Iterator[tuple[int, list[str]]]:
@@ -106,8 +103,8 @@ def _place(row: list[str], columns: dict[str, int], where: str) -> tuple[str, Te
         raise FootageError(f"{where}: expected a name, longitude and latitude, got {row[:4]}")
     if abs(latitude) > 90.0 or abs(longitude) > 360.0:
         raise FootageError(
-            f"{where}: latitude {latitude:g}, longitude {longitude:g} is no place on Earth "
-            "(without a header, longitude comes before latitude)"
+            f"{where}: latitude {latitude:g}, longitude {longitude:g} is no place on Earth: are "
+            "they swapped? Without a header, longitude comes before latitude"
         )
     heights = [
         Height(value, datum, _HEIGHT_M)

@@ -43,12 +43,16 @@ class Localized:
 
 
 class FrameLocalizer:
-    """Localizes recorded frames independently of each other. camera: of the footage."""
+    """Localizes recorded frames independently of each other. camera: of the footage; told: takes
+    each complete prior by its time, for a localizer whose sensors say it (`sensors_of`).
+    """
 
     def __init__(
-        self, localizer: Localizer, relocalizer: Callable[[], Relocalizer], camera: Camera
-    ) -> None:
+        self, localizer: Localizer, relocalizer: Callable[[], Relocalizer], camera: Camera,
+        told: dict[int, Pose] | None = None,
+    ) -> None:  # fmt: skip
         self._localizer, self._relocalizer, self._camera = localizer, relocalizer, camera
+        self._told = {} if told is None else told
         self._loaded = 0
         self._height_m: float | None = None
 
@@ -67,6 +71,8 @@ class FrameLocalizer:
         except (StreamDecodeError, StreamSizeError, OSError) as error:
             return Localized(recorded.name, None, problem=str(error))
         if prior.is_complete:
+            if prior.pose is not None and not prior.was_searched:
+                self._told[frame.exposure_time_ns] = prior.pose
             return self._tracked(recorded.name, frame, prior.pose_prior(frame.exposure_time_ns))
         radius = max(_REGION_SIGMAS * prior.sigma_m, _LEAST_REGION_M)
         region = SearchRegion.circle(prior.pose.translation[:2], radius)

@@ -30,7 +30,7 @@ from companion.reporting.layout import write_report
 from companion.reporting.pictures import MapPictures, ShownFrame, map_pictures, silent
 from companion.reporting.record import VISION
 from companion.terminal.steps import Say
-from companion.trial.result import Judgement, Trial
+from companion.trial.result import Judgement, Trial, spread_limit_m
 from companion.versions import made_by
 from companion.writing import writing
 from localizer.geometry.pose import Array
@@ -103,7 +103,7 @@ def _verdicts(trial: Trial, errors: Array) -> tuple[CriterionResult, ...]:
     known = errors[np.isfinite(errors)]
     if len(known):
         own = float(np.median([p.sigma_m for p in trial.priors if p.pose is not None]))
-        limit, value = float(np.hypot(2.0 * own, 3.0)), float(np.median(known))
+        limit, value = spread_limit_m(trial), float(np.median(known))
         rows.append(CriterionResult(
             "distance from GNSS, median", f"{value:.1f} m", f"<= {limit:.1f} m", value <= limit,
             "positions are wrong, or the recorded ones are", "the overlays: do edges run on?",

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from companion.errors import FootageError
 from companion.geometry import ned_from_world
 from companion.recorded.flight import (
     Datum,
@@ -19,12 +20,11 @@ from companion.recorded.flight import (
     RecordedFlight,
     RecordedFrame,
     RecordedPosition,
-    RecordedView,
 )
 from companion.recorded.photo_tags import looking_down
 from localizer.errors import MapCacheError
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.types import PosePrior
@@ -33,13 +33,15 @@ _LEAST_CLEARANCE_M, _MOST_CLEARANCE_M = 3.0, 10_000.0
 _IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not used at all
 _UNKNOWN_CLEARANCE_M = (15.0, 115.0)  # where cameras of small drones are
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
+_FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
 
 
 @dataclass(frozen=True)
 class FramePrior:
     """One frame's. pose: None where no position is known. sigma_m: horizontal; height_m: world z
-    and its sigma, half of the range where it is not known; clearance_m: above the map's ground.
+    and its sigma, half of the range where it is not known; clearance_m: above the map's ground;
+    was_searched: whether it is a search's result instead of telemetry.
     """
 
     pose: Pose | None
@@ -53,6 +55,7 @@ class FramePrior:
     measured: bool
     over_map: bool
     clearance_m: float
+    was_searched: bool = False
 
     @property
     def is_complete(self) -> bool:
@@ -122,6 +125,7 @@ class FlightPriors:
 
 def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     """What the flight's telemetry says over this map."""
+    _check_near(flight, cache)
     ground, frame = Ground(cache), cache.frame
     geoid_m = cache.manifest.geoid_separation_m
     places = [_enu(f.telemetry.position, frame) for f in flight.frames]
@@ -142,6 +146,35 @@ def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     ]
     notes += _assumptions(flight.frames, made)
     return FlightPriors(tuple(made), datum, tuple(notes))
+
+
+def _check_near(flight: RecordedFlight, cache: TileCache) -> None:
+    """`FootageError` where all positions lie far from the map, with the likely slip."""
+    told = [f.telemetry.position for f in flight.frames if f.telemetry.position is not None]
+    places = np.array([(p.latitude_deg, p.longitude_deg) for p in told]).reshape(-1, 2)
+    low, high = cache.index.box_min[:, :2].min(axis=0), cache.index.box_max[:, :2].max(axis=0)
+    reach_m = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))) + _FAR_M
+
+    def nearest_m(places: Array) -> float:
+        enu = [cache.frame.enu_from_geodetic(lat, lon, 0.0) for lat, lon in places]
+        return float(np.linalg.norm(enu, axis=1).min())
+
+    if not told or nearest_m(places) <= reach_m:
+        return
+    slips = {
+        "latitude and longitude are swapped": places[:, ::-1],
+        "the longitude's sign is wrong": places * [1, -1],
+        "the latitude's sign is wrong": places * [-1, 1],
+    }
+    fits = [what for what, p in slips.items() if np.abs(p[:, 0]).max() <= 90.0
+            and nearest_m(p) <= reach_m]  # fmt: skip
+    origin = cache.frame.origin
+    raise FootageError(
+        f"{flight.name}: its positions, the first latitude {places[0, 0]:.4f}, longitude "
+        f"{places[0, 1]:.4f}, lie {nearest_m(places) * 1e-3:,.0f} km from the map, which is at "
+        f"{origin.latitude_deg:.4f}, {origin.longitude_deg:.4f}: "
+        + (fits[0] if fits else "give the map of that place, which `try` without --map names")
+    )
 
 
 def _enu(position: RecordedPosition | None, frame: LocalFrame) -> Array | None:
@@ -221,7 +254,8 @@ def _prior(
 ) -> FramePrior:  # fmt: skip
     telemetry = one.telemetry
     view = telemetry.view or looking_down(telemetry.course_deg)
-    at = frame.origin if telemetry.position is None else _geodetic(telemetry.position)
+    told = telemetry.position
+    at = frame.origin if told is None else Geodetic(told.latitude_deg, told.longitude_deg, 0.0)
     rotation = np.asarray(ned_from_world(frame, at).T @ view.ned_from_camera)
     base = ground_m if ground_m is not None else usual_m
     low, high = (base + c for c in _UNKNOWN_CLEARANCE_M)
@@ -230,19 +264,11 @@ def _prior(
         z, sigma = height.value_m, height.sigma_m
         is_known = sigma < _KNOWN_SHARE * (z - base)
     pose = None if place is None else Pose(rotation, np.array([place[0], place[1], z]))
-    sigma_m = telemetry.position.sigma_m if telemetry.position is not None else math.inf
+    sigma_m = told.sigma_m if told is not None else math.inf
     return FramePrior(
-        pose, rotation, sigma_m, z, sigma, is_known, view.tilt_sigma_deg, _heading(view),
+        pose, rotation, sigma_m, z, sigma, is_known, view.tilt_sigma_deg, view.heading_sigma_deg,
         view.measured, ground_m is not None, max(z - base, 1.0),
     )  # fmt: skip
-
-
-def _heading(view: RecordedView) -> float | None:
-    return view.heading_sigma_deg
-
-
-def _geodetic(position: RecordedPosition) -> Geodetic:
-    return Geodetic(position.latitude_deg, position.longitude_deg, 0.0)
 
 
 def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) -> list[str]:
@@ -260,8 +286,3 @@ def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) 
     if beside:
         notes.append(f"{beside} frames were taken beside the map")
     return notes
-
-
-def turned(rotation: Array, heading_rad: float) -> Array:
-    """A camera's rotation (3, 3) turned about the vertical, counter-clockwise."""
-    return np.asarray(so3_exp([0.0, 0.0, heading_rad]) @ rotation)

@@ -73,18 +73,22 @@ class Trial:
         return levels
 
     def search_outcome(self) -> tuple[int, int, int]:
-        """Frames that were searched without their position, found there, and found elsewhere."""
+        """Frames that were searched without their position, found there, and found elsewhere: far
+        from where they were recorded and from where their telemetry led, which may be off itself.
+        """
         right = wrong = 0
         for k, one in self.searched.items():
             if not one.accepted or one.pose is None:
                 continue
-            known = self.second[k].pose if self.second[k].accepted else self.priors[k].pose
-            if known is None:
-                right += 1  # nobody says otherwise
-                continue
-            sigma = 0.0 if self.second[k].accepted else self.priors[k].sigma_m
-            limit = max(_LEAST_SAME_M, _SAME_PLACE_SIGMAS * sigma)
-            near = horizontal_m(one.pose, known) <= limit
+            second, prior = self.second[k], self.priors[k]
+            limit_m = max(_LEAST_SAME_M, _SAME_PLACE_SIGMAS * prior.sigma_m)
+            known = [(second.pose, _LEAST_SAME_M)] if second.accepted else []
+            away = [
+                horizontal_m(one.pose, pose) <= limit
+                for pose, limit in (*known, (prior.pose, limit_m))
+                if pose is not None
+            ]
+            near = any(away) or not away  # where nobody says otherwise
             right, wrong = right + near, wrong + (not near)
         return len(self.searched), right, wrong
 
@@ -126,12 +130,12 @@ def _kind(share: float, trial: Trial, known: Array) -> str:
     if share < _SOME_SHARE:
         return NOT
     wrong = trial.search_outcome()[2]
-    spread = _spread_limit(trial)
+    spread = spread_limit_m(trial)
     scattered = len(known) > 0 and float(np.median(known)) > spread
     return PARTLY if share < _GOOD_SHARE or wrong or scattered else WORKS
 
 
-def _spread_limit(trial: Trial) -> float:
+def spread_limit_m(trial: Trial) -> float:
     """What positions may differ from GNSS by in the median: its own error, and 3 m of ours."""
     sigmas = [p.sigma_m for p in trial.priors if p.pose is not None]
     own = float(np.median(sigmas)) if sigmas else 0.0

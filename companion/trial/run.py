@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.offline.localize import sensors_of
 from companion.recorded.flight import RecordedFlight
 from companion.trial.estimate import Tools, estimate
 from companion.trial.localize import FrameLocalizer, Localized
@@ -19,10 +20,12 @@ from localizer.config import LocalizerConfig
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
 from localizer.map.kind import MapKind
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
+from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.opening import MapStack, build_localizer
 
 Count = Callable[[int, int], None]
@@ -73,15 +76,25 @@ def run_trial(
         priors, second, loader = known.priors, first, first_loader
         if found is not None:
             priors = tuple(found.correction.applied(p) for p in known.priors)
-            loader = FrameLocalizer(
-                build_localizer(stack, found.camera, config), search, found.camera
-            )
             begun = tuple(map(_begun, priors, first))
+            told: dict[int, Pose] = {}
+            sure = build_localizer(stack, found.camera, _known_to(config, begun), sensors_of(told))
+            loader = FrameLocalizer(sure, search, found.camera, told)
             second = _all(flight, begun, loader, stage, "localizing again")
         searched = _searched(flight, priors, loader, options.searches, stage)
     why = reasons(flight.frames, priors, second, found, kind)
     notes = (*flight.notes, *known.notes, *_map_notes(kind, flight))
     return Trial(flight, priors, first, second, searched, found, why, notes)
+
+
+def _known_to(config: LocalizerConfig, priors: tuple[FramePrior, ...]) -> LocalizerConfig:
+    """The settings for corrected roll, pitch and height, as sure as those of most frames: over flat
+    ground a tilt of the camera and a shift of its position look alike.
+    """
+    tilt_deg = float(np.median([p.tilt_sigma_deg for p in priors]))
+    height_m = float(np.median([p.height_sigma_m for p in priors]))
+    attitude = AttitudePrior.known_to(tilt_deg)
+    return config.model_copy(update={"attitude": attitude, "height_sigma_m": height_m})
 
 
 def _measured_width(
@@ -137,7 +150,7 @@ def _begun(prior: FramePrior, first: Localized) -> FramePrior:
     return replace(
         prior, pose=first.pose, rotation=first.pose.rotation, sigma_m=_AGAIN_M,
         height_m=float(first.pose.translation[2]), height_sigma_m=_AGAIN_M, height_known=True,
-        tilt_sigma_deg=_AGAIN_DEG, heading_sigma_deg=_AGAIN_DEG,
+        tilt_sigma_deg=_AGAIN_DEG, heading_sigma_deg=_AGAIN_DEG, was_searched=True,
     )  # fmt: skip
 
 

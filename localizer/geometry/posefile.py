@@ -7,6 +7,7 @@ flipping y and z turns the camera axes into OpenCV's.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,9 @@ def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
     ]
     if not rows:
         raise PoseFileError(f"{path}: holds no pose; expected 'name lon lat alt roll pitch yaw'")
+    name, count = Counter(row.name for row in rows).most_common(1)[0]
+    if count > 1:
+        raise PoseFileError(f"{path}: {count} lines are of {name}; leave the right one")
     return tuple(rows)
 
 

@@ -63,7 +63,7 @@ def _tell_map(flight: RecordedFlight) -> None:
 
     wanted = wanted_map(flight)
     out = Console()
-    _tell_notes(flight.notes)
+    _tell_notes(flight, flight.notes)
     out.print(
         f"{len(flight.frames)} frames, {flight.located} with a position; no map is given. "
         f"{wanted.sentence}.",
@@ -72,8 +72,8 @@ def _tell_map(flight: RecordedFlight) -> None:
     out.print(f"Where open data exist: {wanted.command('area')}", soft_wrap=True, highlight=False)
 
 
-def _tell_notes(notes: tuple[str, ...]) -> None:
-    for note in notes:
+def _tell_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
+    for note in (f"camera by {flight.camera.source}", *notes):
         Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
 
 
@@ -92,7 +92,7 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
 
     trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
     judgement = judge(trial)
-    _tell_notes(trial.notes)
+    _tell_notes(flight, trial.notes)
     with shown_steps(console) as say:
         page = write_trial(report, trial, judgement, map_cache, say)
     deployment = write_trial_deployment(report / "deployment.yaml", trial, map_cache)

@@ -27,6 +27,7 @@ from localizer.types import Float32, Image
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
 INDEX_NAME = "index.safetensors"
+_WHOLE = "copy the cache again, whole, or build it again"
 # The geoid lies -107 to 86 m above the WGS84 ellipsoid (EGM2008).
 LOWEST_GEOID_M, HIGHEST_GEOID_M = -120.0, 100.0
 _PLACE_M = 1.0  # by which a tile's middle may lie outside its node's box: rounding is less
@@ -151,10 +152,12 @@ class TileCache:
         try:
             data = plain_bytes(path / INDEX_NAME, None)
         except OSError as error:
-            raise MapCacheError(f"{path / INDEX_NAME}: cannot be read: {error}") from error
+            raise MapCacheError(
+                f"{path / INDEX_NAME}: cannot be read: {error}; {_WHOLE}"
+            ) from error
         if hashlib.sha256(data).hexdigest() != manifest.index_sha256:
             raise MapCacheError(
-                f"{path / INDEX_NAME}: does not match the hash in the manifest; build it again"
+                f"{path / INDEX_NAME}: does not match the hash in the manifest; {_WHOLE}"
             )
         try:
             index = TileIndex(**safetensors.numpy.load(data))
@@ -198,11 +201,11 @@ class TileCache:
         try:
             data = plain_bytes(path, None)
         except OSError as error:
-            raise MapCacheError(f"tile {tile_id}, {path}: cannot be read: {error}") from error
+            text = f"tile {tile_id}, {path}: cannot be read: {error}; {_WHOLE}"
+            raise MapCacheError(text) from error
         if hashlib.sha256(data).digest() != self.index.digest[tile_id].tobytes():
             raise MapCacheError(
-                f"tile {tile_id}, {path}: content does not match its hash; the file is damaged, "
-                "build the cache again"
+                f"tile {tile_id}, {path}: content does not match its hash; {_WHOLE}"
             )
         try:
             return decode_tile(data, self.world_from_tile[tile_id], textured=textured)
@@ -290,7 +293,7 @@ def read_manifest(path: Path) -> Manifest:
     try:
         data = json.loads(plain_bytes(where))
     except (OSError, ValueError, RecursionError) as error:
-        raise MapCacheError(f"{where}: cannot be read as JSON: {error}") from error
+        raise MapCacheError(f"{where}: cannot be read as JSON: {error}; {_WHOLE}") from error
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION:
         raise MapCacheError(

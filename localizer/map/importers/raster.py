@@ -58,6 +58,7 @@ from localizer.types import Image
 
 TEXELS = 512  # of a tile's side
 MIN_CELLS = 16  # of a tile's side
+_FLAT = "; over even ground --flat-ground METRES stands for it, which costs metres of accuracy"
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path, 
         if kind not in found:
             raise MapSourceError(
                 "a map of rasters needs a DSM and an orthophoto of the same ground: "
-                f"the {kind} is missing"
+                f"the {kind} is missing{_FLAT if kind == 'DSM' else ''}"
             )
     return found["DSM"], found["orthophoto"], warnings
 

@@ -35,6 +35,7 @@ from localizer.map.kind import IMAGERY_DATE
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "IMAGERY_DATE")
 _SENSOR_TAGS = ("SATELLITEID", "SENSOR", "SENSOR_ID", "PLATFORM")
+_FLAT_CELLS = 512  # of a flat ground's side, at most
 _MAX_SIDECAR_BYTES = 16 << 20
 # What sidecar files may name is not fetched: no address of the network is one of these. Vertical
 # keys of GeoTIFF 1.0 are reported only when they are asked for.
@@ -68,6 +69,20 @@ def open_raster(path: Path) -> DatasetReader:
         return rasterio.open(path, driver="GTiff")
     except RasterioError as error:
         raise MapSourceError(f"{path}: cannot be read as a raster: {error}") from error
+
+
+def write_flat_ground(ortho: Path, height_m: float, path: Path) -> Path:
+    """A height model of one height below an orthophoto that has none: a flat map's."""
+    with offline(), open_raster(ortho) as data:
+        across, down = (min(n, _FLAT_CELLS) for n in (data.width, data.height))
+        transform = data.transform * Affine.scale(data.width / across, data.height / down)
+        heights = np.full((1, down, across), height_m, np.float32)
+        shape = {"width": across, "height": down, "count": 1, "dtype": "float32"}
+        place = {"crs": data.crs, "transform": transform, "nodata": -9999.0}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with rasterio.open(path, "w", driver="GTiff", compress="deflate", **shape, **place) as out:
+            out.write(heights)
+    return path
 
 
 def opened(path: Path) -> DatasetReader:

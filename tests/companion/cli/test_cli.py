@@ -1,5 +1,6 @@
 """The command line as a process: what an operator sees of wrong input and of an interrupt."""
 
+import re
 import signal
 import socket
 import subprocess
@@ -11,6 +12,8 @@ import yaml
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
+from companion.errors import ConfigError, ReportError
+from companion.writing import made_folder
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.link import sleep_until
 
@@ -134,6 +137,8 @@ def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path, monkeypat
     assert isinstance(result.exception, TlogError)
     assert "file" in str(result.exception)
     assert "\n" not in str(result.exception)
+    with pytest.raises(ReportError, match=r"--report .*is a file; give a folder"):
+        made_folder(tmp_path / "file", "--report")
 
 
 def test_an_interrupt_during_the_imports_ends_it_without_a_word():
@@ -146,6 +151,14 @@ def test_an_interrupt_during_the_imports_ends_it_without_a_word():
     assert process.returncode == 130
     assert out == ""
     assert "Traceback" not in before + err
+
+
+@pytest.mark.parametrize("options", [("--fov", "nan"), ("--fov=inf",)])
+def test_an_option_that_is_no_finite_number_is_named(tmp_path, options):
+    """The ranges of options let nan pass."""
+    result = CliRunner().invoke(app, ["try", str(tmp_path), *options])
+    assert isinstance(result.exception, ConfigError)
+    assert re.fullmatch("--fov (nan|inf): give a finite number", str(result.exception))
 
 
 def test_the_version_is_that_of_the_package():

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
@@ -55,6 +56,22 @@ def test_commands(source, tmp_path):
     damaged = run("verify", out)
     assert damaged.exit_code == 1
     assert "tile 2" in damaged.output
+
+
+def test_an_orthophoto_alone_becomes_a_flat_map(tmp_path):
+    ortho, out = tmp_path / "ortho.tif", tmp_path / "made" / "area"
+    pixels = np.random.default_rng(0).integers(0, 255, (3, 90, 120), np.uint8)
+    corner = rasterio.Affine(2.0, 0.0, 465_000.0, 0.0, -2.0, 5_250_000.0)
+    with rasterio.open(ortho, "w", driver="GTiff", width=120, height=90, count=3, dtype="uint8",
+                       crs="EPSG:32632", transform=corner) as file:  # fmt: skip
+        file.write(pixels)
+    alone = run("build", ortho, "--out", out)
+    assert "--flat-ground METRES" in str(alone.exception)
+    options = ("--flat-ground", 430, "--vertical-datum", "ellipsoidal", "--workers", 1)
+    assert run("build", ortho, "--out", out, *options).exit_code == 0
+    cache = TileCache.open(out)
+    assert cache.manifest.height_range_m == pytest.approx((430.0, 430.0), abs=5.0)
+    assert cache.manifest.kind.heights == "flat"
 
 
 def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):

@@ -88,6 +88,23 @@ def test_a_survey_is_read_from_the_items_that_were_saved_with_it(tmp_path, kind)
     assert [p.latitude_deg for p in mission.waypoints] == [47.201, 47.202]
 
 
+def test_a_file_that_breaks_off_is_named(tmp_path):
+    """Cut within its altitude, a row of 11 fields was read as a lower waypoint."""
+    plan(tmp_path, waypoint(47.201, 60), waypoint(47.202, 60))
+    rows(tmp_path, (0, 1, 0, 16, 0, 0, 0, 0, *HOME, 1), (1, 0, 3, 16, 0, 0, 0, 0, 47.2, 8.2, 60, 1))
+    for name, why in (
+        ("mission.plan", "breaks off at line 1"),
+        ("mission.waypoints", "row 1 has 11"),
+    ):
+        path = tmp_path / name
+        path.write_text(path.read_text()[:-3])
+        with pytest.raises(MissionFileError, match=f"{name}.*{why}"):
+            read_mission(path)
+    path.write_text("")
+    with pytest.raises(MissionFileError, match="it is empty"):
+        read_mission(path)
+
+
 @pytest.mark.parametrize(
     "entry",
     [

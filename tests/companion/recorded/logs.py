@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +81,8 @@ _ROWS = {  # name: (type, format, columns)
     "XKF1": (135, "QBffffff", "TimeUS,C,VN,VE,VD,PN,PE,PD"),
     "IMU": (136, "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
     "ARM": (137, "QB", "TimeUS,ArmState"),
-    "CAM": (134, "QBQIHLLefffff", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
+    "CAM": (134, "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
+    "TRIG": (138, "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
 }
 _CODES = {"Q": "Q", "B": "B", "I": "I", "H": "H", "c": "h", "C": "H", "L": "i", "e": "i",
           "f": "f", "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
@@ -91,9 +92,11 @@ _GPS_EPOCH_S, _LEAP_S = 315_964_800.0, 18.0
 
 def write_dataflash(
     path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None,
-    origin: tuple[float, float, float] = (*ORIGIN, 500.0),
+    origin: tuple[float, float, float] = (*ORIGIN, 500.0), exposures: Sequence[float] = (),
 ) -> Path:  # fmt: skip
-    """The same flight as a .bin, with three camera triggers. origin: latitude, longitude, AMSL."""
+    """The same flight as a .bin. origin: latitude, longitude, AMSL; exposures: seconds of CAM, each
+    with its TRIG 0.2 s before.
+    """
     body = b"".join(_format(name) for name in _ROWS) + _row("ARM", round(BOOT_S * 1e6), 1)
     gps_s = UTC_S - _GPS_EPOCH_S + _LEAP_S
     for step in range(round(seconds * 10)):
@@ -117,8 +120,14 @@ def write_dataflash(
         body += _row("ATT", us, 0, degrees[0], 0, degrees[1], turn, turn)
         if gimbal_pitch_deg is not None:
             body += _row("MNT", us, 0, 0.0, 0.0, 0.0, gimbal_pitch_deg, 0.0, 0.0)
-        if step in (20, 40, 60):
-            body += _row("CAM", us, 0, step, 0, 0, lat, lng, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for number, t in enumerate(exposures):
+        north, east, height, roll, pitch, yaw = motion(t)
+        at = [round(1e7 * degrees) for degrees in place(north, east, origin)]
+        up = [round(100 * metres) for metres in (origin[2] + height, height, origin[2] + height)]
+        angles = [round(math.degrees(a) * 100) for a in (roll, pitch, yaw)]
+        for name, when in (("TRIG", t - 0.2), ("CAM", t)):
+            us = round((BOOT_S + when) * 1e6)
+            body += _row(name, us, 0, number, 0, 0, *at, *up, *angles[:2], angles[2] % 36000)
     path.write_bytes(body)
     return path
 

@@ -1,6 +1,7 @@
 """ArduPilot's logs, and the clock of images beside them."""
 
 import math
+import re
 import sys
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 
 from companion.errors import FootageError
 from companion.recorded.autopilot_log import read_autopilot_log
-from companion.recorded.clock import find_offset
+from companion.recorded.clock import exposures_of, find_offset
 from companion.recorded.flight import Datum, RecordedFrame, Telemetry
 from companion.recorded.footage import FootageOptions, read_footage
 from localizer.geometry.camera import Camera
@@ -47,9 +48,6 @@ def test_a_log_says_where_the_camera_was_and_looked(tmp_path, kind, gimbal):
         down = math.radians(gimbal)
         expected = [math.cos(down) * math.cos(yaw), math.cos(down) * math.sin(yaw), -math.sin(down)]
     np.testing.assert_allclose(axis, expected, atol=0.02)
-    if kind == "bin":
-        assert len(log.triggers_ns) == 3
-        assert log.triggers_ns[0] == pytest.approx((UTC_S + 2.0) * 1e9, abs=2e8)
 
 
 def test_a_log_of_px4_is_read_by_pyulog(tmp_path, monkeypatch):
@@ -109,13 +107,12 @@ def _cs(angle):
     return math.cos(angle), math.sin(angle)
 
 
-def _footage(folder, camera, offset_s, count=10):
-    """Images every 0.8 s whose clock is behind the log's by so much."""
+def _footage(folder, camera, offset_s, count=10, motion=swaying, times=None):
+    """Images every 0.8 s, or at such times, whose clock is behind the log's by so much."""
     ground, frames = _ground(np.random.default_rng(1)), []
-    for k in range(count):
-        t = 4.0 + 0.8 * k
+    for k, t in enumerate(times or [4.0 + 0.8 * k for k in range(count)]):
         path = folder / f"{k:02d}.png"
-        cv2.imwrite(str(path), _seen(ground, swaying, t, camera))
+        cv2.imwrite(str(path), _seen(ground, motion, t, camera))
         time_ns = round((UTC_S + t - offset_s) * 1e9)
         frames.append(RecordedFrame(path.name, path, time_ns, Telemetry()))
     return frames
@@ -128,8 +125,38 @@ def test_the_clocks_offset_is_found_by_motion(tmp_path):
     found = find_offset(frames, camera, log.track, (-3.0, 3.0))
     assert found.is_decisive
     assert found.offset_s == pytest.approx(1.34, abs=0.06)
-    still = [f for f in frames for _ in (0,)][:1]
-    assert find_offset(still, camera, log.track, (-3.0, 3.0)) is None
+    assert find_offset(frames[:1], camera, log.track, (-3.0, 3.0)) is None
+
+
+def _level(t):
+    return 8.0 * t, 0.0, 80.0, 0.0, 0.0, 0.0
+
+
+def _round(t):
+    """Rounds of 12 s: the flight looks alike again and again."""
+    turn = 2.0 * math.pi * t / 12.0
+    return 60.0 * math.sin(turn), 60.0 - 60.0 * math.cos(turn), 80.0, 0.2, 0.0, turn
+
+
+def _other(t):
+    return 9.0 * t, 4.0 * math.sin(0.7 * t), 70.0, 0.2 * math.sin(0.6 * t + 1.0), 0.0, 0.1 * t
+
+
+@pytest.mark.parametrize(
+    ("motion", "flown"), [(_level, _level), (_round, _round), (swaying, _other)]
+)
+@pytest.mark.parametrize("count", [4, 10])
+def test_an_offset_that_others_match_or_chance_is_not_decisive(tmp_path, motion, flown, count):
+    """Straight and level, on equal rounds, or in another flight's log: an offset was found by
+    chance where three pairs of images left 2 degrees.
+    """
+    camera = Camera.from_fov(480, 360, 60.0)
+    frames = _footage(tmp_path, camera, 0.0, count, motion)
+    log = read_autopilot_log(write_dataflash(tmp_path / "flight.bin", flown, 60.0))
+    for begin in (-3.0, 5.0, 20.0):
+        found = find_offset(frames, camera, log.track, (begin, begin + 25.0))
+        assert found is not None
+        assert not found.is_decisive, found.text
 
 
 def test_photos_beside_a_log_take_its_telemetry(tmp_path):
@@ -139,7 +166,7 @@ def test_photos_beside_a_log_take_its_telemetry(tmp_path):
     rows = "".join(f"{f.name},{ORIGIN[0]},{ORIGIN[1]},{f.time_ns / 1e9:.3f}\n" for f in frames)
     (tmp_path / "times.csv").write_text("name,latitude,longitude,utc\n" + rows)
     flight = read_footage(tmp_path, FootageOptions(tmp_path / "work", fov_deg=60.0))
-    assert any("found by motion" in note and "+0.5" in note for note in flight.notes)
+    assert any("by motion" in note and "+0.5" in note for note in flight.notes)
     north, east, *_ = swaying(4.0)
     first = flight.frames[0].telemetry.position
     assert (first.latitude_deg, first.longitude_deg) == pytest.approx(place(north, east), abs=1e-5)
@@ -155,13 +182,45 @@ def test_photos_beside_a_log_take_its_telemetry(tmp_path):
         read_footage(tmp_path, FootageOptions(tmp_path / "work", fov_deg=60.0))
 
 
-@pytest.mark.real
-def test_a_real_flights_clock(real_data, tmp_path):
-    folder = real_data("cmac")
-    options = FootageOptions(
-        tmp_path, places=folder / "queries.csv", log=folder / "flight.tlog", fov_deg=63.3
-    )
-    flight = read_footage(folder / "queries", options)
-    assert flight.located == 18
-    assert any("found by motion" in note for note in flight.notes)
-    assert all(f.telemetry.view.nadir_angle_deg < 10.0 for f in flight.frames)
+_EXPOSED = (4.03, 5.21, 7.34, 8.02, 11.57, 12.66)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "by"),
+    [
+        ([round(t) for t in _EXPOSED[1:]], r"by their times, \+\d\d\.\d\d s apart"),
+        ([None] * 6, "by their order, as they have no times"),
+    ],
+)
+def test_photos_whose_exposures_are_logged_take_those(tmp_path, stamps, by):
+    """CAM's own place and attitude, of a camera whose clock is a minute late and has whole seconds;
+    TRIG, the command 0.2 s before, is not the exposure.
+    """
+    camera = Camera.from_fov(480, 360, 60.0)
+    taken = _EXPOSED[-len(stamps) :]
+    frames = _footage(tmp_path, camera, 0.0, times=taken)
+    write_dataflash(tmp_path / "flight.bin", swaying, 20.0, exposures=_EXPOSED)
+    times = ["" if s is None else f"{UTC_S + s - 60.0:.0f}" for s in stamps]
+    rows = "".join(f"{f.name},0,0,{t}\n" for f, t in zip(frames, times, strict=True))
+    (tmp_path / "times.csv").write_text("name,latitude,longitude,utc\n" + rows)
+    flight = read_footage(tmp_path, FootageOptions(tmp_path / "work", fov_deg=60.0))
+    assert any(re.search(by, note) for note in flight.notes), flight.notes
+    for frame, t in zip(flight.frames, taken, strict=True):
+        north, east, height, roll, _, yaw = swaying(t)
+        said = frame.telemetry
+        at = said.position.latitude_deg, said.position.longitude_deg
+        assert at == pytest.approx(place(north, east), abs=2e-7)
+        assert {h.datum: h.value_m for h in said.position.heights} == pytest.approx(
+            {Datum.TAKEOFF: height, Datum.AMSL: 500 + height}, abs=0.01
+        )
+        lean = [math.sin(roll) * math.sin(yaw), -math.sin(roll) * math.cos(yaw), math.cos(roll)]
+        np.testing.assert_allclose(said.view.ned_from_camera[:, 2], lean, atol=1e-3)
+
+
+def test_exposures_at_equal_intervals_are_not_guessed():
+    at = [round((UTC_S + 2.0 * k) * 1e9) for k in range(10)]
+    exposures, times = [Telemetry(t) for t in at], [t + 300_000_000 for t in at]
+    assert exposures_of(times, exposures) == tuple(exposures)
+    assert exposures_of(times[2:8], exposures) is None  # five begins fit alike
+    assert exposures_of([*times[:9], times[9] + 5 * 10**9], exposures) is None
+    assert exposures_of([None] * 9, exposures) is None

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -86,6 +87,15 @@ def test_what_is_wrong_with_photos_is_named(tmp_path):
         read_footage(empty / "DJI_0001.DNG", options)
     with pytest.raises(FootageError, match="no such file"):
         read_footage(tmp_path / "nowhere", options)
+    write_tlog(tmp_path / "a.tlog", swaying, 1.0)
+    for wrong, why in (
+        ({"places": tmp_path / "a.tlog"}, "--places .*autopilot's log; give it as --log"),
+        ({"log": empty / "DJI_0001.DNG"}, "--log .*no autopilot's log"),
+        ({"log": tmp_path / "b.bin"}, "--log .*no such file"),
+        ({"camera": empty}, "--camera .*is a folder; give the file"),
+    ):
+        with pytest.raises(FootageError, match=why):
+            read_footage(empty, replace(options, **wrong))
     bare = tmp_path / "bare"
     bare.mkdir()
     write_photo(bare / "a.jpg")
@@ -98,7 +108,8 @@ def test_what_is_wrong_with_photos_is_named(tmp_path):
 def test_zero_angles_other_lenses_and_rotated_photos_are_told(tmp_path):
     folder = _survey(tmp_path / "p", FlightYawDegree="90.0")
     for k in range(4):
-        zero = dji(GimbalRollDegree="+0.00", GimbalPitchDegree="+0.00", GimbalYawDegree="+0.00")
+        zero = dji(GimbalRollDegree="+0.00", GimbalPitchDegree="+0.00", GimbalYawDegree="+0.00",
+                   FlightYawDegree=k)  # fmt: skip
         write_photo(folder / f"Z_{k:04d}.JPG", zero, exif={_FOCAL_35: 24, 0x0112: 6})
     write_photo(folder / "thermal.jpg", exif={_FOCAL_35: 24}, size=(32, 24))
     notes = " ".join(read_footage(folder, FootageOptions(tmp_path / "w")).notes)
@@ -119,6 +130,35 @@ def test_what_cannot_be_used_is_left_out_or_refused(tmp_path):
         read_footage(folder, FootageOptions(tmp_path / "w"))
     with pytest.raises(FootageError, match="give one of its folders: p"):
         read_footage(tmp_path, FootageOptions(tmp_path / "w"))
+
+
+def test_a_repeated_photo_counts_once(tmp_path):
+    """As evidence it says nothing new: 100 links to 8 photos made the sigmas a third."""
+    folder = _survey(tmp_path / "p", 3)
+    (folder / "again.JPG").symlink_to(folder / "DJI_0001.JPG")
+    shutil.copy(folder / "DJI_0002.JPG", folder / "copy.JPG")
+    flight = read_footage(folder, FootageOptions(tmp_path / "w"))
+    assert len(flight.frames) == 3
+    assert "2 photos repeat others byte by byte: left out" in flight.notes
+
+
+def test_a_calibration_beside_the_photos_is_used_without_a_folding_lens(tmp_path):
+    """A real one of OpenCV: K is good, k3 folds the corners."""
+    folder = tmp_path / "set" / "photos"
+    folder.mkdir(parents=True)
+    write_photo(folder / "a.jpg", size=(164, 123))
+    told = {"xresolution": 1640, "yresolution": 1232, "lens": 3.0,
+            "K": [[1329.5, 0.0, 810.0], [0.0, 1329.3, 618.6], [0.0, 0.0, 1.0]],
+            "D": [[0.166, -0.223, -0.0038, 0.0024, -0.608]]}  # fmt: skip
+    file = tmp_path / "set" / "camera_picam.json"
+    file.write_text(json.dumps(told))
+    guess = read_footage(folder, FootageOptions(tmp_path / "w")).camera
+    assert guess.camera.fx == pytest.approx(132.95, rel=1e-3)
+    assert not guess.camera.is_distorted
+    assert guess.source.startswith("camera_picam.json without its distortion")
+    file.write_text(json.dumps(told | {"D": [[-1.7, 0.9, 0.0, 0.0, 0.0]]}))
+    with pytest.raises(FootageError, match="give the field of view alone, as --fov"):
+        read_footage(folder, FootageOptions(tmp_path / "w"))
 
 
 def test_photos_that_another_program_turned_are_refused(tmp_path):

@@ -34,6 +34,8 @@ def test_places_that_cannot_be_are_named(tmp_path):
         ("a.jpg 47.3 108.5 500\n", "longitude comes before latitude"),
         ("a.jpg here there\n", "expected a name"),
         ("\n", "holds no place"),
+        ("a.jpg 8.5 47.3\na.jpg 8.5 47.4\n", r":2: a second line of a\.jpg"),
+        ("name,lat,lon\na.jpg,149.2,-35.4\n", "are they swapped"),
     ):
         file.write_text(text)
         with pytest.raises(FootageError, match=why):

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from companion.errors import FootageError
 from companion.recorded.flight import (
     CameraGuess,
     Datum,
@@ -20,9 +21,10 @@ from companion.recorded.flight import (
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, priors_of
 from companion.trial.reasons import reasons
+from companion.trial.result import Trial
 from companion.trial.wanted_map import wanted_map
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import so3_exp
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 
 CAMERA = CameraGuess(Camera.from_fov(640, 480, 60.0), 2.0, "test")
@@ -106,6 +108,41 @@ def test_each_failure_has_its_reason(cache, tmp_path):
     assert why[6].startswith("too few frames agree")
     done = Localized("a", priors[0].pose, np.eye(6), 0.5, True)
     assert reasons(frames[:1], priors[:1], [done], None) == {}
+
+
+def test_a_search_is_wrong_where_neither_record_nor_registration_agree(cache):
+    """A real photo that was found 4 m from the truth counted as wrong: its registration from
+    telemetry, 14 m off, was the only reference.
+    """
+    flight = _flight(cache.frame, [(0.0, 0.0)] * 3, (Height(80.0, Datum.TAKEOFF, 3.0),), course=0.0)
+    priors = priors_of(flight, cache).priors
+
+    def found(prior, east_m):
+        pose = Pose(prior.rotation, prior.pose.translation + np.array([east_m, 0, 0]))
+        return Localized("a", pose, np.eye(6), 0.5, True, True)
+
+    second = tuple(found(p, 14.0) for p in priors)
+    searched = {k: found(p, m) for k, (p, m) in enumerate(zip(priors, (3, 20, -30), strict=True))}
+    trial = Trial(flight, priors, second, second, searched, None, {}, ())
+    assert trial.search_outcome() == (3, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "slip"),
+    [
+        (lambda p: (p.longitude_deg, p.latitude_deg), "latitude and longitude are swapped"),
+        (lambda p: (p.latitude_deg, -p.longitude_deg), "longitude's sign is wrong"),
+        (lambda _: (-35.4, 149.2), "give the map of that place"),
+    ],
+)
+def test_footage_far_from_the_map_is_refused_with_the_likely_slip(cache, change, slip):
+    (frame,) = _flight(cache.frame, [(0.0, 0.0)], ()).frames
+    position = frame.telemetry.position
+    latitude, longitude = change(position)
+    wrong = replace(position, latitude_deg=latitude, longitude_deg=longitude)
+    moved = frame.with_telemetry(replace(frame.telemetry, position=wrong))
+    with pytest.raises(FootageError, match=rf"km from the map.*{slip}"):
+        priors_of(RecordedFlight("a", "photos", (moved,), CAMERA), cache)
 
 
 def test_the_wanted_map_reaches_past_the_footage(cache):

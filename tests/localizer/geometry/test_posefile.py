@@ -46,6 +46,7 @@ def test_round_trip_through_a_file(tmp_path, seed):
         ("a.jpg 8 147 450 0 0 0\n", "out of range"),
         ("a.jpg 8 47 450 0 nan 0\n", "finite"),
         ("a.jpg 8 47 high 0 0 0\n", "could not convert"),
+        ("a.jpg 8 47 0 0 0 0\na.jpg 8 48 0 0 0 0\n", r"2 lines are of a\.jpg"),
     ],
 )
 def test_bad_lines_name_file_and_line(tmp_path, text, what):
