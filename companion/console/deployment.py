@@ -23,7 +23,7 @@ _MOST_BYTES = 64 << 10
 
 def shown(path: Path, editable: bool) -> dict[str, Any]:
     """The file's text and the help; credentials only for someone who may change the file.
-    `ConfigError` if the file cannot be read.
+    `ConfigError` if the file cannot be read. editable: they may.
     """
     try:
         text = plain_text(path)

@@ -28,7 +28,9 @@ _INTEGER_FORMATS = {
 
 
 def decode_value(value: float, kind: int, *, bytewise: bool) -> float:
-    """The number in PARAM_VALUE: PX4 puts an integer's bytes into the float, ArduPilot casts."""
+    """The number in PARAM_VALUE: PX4 puts an integer's bytes into the float, ArduPilot casts. kind:
+    MAV_PARAM_TYPE; bytewise: as PX4 does.
+    """
     if bytewise and kind in _INTEGER_FORMATS:
         return float(struct.unpack(_INTEGER_FORMATS[kind], struct.pack("<f", value))[0])
     return float(value)

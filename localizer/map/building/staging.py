@@ -116,7 +116,7 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
     """The staging folder of a build, locked; what an interrupted build of the same `parameters`
     left there is kept. On an exception it stays for the next try, `out` is not touched.
     `MapCacheError` if the cache exists (unless it may be replaced), the folder cannot be made, or
-    another build holds it.
+    another build holds it. overwrite: an existing cache may be replaced.
     """
     if out.exists() and not overwrite:
         raise MapCacheError(
