@@ -1,4 +1,4 @@
-"""Time of feature extraction: `tiny` and `s0` on every execution provider there is, in one table.
+"""Time of feature extraction: `tiny` (float32, int8) and `s0` on every provider, in one table.
 
     python -m benchmarks.features.network_speed [--s0 MODEL.onnx] [--threads 2]
 
@@ -22,7 +22,7 @@ from benchmarks.common.arguments import Parser, existing, whole
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
 from localizer.features import OnnxExtractor
-from localizer.features.extractor import SHIPPED_MODEL
+from localizer.features.extractor import SHIPPED_INT8, SHIPPED_MODEL
 from localizer.features.providers import SHORT_NAMES
 from localizer.types import Image
 
@@ -118,7 +118,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        models = [SHIPPED_MODEL, *(args.s0 or untrained_s0(Path(folder)))]
+        models = [SHIPPED_MODEL, SHIPPED_INT8, *(args.s0 or untrained_s0(Path(folder)))]
         print(table(list(measure(models, SIZES, args.threads, args.count))))
 
 

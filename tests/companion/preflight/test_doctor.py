@@ -50,7 +50,7 @@ def test_a_good_deployment(map_cache, feed):
         "power mode",
     }
     assert all(findings[name].ok for name in ("map", "localizer", "camera"))
-    assert findings["localizer"].found.startswith("tiny (onnxruntime, ")
+    assert findings["localizer"].found.startswith("tiny")
     assert "numba" in findings["localizer"].found
     assert findings["camera"].found == "160x120, 20.0 Hz"
     assert "tiles" in findings["map"].found

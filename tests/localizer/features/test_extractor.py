@@ -7,10 +7,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnxruntime as ort
 import pytest
 
 from localizer.errors import ModelError
-from localizer.features import GradientExtractor, OnnxExtractor, extractor, load_extractor
+from localizer.features import (
+    GradientExtractor,
+    OnnxExtractor,
+    extractor,
+    load_extractor,
+    providers,
+)
 from localizer.features.extractor import model_key
 from localizer.types import FeaturePyramid
 
@@ -69,12 +76,39 @@ def test_without_shipped_weights_the_fallback_says_so(monkeypatch, tmp_path, cap
 def test_shipped_weights_run_at_sizes_divisible_by_eight(image: np.ndarray) -> None:
     loaded = load_extractor(threads=1)
     assert isinstance(loaded, OnnxExtractor)
-    assert loaded.name == f"tiny (onnxruntime, {loaded.provider})"
+    assert loaded.name in [f"{n} (onnxruntime, {loaded.provider})" for n in ("tiny", "tiny-int8")]
     assert_is_pyramid(loaded.extract(image), image)
     odd = np.ascontiguousarray(image[:200, :264])
     assert_is_pyramid(loaded.extract(odd), odd)
     with pytest.raises(ModelError, match="divisible by 8"):
         loaded.extract(np.ascontiguousarray(image[:, :300]))
+
+
+@pytest.mark.parametrize(
+    ("flags", "gpu", "name"),
+    [(b"avx512f", [], "tiny"), (b"avx512_vnni", [], "tiny-int8"),
+     (b"avx512_vnni", ["CUDAExecutionProvider"], "tiny"), (None, [], "tiny")],
+)  # fmt: skip
+def test_eight_bits_serve_where_they_are_faster(
+    flags: bytes | None, gpu: list[str], name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if flags:
+        (tmp_path / "cpuinfo").write_bytes(b"flags : fpu " + flags)
+    monkeypatch.setattr(providers, "_CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(ort, "get_available_providers", lambda: [*gpu, "CPUExecutionProvider"])
+    monkeypatch.setattr(extractor, "OnnxExtractor", lambda model, **_: model)
+    assert load_extractor().stem == name  # type: ignore[attr-defined]
+
+
+@pytest.mark.skipif(not providers.prefers_int8(), reason="sums saturate without VNNI")
+def test_features_in_eight_bits_are_those_of_float32(image: np.ndarray) -> None:
+    exact, quantized = (
+        OnnxExtractor(m, threads=1).extract(image).levels
+        for m in (extractor.SHIPPED_MODEL, extractor.SHIPPED_INT8)
+    )
+    for a, b in zip(exact, quantized, strict=True):
+        assert float((a.features * b.features).sum(-1).mean()) > 0.99
+        np.testing.assert_array_equal(a.confidence, b.confidence)
 
 
 def test_a_model_asked_for_by_path_must_exist(tmp_path: Path) -> None:
@@ -96,10 +130,10 @@ def test_two_models_of_one_name_are_told_apart(tmp_path: Path) -> None:
     description = json.loads(extractor.SHIPPED_MODEL.with_suffix(".json").read_text())
     description["sha256"] = hashlib.sha256(model.read_bytes()).hexdigest()
     model.with_suffix(".json").write_text(json.dumps(description))
-    shipped, trained = load_extractor(), load_extractor(model)
+    shipped, trained = (load_extractor(m) for m in (extractor.SHIPPED_MODEL, model))
     assert shipped.name == trained.name
     assert model_key(shipped) != model_key(trained)
-    assert model_key(shipped) == model_key(load_extractor())
+    assert model_key(shipped) == model_key(load_extractor(extractor.SHIPPED_MODEL))
 
 
 def test_a_changed_byte_is_found(tmp_path: Path) -> None:

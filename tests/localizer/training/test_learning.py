@@ -21,6 +21,7 @@ from localizer.training.data.batches import LoaderConfig, collate, crop_pair  # 
 from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
+from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer, perturbed  # noqa: E402
 from localizer.training.losses import Batch, alignment_loss, project, sample  # noqa: E402
@@ -183,3 +184,8 @@ def test_export_is_checked_against_torch(config: TrainConfig, tmp_path: Path) ->
     assert [level.stride for level in extractor.info.levels] == [8, 4, 2]
     text = model.with_suffix(".json").read_text()
     assert str(config.data.shards) not in text
+    smaller = model.with_name("tiny-int8.onnx")
+    assert quantize(model, smaller, sorted(config.data.shards.glob("*.npz"))) > 0.99
+    assert OnnxExtractor(smaller, threads=1).info.name == "tiny-int8"
+    with pytest.raises(ModelError, match="0 images"):
+        quantize(model, smaller, [])
