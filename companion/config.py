@@ -22,6 +22,7 @@ from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
 from localizer.geometry.camera import MAX_READOUT_MS, Camera, lens_fault
 from localizer.geometry.lens import LensModel, whole_coefficients
+from localizer.map.kind import MapKind
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.config import BridgeConfig, StrictModel
 
@@ -181,6 +182,11 @@ class TargetConfig(StrictModel):
     operator_delay_sigma_ms: float = Field(100.0, exclude=True)  # its error, 1 sigma
     # time outside the image after which a clicked target ends
     timeout_s: float = Field(300.0, exclude=True)
+
+    def over(self, kind: MapKind) -> TargetConfig:
+        """The same over a map of a kind: a target may stand on a roof that the map lacks."""
+        sigma_m = max(self.map_sigma_m, kind.unknown_height_sigma_m)
+        return self.model_copy(update={"map_sigma_m": sigma_m})
 
     @field_validator("detections")
     @classmethod

@@ -148,7 +148,6 @@ def parser() -> Parser:
     p.add_argument("--pairs", type=whole(1, 100_000), default=60, help="how many")
     p.add_argument("--seed", type=whole(0, 9), default=0, help="0, 1, 2: other places and draws")
     p.add_argument("--split", choices=("test", "validation"), default="test", help="of the places")
-    p.add_argument("--shared-detail", action="store_true", help="the easier pairs")
     p.add_argument(
         "--textures", type=Path, default=Path("../shared/data/textures"), help="real textures"
     )
@@ -198,22 +197,19 @@ def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
     """The set's name, and its pairs, as wide as the widest that is asked for."""
     size = (max(args.widths), max(args.widths) * SIZE[1] // SIZE[0])
     if args.mesh:
-        return "mesh world", mesh_pairs(
-            args.pairs, args.seed, shared_detail=args.shared_detail, size=size
-        )
+        return "mesh world", mesh_pairs(args.pairs, args.seed, size)
     if args.real is not None:
         return args.real.resolve().name, real_pairs(
             args.real,
             args.pairs,
             args.seed,
             args.cache,
-            shared_detail=args.shared_detail,
-            size=size,
+            size,
         )
     textures = args.textures if args.textures.is_dir() else None
     if textures is None:
         _log.warning("%s is absent: places without real textures", args.textures)
-    which = MadePlaces(args.split, args.seed, args.shared_detail, textures, size)
+    which = MadePlaces(args.split, args.seed, textures, size)
     return "generated", made_pairs(args.pairs, which, args.cache)
 
 

@@ -2,7 +2,7 @@
 
 What differs between map and query is drawn by the training's own generator, with other seeds and
 with real textures that no training run has seen; model-card.md says what each difference
-stands for. `shared_detail` is the easier condition of earlier reports.
+stands for.
 """
 
 from __future__ import annotations
@@ -44,14 +44,13 @@ class TestPair:
 
 @dataclass(frozen=True)
 class MadePlaces:
-    """Which generated pairs: split (test or validation), seed (0, 1, 2, ... other places), whether
-    map and query share their fine texture, and the folder of the real textures, if any; size: of
-    the pictures. Wider ones look from further away, so that a pixel is as much ground.
+    """Which generated pairs: split (test or validation), seed (0, 1, 2, ... other places), and
+    the folder of the real textures, if any; size: of the pictures. Wider ones look from further
+    away, so that a pixel is as much ground.
     """
 
     split: str
     seed: int
-    shared_detail: bool
     textures: Path | None
     size: tuple[int, int] = SIZE
 
@@ -63,9 +62,8 @@ class MadePlaces:
     @property
     def name(self) -> str:
         """Folder of these pairs in the cache."""
-        kind = "easy" if self.shared_detail else "made"
         wide = "" if self.size == SIZE else f"-{self.size[0]}"
-        return f"{kind}-{self.split}-{self.seed}{wide}" + ("" if self.textures else "-untextured")
+        return f"made-{self.split}-{self.seed}{wide}" + ("" if self.textures else "-untextured")
 
     @property
     def scenes(self) -> SceneConfig:
@@ -80,7 +78,6 @@ class MadePlaces:
             cell_m=(0.25, 0.55),
             conditions=self.conditions,
             motion=(METRES, DEGREES),
-            shared_detail=self.shared_detail,
         )
 
 
@@ -114,12 +111,10 @@ def narrowed(pair: TestPair, width: int) -> TestPair:
     return replace(pair, view=view, query=query)
 
 
-def mesh_pairs(
-    count: int, seed: int, *, shared_detail: bool, size: tuple[int, int] = SIZE
-) -> list[TestPair]:
+def mesh_pairs(count: int, seed: int, size: tuple[int, int] = SIZE) -> list[TestPair]:
     """Pairs of a generated mesh world that no training run has seen."""
     rng = np.random.default_rng((seed, 2))
-    scenes = MadePlaces("test", seed, shared_detail, None, size).scenes
+    scenes = MadePlaces("test", seed, None, size).scenes
     made = world_pairs(900_000 + seed, scenes, count=count)
     return [_degraded(pair, rng, k) for k, pair in enumerate(made)]
 

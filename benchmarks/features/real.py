@@ -46,8 +46,6 @@ def real_pairs(
     count: int,
     seed: int,
     cache: Path,
-    *,
-    shared_detail: bool,
     size: tuple[int, int] = SIZE,
 ) -> list[TestPair]:
     """Pairs of the real set in `folder`, conditions in turn; its map is built in `cache` once."""
@@ -59,7 +57,7 @@ def real_pairs(
         renderer = NumbaRenderer(streamer)
         if photos.exists():
             return _photo_pairs(renderer, photos, count, seed, size)
-        return _rendered_pairs(renderer, count, seed, size, shared_detail=shared_detail)
+        return _rendered_pairs(renderer, count, seed, size)
 
 
 def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
@@ -115,7 +113,7 @@ def _surveyed(view: RenderedView, rng: np.random.Generator, *, repainted: bool) 
 
 
 def _rendered_pairs(
-    renderer: NumbaRenderer, count: int, seed: int, size: tuple[int, int], *, shared_detail: bool
+    renderer: NumbaRenderer, count: int, seed: int, size: tuple[int, int]
 ) -> list[TestPair]:
     """Views of the map itself, 80 to 200 m up, under every condition in turn."""
     kinds = (*CONDITIONS, SEASON)
@@ -129,10 +127,8 @@ def _rendered_pairs(
         if min((view.depth > 0).mean(), (seen.depth > 0).mean()) < 0.8:
             continue
         condition = kinds[len(pairs) % len(kinds)]
-        query = seen.rgb
-        if not shared_detail:
-            query = _regrown_image(seen, rng)
-            view = _surveyed(view, rng, repainted=False)
+        query = _regrown_image(seen, rng)
+        view = _surveyed(view, rng, repainted=False)
         if condition == SEASON:
             query = _image(season_shift(_squared(query), rng), query.shape)
         look = sample_appearance(rng, "day" if condition == SEASON else condition)

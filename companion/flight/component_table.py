@@ -58,6 +58,7 @@ from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
+from localizer.map.inspection.kind import map_kind
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.opening import MapStack, build_localizer
@@ -217,7 +218,7 @@ def _targets(making: BuildContext) -> TargetReporter:
     channels, bridge = making.channels, making[Bridge]
     cache, numbers = making[MapStack].cache, TargetNumbers()
     reporter = TargetReporter(
-        making.config.targets,
+        making.config.targets.over(map_kind(cache)),
         MapSurface(cache).cast,
         channels.targets.send,
         channels.gone.send,

@@ -8,18 +8,18 @@ from companion.recorded.flight import LogBeside
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.tlog import read_tlog
-from mavlink_bridge.messages import Attitude, GimbalAttitude, InertialSample, VehicleState
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
-class RecordedAutopilot:
+class RecordedAutopilot(VehicleTracker):
     """What the vehicle had said by a time, from the recorded messages."""
 
     def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
         c = bridge.camera
         mount = quat.from_euler(*np.radians([c.mount_roll_deg, c.mount_pitch_deg, c.mount_yaw_deg]))
         self._now_ns = start_ns
-        self._tracker = VehicleTracker(
+        super().__init__(
             bridge.system_id,
             mount,
             bridge.camera.mount == "fixed",
@@ -35,37 +35,13 @@ class RecordedAutopilot:
         self._now_ns = time_ns
         while self._next is not None and self._next[0] <= time_ns:
             received_ns, message = self._next
-            if self._tracker.accepts(message):
+            if self.accepts(message):
                 if message.get_type() != "TIMESYNC":
-                    self._tracker.handle(message, received_ns)
+                    self.handle(message, received_ns)
                 elif message.tc1 != 0:  # an answer; ts1 is our own time of the question
-                    self._tracker.timesync(message.tc1, message.ts1, received_ns)
+                    self.timesync(message.tc1, message.ts1, received_ns)
             self._next = next(self._messages, None)
 
     def state(self) -> VehicleState:
         """What the vehicle said about itself."""
-        return self._tracker.snapshot(self._now_ns)
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time."""
-        return self._tracker.attitude_at(time_ns)
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a CLOCK_MONOTONIC time."""
-        return self._tracker.gimbal_at(time_ns)
-
-    def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
-        """The camera's reported zoom at a time, per cent of its range."""
-        return self._tracker.zoom_at(time_ns, hold_s)
-
-    def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's NED position from its origin at a time."""
-        return self._tracker.local_at(time_ns)
-
-    def global_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's (latitude, longitude in degrees, altitude AMSL) at a time."""
-        return self._tracker.global_at(time_ns)
-
-    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """What the IMU read after a time, oldest first; at most the last 10 s."""
-        return self._tracker.inertial_since(time_ns)
+        return self.snapshot(self._now_ns)

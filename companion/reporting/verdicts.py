@@ -50,6 +50,11 @@ _ADVICE = {
         "fixes are further off than their own 95 % bound says, more often than 5 in 100",
         "calibration and time stamps, which no single picture shows, and localizer.map_error_m",
     ),
+    "fixed targets in their bound": Advice(
+        "coordinates of standing targets are further off than their sigma says",
+        "the map's kind: what stands on the ground and is not in its heights; then the targets' "
+        "own lines",
+    ),
     "fixed targets": Advice(
         "coordinates given for places that stand still are off",
         "the targets' own lines: one bad target is an edge or a roof, all of them are the pose",

@@ -138,23 +138,50 @@ def _matched(
     return rows[found >= 0], found[found >= 0]
 
 
+TruthAt = Mapping[str, Mapping[int, Array]]
+"""True place (3,) ENU by a target's name and the time of a fix, ns."""
+
+
 def target_errors(
-    targets: Columns, truth_at: Mapping[str, Mapping[int, Array]], span_ns: tuple[int, int]
+    targets: Columns, truth_at: TruthAt, span_ns: tuple[int, int]
 ) -> dict[str, Array]:
-    """3-D errors of each target's fixes within the span; truth_at[name][time_ns] is (3,) ENU."""
-    errors: dict[str, Array] = {}
+    """3-D errors of each target's fixes within the span, m."""
+    return {
+        name: np.linalg.norm(_target_offsets(targets, name, truth, span_ns)[1], axis=1)
+        for name, truth in truth_at.items()
+    }
+
+
+def targets_inside(targets: Columns, truth_at: TruthAt, span_ns: tuple[int, int]) -> float | None:
+    """Per cent of the targets' fixes within their own horizontal 95 % ellipse; None without any."""
+    squared = []
     for name, truth in truth_at.items():
-        rows = np.flatnonzero(
-            (targets["target_id"] == name)
-            & (targets["exposure_time_ns"] >= span_ns[0])
-            & (targets["exposure_time_ns"] <= span_ns[1])
-        )
-        fixes = np.column_stack([targets[k][rows] for k in ("east_m", "north_m", "up_m")])
-        times = [int(t) for t in targets["exposure_time_ns"][rows]]
-        known = [i for i, t in enumerate(times) if t in truth]
-        true = np.array([truth[times[i]] for i in known]).reshape(-1, 3)
-        errors[name] = np.linalg.norm(fixes[known] - true, axis=1)
-    return errors
+        rows, offsets = _target_offsets(targets, name, truth, span_ns)
+        ee, en, nn = (targets[f"cov_{axes}"][rows] for axes in ("ee", "en", "nn"))
+        e, n = offsets[:, 0], offsets[:, 1]
+        squared.append((nn * e**2 - 2.0 * en * e * n + ee * n**2) / (ee * nn - en**2))
+    inside = np.concatenate([*squared, np.empty(0)]) <= _CHI2_95
+    return 100.0 * float(inside.mean()) if len(inside) else None
+
+
+def _target_offsets(
+    targets: Columns, name: str, truth: Mapping[int, Array], span_ns: tuple[int, int]
+) -> tuple[np.ndarray, Array]:
+    """Rows of a target's fixes in the span whose truth is known, and their errors (N, 3), ENU."""
+    times = targets["exposure_time_ns"]
+    rows = np.array(
+        [
+            k
+            for k in np.flatnonzero(
+                (targets["target_id"] == name) & (times >= span_ns[0]) & (times <= span_ns[1])
+            )
+            if int(times[k]) in truth
+        ],
+        dtype=np.int64,
+    )
+    fixes = np.column_stack([targets[k][rows] for k in ("east_m", "north_m", "up_m")])
+    true = np.array([truth[int(times[k])] for k in rows]).reshape(-1, 3)
+    return rows, fixes - true
 
 
 def stage_latencies(estimates: Columns, span_ns: tuple[int, int]) -> dict[str, Spread]:

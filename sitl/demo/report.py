@@ -26,12 +26,14 @@ from sitl.camera.detector import FixedPoint
 from sitl.demo.analysis import (
     FrameErrors,
     Spread,
+    TruthAt,
     bound_figures,
     ekf_errors,
     frame_errors,
     localization_summary,
     stage_latencies,
     target_errors,
+    targets_inside,
 )
 from sitl.demo.criteria import (
     ComputingRates,
@@ -52,9 +54,10 @@ class FlightReport:
     errors. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
     against where GNSS would have it; the map lies map_shift_m beside GNSS. inside_bound: per cent
     of fixes within their own 95 % ellipse; inside_level: within their protection level, of which
-    protection_m are the horizontal ones. map_kind: what the map can show. targets: name to 3-D
-    error, in the map's frame. won: the flight in one line; broken: why
-    it was not flown to its end; slow: what the computer did not keep up with.
+    protection_m are the horizontal ones. fixed_inside: per cent of the standing targets' fixes
+    within their own 95 % ellipse. map_kind: what the map can show. targets: name to 3-D error, in
+    the map's frame. won: the flight in one line; broken: why it was not flown to its end; slow:
+    what the computer did not keep up with.
     """
 
     won: str
@@ -74,6 +77,7 @@ class FlightReport:
     map_kind: str
     home_error_m: float
     fixed_targets_m: Spread
+    fixed_inside: float | None
     targets_m: Mapping[str, Spread]
     stages_ms: Mapping[str, Spread]
     criteria: tuple[Criterion, ...]
@@ -125,8 +129,9 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
     fixed_targets = Spread.of(np.concatenate([*fixed, np.empty(0)]))
     bounds = bound_figures(truth, estimates, span)
     judged = FlightFigures(
-        summary, Spread.of(horizontal), fixed_targets, bounds.inside_bound, bounds.inside_level
-    )
+        summary, Spread.of(horizontal), fixed_targets, bounds.inside_bound, bounds.inside_level,
+        _fixed_inside(record, targets, still),
+    )  # fmt: skip
     denied_s = (span[1] - span[0]) * 1e-9
     stages = stage_latencies(estimates, span) if estimates else {}
     latency = stages.get("latency", Spread(None, None, None))
@@ -152,7 +157,8 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
         fixed_targets_m=fixed_targets,
         targets_m={name: Spread.of(e) for name, e in by_target.items()},
         stages_ms=stages,
-        criteria=judge(judged),
+        criteria=judge(judged, satellite=scenario.satellite is not None),
+        fixed_inside=judged.fixed_inside,
         broken=record.broken,
         slow=_pace(record, scenario, errors, latency, config).complaint(),
     )
@@ -180,9 +186,19 @@ def _pace(
 def _target_errors(record: DemoRecord, targets: Columns) -> dict[str, Array]:
     if not len(targets):
         return {t.name: np.empty(0) for t in record.targets}
+    return target_errors(targets, _target_truth(record, targets), record.denied_ns)
+
+
+def _fixed_inside(record: DemoRecord, targets: Columns, still: set[str]) -> float | None:
+    if not len(targets):
+        return None
+    truth = {k: v for k, v in _target_truth(record, targets).items() if k in still}
+    return targets_inside(targets, truth, record.denied_ns)
+
+
+def _target_truth(record: DemoRecord, targets: Columns) -> TruthAt:
     times = [int(t) for t in targets["exposure_time_ns"]]
-    truth = {t.name: {ns: t.position_at(ns) for ns in times} for t in record.targets}
-    return target_errors(targets, truth, record.denied_ns)
+    return {t.name: {ns: t.position_at(ns) for ns in times} for t in record.targets}
 
 
 def _flown(vehicle: Columns, span: tuple[int, int]) -> float:

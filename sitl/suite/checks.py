@@ -353,7 +353,6 @@ Check = (
     | RefusedJumpExpectation
     | TextExpectation
     | AlertExpectation
-    | AlertExpectation
     | ErrorAlertExpectation
     | NoWarningExpectation
     | ModeExpectation

@@ -40,7 +40,7 @@ def make_place(
     for _ in range(flight_days):
         visit = draw_visit(rng)
         fixed = None if scenes.light_variety else survey.light
-        days.append((visit, *lived_scene(rng, place, visit, fixed, scenes.shared_detail)))
+        days.append((visit, *lived_scene(rng, place, visit, fixed)))
     return PlaceVisits(survey, tuple((lit, visit, season) for visit, lit, season in days), source)
 
 

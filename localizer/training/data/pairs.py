@@ -68,9 +68,7 @@ class SceneConfig:
     season in the query (the ablation of the paper's Table 4). cell_m: range of the size of a cell,
     which sets the altitude. conditions: of each light in turn when given (`visit_of`), as many as
     there are lights; else drawn. motion: metres and
-    degrees between the two views, exactly, instead of the training's mixture. shared_detail: the
-    query repeats the map's fine texture and the map is nearly as sharp as the query; no flight is
-    like that, it is kept as the easier condition of earlier reports.
+    degrees between the two views, exactly, instead of the training's mixture.
     """
 
     cells: int = 1024
@@ -83,7 +81,6 @@ class SceneConfig:
     cell_m: tuple[float, float] = (0.2, 2.2)
     conditions: tuple[str, ...] = ()
     motion: tuple[float, float] | None = None
-    shared_detail: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,15 +108,13 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             else:
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
-            lived, season = lived_scene(rng, place, visit, fixed, config.shared_detail)
+            lived, season = lived_scene(rng, place, visit, fixed)
         pair = draw_views(rng, survey, lived, config)
         if pair is None:
             continue
         reference, query, camera = pair
         image, depth = render(survey, reference, camera)
         seen, seen_depth = render(lived, query, camera, supersample=2)
-        if config.shared_detail:
-            image = soften(rng, image)
         yield Pair(
             image, depth, seen, seen_depth, reference, query, camera, visit.weather,
             visit.outdated, source, season,
@@ -165,18 +160,11 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
 def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneConfig) -> LitScene:
     """The map: the place on the day of the survey, as a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
-    if not config.shared_detail:
-        if rng.random() < _PLAIN_WALLS:
-            prisms = plain_walls(prisms)
-        light = _sun(rng, rng.uniform(30, 70), rng.uniform(0.0, 1.0))
-        lit = light_scene(compose(place.land, prisms), light, _sky(rng, "day"), draw_texel(rng))
-        return coarse_mesh(lit, rng) if rng.random() < _COARSE_MESH else lit
-    scene = compose(place.land, prisms)
-    if rng.random() < 0.25:
-        blurred = cv2.GaussianBlur(scene.height, (0, 0), rng.uniform(0.5, 1.5))
-        scene = type(scene)(blurred, scene.albedo, scene.prism, scene.facades, scene.cell_m)
+    if rng.random() < _PLAIN_WALLS:
+        prisms = plain_walls(prisms)
     light = _sun(rng, rng.uniform(30, 70), rng.uniform(0.0, 1.0))
-    return light_scene(scene, light, _sky(rng, "day"))
+    lit = light_scene(compose(place.land, prisms), light, _sky(rng, "day"), draw_texel(rng))
+    return coarse_mesh(lit, rng) if rng.random() < _COARSE_MESH else lit
 
 
 def lived_scene(
@@ -184,7 +172,6 @@ def lived_scene(
     place: TrainingPlace,
     visit: FlightDay,
     light: SkyLight | None,
-    shared_detail: bool,
 ) -> tuple[LitScene, bool]:
     """The place on the day of the flight, and whether that is another season than the map's; a
     given light also keeps the season.
@@ -197,9 +184,8 @@ def lived_scene(
         if rng.random() < 0.7 or (visit.season and not season):
             albedo, season = season_shift(albedo, rng), True
         land = Land(land.height, albedo, land.cell_m)
-    if not shared_detail:
-        albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
-        land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
+    albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
+    land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
     if outdated:
         prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
         prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
@@ -317,7 +303,7 @@ def _overlap(scene: LitScene, reference: Pose, query: Pose, camera: Camera) -> f
 
 
 def soften(rng: np.random.Generator, image: Image) -> Image:
-    """A map texture somewhat coarser than the view (the easier, earlier condition)."""
+    """A map texture somewhat coarser than the view."""
     if rng.random() < 0.5:
         return image
     soft: Image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))

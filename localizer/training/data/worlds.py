@@ -77,7 +77,7 @@ def _pair(
         return None
     condition = draw_condition(rng)
     return Pair(
-        view.rgb if scenes.shared_detail else coarser(view.rgb, draw_texel(rng)),
+        coarser(view.rgb, draw_texel(rng)),
         view.depth,
         seen.rgb,
         seen.depth,

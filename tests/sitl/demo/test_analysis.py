@@ -9,6 +9,7 @@ from sitl.demo.analysis import (
     localization_summary,
     stage_latencies,
     target_errors,
+    targets_inside,
 )
 
 
@@ -74,9 +75,12 @@ def test_ekf_target_and_stage_errors():
     targets = {
         "target_id": np.array(["a", "b", "a"]), "exposure_time_ns": np.array([1, 1, 7]),
         "east_m": np.array([1.0, 0.0, 0.0]), "north_m": np.zeros(3), "up_m": np.zeros(3),
+        "cov_ee": np.full(3, 0.1), "cov_en": np.zeros(3), "cov_nn": np.ones(3),
     }  # fmt: skip
-    found = target_errors(targets, {"a": {1: np.zeros(3)}, "b": {1: np.zeros(3)}}, (0, 5))
-    np.testing.assert_allclose(found["a"], [1.0])
+    truth = {"a": {1: np.zeros(3)}, "b": {1: np.zeros(3)}}
+    np.testing.assert_allclose(target_errors(targets, truth, (0, 5))["a"], [1.0])
+    assert targets_inside(targets, truth, (0, 5)) == 50.0  # 1 m at a sigma of 0.32 m is outside
+    assert targets_inside(targets, {}, (0, 5)) is None
     stages = stage_latencies({"exposure_time_ns": np.array([0, 9]), "x_ms": np.array([4.0, 8.0])},
                              (0, 5))  # fmt: skip
     assert stages["x"].median == 4.0

@@ -8,9 +8,11 @@ from sitl.demo.criteria import ComputingRates, FlightFigures, headline, judge
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
 
-def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0, level=100.0):
+def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0, level=100.0, targets=99.0):
     metrics = LocalizationMetrics(**(GOOD.to_dict() | (localizer or {})))
-    return FlightFigures(metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside, level)
+    return FlightFigures(
+        metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside, level, targets
+    )
 
 
 def _missed(**changes):
@@ -90,6 +92,22 @@ def test_a_computer_that_keeps_up_is_not_blamed(changes):
 
 
 def test_every_target_says_what_a_miss_means_and_where_to_look():
-    known = [advice(criterion.name) for criterion in judge(_judged())]
+    names = {c.name for map_ in (True, False) for c in judge(_judged(), satellite=map_)}
+    known = [advice(name) for name in names]
     assert advice("something else") not in known
     assert len({a.look for a in known}) == len(known)
+
+
+@pytest.mark.parametrize(
+    ("changes", "missed"),
+    [
+        ({"ekf": 2.9, "fixed": 14.0, "inside": 93.1}, []),
+        ({"ekf": 3.1}, ["EKF horizontal p95"]),
+        ({"inside": 92.9}, ["fixes in their bound"]),
+        ({"targets": 94.0}, ["fixed targets in their bound"]),
+        ({"targets": None}, ["fixed targets in their bound"]),
+    ],
+)
+def test_a_flight_over_a_satellite_map_needs_claims_that_hold(changes, missed):
+    found = judge(_judged(**changes), satellite=True)
+    assert [c.name for c in found if not c.ok] == missed
