@@ -1,1 +1,1 @@
-"""The companion process: configuration, camera feeds, wiring, health, recording, CLI."""
+"""The companion application: configuration, video, components, health, records, command line."""

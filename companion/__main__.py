@@ -8,7 +8,7 @@ from companion.cli.interrupts import end_at_once
 
 
 def main() -> None:
-    """Entry point. The imports take seconds, in which an operator may think better of it."""
+    """Entry point. The operator can interrupt during the imports, which take seconds."""
     signal.signal(signal.SIGINT, end_at_once)
     from companion.cli.commands import main as command_line
 

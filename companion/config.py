@@ -1,4 +1,4 @@
-"""The deployment's configuration: one YAML file, checked as a whole before anything starts."""
+"""The deployment's configuration: one YAML file, checked completely before anything starts."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were giv
 
 
 class FeedConfig(StrictModel):
-    """Where the video comes from. How the camera is mounted stands under ``bridge.camera``."""
+    """Source of the video. The camera's mounting is in ``bridge.camera``."""
 
     source: str = Field(
         description="udp:// (MPEG-TS, RTP, H.264), .sdp file, rtsp://, /dev/videoN, video or folder"
@@ -201,7 +201,7 @@ class TargetConfig(StrictModel):
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """How well the autopilot's own position is believed when tracking (re)starts from it."""
+    """Assumed accuracy of the autopilot's position when tracking (re)starts from it."""
 
     position_sigma_m: float = SENSORS.start_m
     rotation_sigma_deg: float = SENSORS.heading_deg
@@ -209,7 +209,7 @@ class PriorConfig:
 
 
 class RecordConfig(StrictModel):
-    """What is kept of a flight."""
+    """What is recorded of a flight."""
 
     folder: Path = Field(description="folder of the record")
     snapshot_interval_s: float | None = Field(
@@ -218,7 +218,7 @@ class RecordConfig(StrictModel):
 
 
 class KlvConfig(StrictModel):
-    """The video sent on, with where each picture was taken in it (MISB ST 0601)."""
+    """The forwarded video with the pose of each frame (MISB ST 0601)."""
 
     output: str = Field(
         pattern=r"^udp://[^\s/@?]+:[0-9]{1,5}(\?.*)?$", description="udp://HOST:PORT, MPEG-TS"
@@ -228,7 +228,7 @@ class KlvConfig(StrictModel):
 
 
 class CompanionConfig(StrictModel):
-    """One deployment."""
+    """All settings of one deployment."""
 
     map: Path = Field(description="tile cache made by `companion map build`")
     map_sha256: str | None = Field(
@@ -260,7 +260,7 @@ class CompanionConfig(StrictModel):
 
     @property
     def state_folder(self) -> Path | None:
-        """Where enabled injection and the last position are kept; None: nowhere."""
+        """Folder of the enabled injection and the last position; None: not kept."""
         if self.state_dir is not None or self.record is None:
             return self.state_dir
         return self.record.folder.parent

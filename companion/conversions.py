@@ -1,4 +1,4 @@
-"""Between what the localizer knows and what the bridge tells: every conversion of the flight.
+"""Conversions between the types of localizer and bridge; all conversions of the flight are here.
 
 Pure geometry, no threads, no MAVLink.
 
@@ -44,7 +44,7 @@ _MAX_POSITION_AGE_NS = 2_000_000_000
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
-    """What stays the same for a flight: the map's frame and the camera's place on the vehicle."""
+    """Constants of a flight: the map's frame and the camera's position on the vehicle."""
 
     frame: LocalFrame
     geoid_separation_m: float
@@ -59,7 +59,7 @@ def vision_fix(
     gimbal: GimbalAttitude | None,
     reset_count: int,
 ) -> VisionFix:
-    """The vehicle's position and attitude as the camera's estimate implies them.
+    """The vehicle's position and attitude from the camera's estimate.
 
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
     Without them the vehicle's attitude is unknown, and the camera's position is reported: the
@@ -119,7 +119,7 @@ def vehicle_prior(
     sigma: tuple[float, float],
     time_ns: int,
 ) -> PosePrior | None:
-    """The camera's pose and velocity at `time_ns` as the autopilot knows them; None if it does not.
+    """The camera's pose and velocity at `time_ns` from the autopilot's data; None if unknown.
 
     sigma: of position (m) and rotation (rad).
     """
@@ -146,7 +146,7 @@ def vehicle_prior(
 
 
 def target_report(fix: TargetFix, camera: Camera, frame: LocalFrame, number: int) -> TargetReport:
-    """A located target for the ground. camera: that of the frame that it is told for."""
+    """A located target as a report. camera: that of its frame."""
     position = frame.position(fix.position_world)
     velocity_ned = velocity_sigma = None
     if fix.velocity is not None:
@@ -180,7 +180,9 @@ def target_report(fix: TargetFix, camera: Camera, frame: LocalFrame, number: int
 
 
 def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> CameraView:
-    """Camera and the ground in the picture's centre; None where that ray meets no map."""
+    """The camera and the ground point in the image's centre; None if that ray does not
+    hit the map.
+    """
     pose, camera = estimate.world_from_camera, estimate.camera
     position = frame.position(pose.translation)
     ned_from_camera = ned_from_world(frame, position) @ pose.rotation

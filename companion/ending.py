@@ -1,4 +1,6 @@
-"""The end of a thread, waited for with a limit: what hangs must not keep the rest from ending."""
+"""Wait for the end of a thread with a time limit, so that a hanging thread does not block the
+shutdown.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,8 @@ _PATIENCE_S = 5.0
 
 
 def joined(thread: threading.Thread) -> bool:
-    """Whether a daemon thread that was told to end has ended. One that hangs (a disk that stands
-    still, a device that does not answer) is named in the log and left behind: what is closed after
-    it, the record and the link to the autopilot, is closed all the same.
+    """Whether a daemon thread that was told to end has ended. A thread that hangs, for example on a
+    disk or device, is named in the log, and the shutdown continues: record and link are closed.
     """
     thread.join(_PATIENCE_S)
     if thread.is_alive():

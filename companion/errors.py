@@ -32,9 +32,7 @@ class StreamSizeError(StreamError):
 
 
 class StreamDepthError(StreamError):
-    """A stream of 16-bit grey of which it is not said which counts are black and white, or of
-    pixels that cannot be converted.
-    """
+    """A stream of 16-bit grey without `grey_range`, or of pixels that cannot be converted."""
 
 
 class StreamDecodeError(StreamError):
@@ -70,4 +68,4 @@ class DetectorError(CompanionError):
 
 
 class MissionFileError(CompanionError):
-    """A mission that cannot be read, or that does not lie where the map is."""
+    """A mission that cannot be read, or that is not on the map."""

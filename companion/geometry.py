@@ -22,7 +22,7 @@ GIMBAL_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.
 
 
 class GimbalFrame(Enum):
-    """What a gimbal's angles are measured against.
+    """Reference frame of a gimbal's angles.
 
     HEADING: roll and pitch from the horizon, yaw from the vehicle's heading (MAVLink's
     GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, what ArduPilot sends). EARTH: yaw from true north.
@@ -46,7 +46,7 @@ class GimbalAngles:
 
 @dataclass(frozen=True)
 class Mount:
-    """How the camera sits on the vehicle.
+    """Mounting of the camera on the vehicle.
 
     rotation: (3, 3), camera housing to gimbal (both x forward, y right, z down), the calibration's
     boresight correction. lever_arm_m: (3,), from the autopilot to the camera, body axes.

@@ -1,4 +1,4 @@
-"""The IMU integrated on its own: how the aircraft moved, whatever any estimator believes.
+"""Integrates the IMU alone, independent of any estimator.
 
 The autopilot's attitude follows what is injected: an EKF that is fed a frozen position explains
 the acceleration away as tilt. Here the gyros carry the attitude, which leans towards the
@@ -29,7 +29,7 @@ _KEPT = 1024
 
 
 class VehicleTelemetry(Protocol):
-    """What the monitor asks of the vehicle: the bridge, which lets no impossible number in."""
+    """The vehicle's telemetry that the monitor reads from the bridge, without impossible values."""
 
     def state(self) -> VehicleState:
         """What the vehicle says about itself."""
@@ -40,7 +40,7 @@ class VehicleTelemetry(Protocol):
         ...
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """What its IMU read after a time, oldest first."""
+        """IMU samples after a time, oldest first."""
         ...
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
@@ -48,13 +48,13 @@ class VehicleTelemetry(Protocol):
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
+        """The EKF's latitude, longitude and altitude at a time, while it uses GNSS."""
         ...
 
 
 @dataclass(frozen=True)
 class InertialDisplacement:
-    """The free integral of the IMU at a time: velocity and position (2,), north and east, m/s, m.
+    """The IMU's integral at a time: velocity and position (2,), north and east, m/s, m.
 
     Both have begun at zero at some time and drift; only their changes over seconds mean something.
     """
@@ -65,7 +65,7 @@ class InertialDisplacement:
 
 
 class InertialTrack:
-    """Integrates samples as they come, for all who ask; any thread. restarts counts the gaps."""
+    """Integrates samples as they arrive; any thread. restarts: number of gaps."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -77,13 +77,13 @@ class InertialTrack:
         self._track: deque[InertialDisplacement] = deque(maxlen=_KEPT)
 
     def follow(self, vehicle: VehicleTelemetry) -> None:
-        """Take in what the IMU read meanwhile."""
+        """Integrate the new samples."""
         with self._lock:
             for sample in vehicle.inertial_since(self.newest_ns):
                 self.add(sample, vehicle.attitude_at)
 
     def add(self, sample: InertialSample, attitude_at: Callable[[int], Attitude | None]) -> None:
-        """One sample; without the autopilot's attitude it cannot be used."""
+        """Add a sample; it is ignored without the autopilot's attitude."""
         reference = attitude_at(sample.time_ns)
         if reference is None or sample.time_ns <= self.newest_ns:
             return

@@ -1,4 +1,4 @@
-"""Arrays that lie on a GPU already, such as a network's outputs, for use in place."""
+"""Arrays in GPU memory, such as a network's outputs, used in place."""
 
 from __future__ import annotations
 

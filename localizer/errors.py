@@ -40,7 +40,7 @@ class OutsideMapError(MapError):
 
 
 class MapLoadingError(OutsideMapError):
-    """A view of which nothing is in memory yet; it is on its way."""
+    """A view whose tiles are not in memory yet; they are being loaded."""
 
 
 class RenderError(LocalizerError):
@@ -60,7 +60,7 @@ class SequenceError(LocalizerError):
 
 
 class GreyRangeError(LocalizerError):
-    """Grey counts of a sensor of which it is not said what is black and what is white."""
+    """16-bit grey without a stated range of black and white."""
 
 
 class DeviceArrayError(LocalizerError):

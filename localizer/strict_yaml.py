@@ -1,5 +1,5 @@
-"""YAML as settings need it: plain types, no key twice, no merge key, no `yes` where a number
-belongs, and no number that says another one than is read: YAML 1.1 takes 8:20 for 500.
+"""YAML for settings: plain types, no repeated key, no merge key, no `yes` for a number, and no
+number that YAML 1.1 reads differently, such as 8:20 for 500.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Everything that speaks MAVLink, and nothing that sees images."""
+"""All MAVLink code. It uses no images."""
 
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig

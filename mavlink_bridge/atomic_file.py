@@ -1,5 +1,5 @@
-"""A small file that is replaced as a whole: who reads it sees the old text or the new one, and
-reads no more of it than it may hold.
+"""A small file that is replaced atomically: a reader sees the old text or the new one. Reading is
+limited in size.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ PRIVATE = 0o600
 
 
 def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = False) -> None:
-    """Write the text beside the file, and put it in its place; `OSError` where the disk refuses.
+    """Write the text beside the file and rename it; raises `OSError` if the disk refuses.
 
     The file beside it is always a new one: a link that somebody laid there is not followed.
     durable: it is on the disk before it is in its place, for what must outlive a loss of power.
@@ -31,7 +31,7 @@ def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = 
 
 
 def read_small_file(path: Path, most: int = 1000) -> str:
-    """The text, UTF-8. most: bytes, beyond which the file is another one.
+    """Read the UTF-8 text. most: size limit in bytes.
 
     `OSError` for a link, a pipe, whose reader waits for who writes, and for a longer file;
     ValueError for what is no text.

@@ -1,4 +1,4 @@
-"""The bridge: one flight-controller link, an optional ground link, and what flows over them."""
+"""The bridge: one flight-controller link, an optional ground link, and the messages on them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one
 
 
 class Bridge:
-    """Speaks MAVLink for the localizer. Every public method may be called from any thread.
+    """The localizer's MAVLink interface. Every public method may be called from any thread.
 
     Above 200 lines and 15 public methods: it is the package's whole surface, and each method hands
     one thing to, or asks one thing of, the part that does the work.
@@ -139,8 +139,8 @@ class Bridge:
     # --- life -----------------------------------------------------------------------------------
 
     def set_map_id(self, map_id: str) -> None:
-        """Before `start`, which map the fixes are of: what spoke against another one in a process
-        before is not remembered of it.
+        """Before `start`, set the id of the map. A stored failure of the shadow check over another
+        map is ignored.
         """
         self._fc.set_map_id(map_id)
 
@@ -158,7 +158,9 @@ class Bridge:
             link.start()
 
     def play(self, message: Any) -> None:
-        """A recorded message of the flight controller, at the clock's time, without `start`."""
+        """Process a recorded message of the flight controller at the clock's time,
+        without `start`.
+        """
         self._fc.on_message(self._fc_link, message, self._clock())
 
     def tick(self) -> None:
@@ -166,7 +168,7 @@ class Bridge:
         self._fc.on_tick(self._fc_link, self._clock())
 
     def hand_over(self) -> None:
-        """What follows is no end in order: what is remembered over a restart stays so."""
+        """The following stop is no clean shutdown: state for a restart is kept."""
         if self._shared.enable is not None:
             self._shared.enable.stop(clean_shutdown=False)
         self._fc.end(clean_shutdown=False)
@@ -196,41 +198,43 @@ class Bridge:
     # --- in -------------------------------------------------------------------------------------
 
     def submit(self, fix: VisionFix) -> None:
-        """Hand over a fix; never blocks."""
+        """Submit a fix; never blocks."""
         self._fc.sender.put(fix)
         self._fc_link.wake()
 
     def report(self, target: TargetReport) -> None:
-        """Report a target to the ground; never blocks."""
+        """Report a target to the ground station; never blocks."""
         self._to_ground(target)
         self._shared.look.report(target)
         if self._cot is not None:
             self._cot.send(target)
 
     def forget(self, target_id: int) -> None:
-        """Tell the ground of that target no more; never blocks."""
+        """Stop reporting that target; never blocks."""
         self._to_ground(TargetEnd(target_id))
         self._shared.look.forget(target_id)
 
     def track(self, request: TrackRequest) -> None:
-        """Take a wish as if a ground station had said it; a target gets a number among theirs."""
+        """Process a track request as if a ground station had sent it; the target gets the next
+        number.
+        """
         if request.kind != "stop":
             request = replace(request, number=next(self._shared.target_numbers))
         if self._shared.on_track is not None:
             self._shared.on_track(request)
 
     def inhibit(self, of: AlertId) -> None:
-        """Until `clear`: what the alert inhibits does not begin (`Inhibits`). The pilot's command
-        (mode ``rc``) and `injection.force` overrule it.
+        """Until `clear`, what the alert inhibits does not start (`Inhibits`). The pilot's command
+        (mode ``rc``) and `injection.force` override it.
         """
         self._fc.inhibit(of)
 
     def clear(self, of: AlertId) -> None:
-        """The alert inhibits nothing any more."""
+        """End the inhibition by this alert."""
         self._fc.clear(of)
 
     def look(self, view: CameraView) -> None:
-        """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
+        """Report the camera's view to the ground station (CAMERA_FOV_STATUS); never blocks."""
         if self._config.camera.announce:
             self._to_ground(view)
         if self._cot is not None:
@@ -243,19 +247,19 @@ class Bridge:
     def set_health(
         self, level: HealthLevel, alerts: Sequence[Alert] = (), *, tell: bool = True
     ) -> None:
-        """The localizer's health, and the alerts that are true now, worst first; each is sent once.
+        """Set the localizer's health and the active alerts, most severe first; each is sent once.
 
         tell: false for what was sent already.
         """
         self._status.set_health(level, alerts, tell=tell)
 
     def report_alert(self, alert: Alert) -> None:
-        """An alert for the operator: STATUSTEXT on the ground side, and the log."""
+        """Report an alert to the operator: STATUSTEXT to the ground station, and the log."""
         self._status.report(alert)
 
     def tell_figures(self, figures: Mapping[str, float]) -> None:
-        """NAMED_VALUE_FLOAT for each figure, names of at most 10 characters, where
-        `named_values` has them; never blocks.
+        """Send NAMED_VALUE_FLOAT for each value, with names of at most 10 characters, if
+        `named_values` is set; never blocks.
         """
         if self._config.named_values:
             uptime_ms = self._shared.uptime_ms(self._clock())
@@ -271,20 +275,20 @@ class Bridge:
     # --- out ------------------------------------------------------------------------------------
 
     def state(self) -> VehicleState:
-        """What the vehicle says about itself."""
+        """Newest state of the vehicle."""
         return self._tracker.snapshot(self._clock())
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time; None when the buffer has none."""
+        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if it is not buffered."""
         return self._tracker.attitude_at(time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time: gimbal or body, and mounting."""
+        """The camera's attitude to NED at a time, from gimbal or body, and the mounting."""
         return self._tracker.gimbal_at(time_ns)
 
     def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
-        """The camera's reported zoom at a time, per cent of its range; None: not known. hold_s: for
-        how long a report counts after which none came.
+        """The camera's reported zoom at a time, per cent of its range; None: unknown. hold_s: how
+        long a report stays valid.
         """
         return self._tracker.zoom_at(time_ns, hold_s)
 
@@ -293,8 +297,8 @@ class Bridge:
         return self._tracker.local_at(time_ns)
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's (latitude, longitude, altitude AMSL) at a time; None while it does not follow a
-        healthy GNSS, or where that is not known.
+        """The EKF's (latitude, longitude, altitude AMSL) at a time; None unless it uses healthy
+        GNSS.
         """
         if not self.on_gnss or not gnss_healthy(self.state(), self._clock()):
             return None
@@ -302,18 +306,18 @@ class Bridge:
 
     @property
     def on_gnss(self) -> bool | None:
-        """Whether GNSS makes the EKF's position, healthy or not: by its source set, and not where
-        the receiver is fed by us; None where the set is not known.
+        """Whether the EKF uses GNSS, healthy or not, by its source set. False if the receiver is
+        our GPS_INPUT; None if the set is unknown.
         """
         return self._fc.on_gnss(self._clock())
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""
+        """IMU samples of the vehicle after a CLOCK_MONOTONIC time, oldest first."""
         return self._tracker.inertial_since(time_ns)
 
     def mission(self) -> tuple[MissionWaypoint, ...]:
-        """The places that the vehicle's mission flies to, as far as they are known. The first call
-        begins to read it, and it is followed from then on.
+        """Positions of the vehicle's mission, as far as they are known. The first call starts the
+        download; changes are followed.
         """
         mission = self._fc.requests.mission
         mission.wanted = True
@@ -324,7 +328,7 @@ class Bridge:
         return self._status.alerts()
 
     def last_ticks_ns(self) -> dict[str, int]:
-        """When each link's thread began its newest turn, CLOCK_MONOTONIC ns, by the link's name."""
+        """Time of the last run of each link's thread, CLOCK_MONOTONIC ns, by the link's name."""
         return {f"link {link.name}": link.last_tick_ns for link in self._links}
 
     @property
@@ -337,8 +341,9 @@ class Bridge:
 
     @property
     def injecting(self) -> bool:
-        """Whether fixes are sent to the flight controller right now (mode, gate and
-        shadow score)."""
+        """Whether fixes are being sent to the flight controller (mode, pilot's enable and shadow
+        check).
+        """
         return self._fc.injecting
 
     @property
@@ -348,22 +353,24 @@ class Bridge:
 
     @property
     def injection_fault(self) -> Alert | None:
-        """Why the EKF does not have what it should while injecting: positions are not sent, or not
-        followed; None while all is well. The operator was told.
+        """Alert while injecting if positions are not sent, or the EKF does not follow them; None
+        otherwise. The operator was told.
         """
         return self._fc.injection_fault
 
     def shadow_score(self) -> ShadowScore:
-        """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
+        """Comparison of vision with GNSS while GNSS was healthy."""
         return self._fc.shadow_score(self._clock())
 
     def loop_verdict(self) -> LoopVerdict | None:
-        """Whether the EKF follows what is sent; None while nothing is sent or it is too early."""
+        """Whether the EKF follows the sent positions; None while nothing is sent or it is too
+        early.
+        """
         return self._fc.outcome.verdict
 
     def counters(self) -> Figures:
-        """Counters of links and injection, None where a figure is not known; keys are prefixed by
-        where they come from.
+        """Counters of links and injection, None where unknown; the prefix of a key names its
+        source.
         """
         result: Figures = {}
         for link in self._links:
@@ -374,7 +381,7 @@ class Bridge:
         return result
 
     def waiting(self) -> dict[str, int]:
-        """Messages and bytes that wait anywhere in the bridge, by where they do."""
+        """Queued messages and bytes, by queue."""
         result = {"alerts": len(self._status.alerts()), **self._fc.waiting()}
         if self._ground is not self._fc.components:
             result.update({f"ground {name}": n for name, n in self._ground.waiting().items()})

@@ -1,4 +1,4 @@
-"""Our components on a link: heartbeats, commands to them, and the camera's messages."""
+"""Our components on a link: heartbeats, received commands, and camera messages."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _is_order(command: int) -> bool:
 
 
 class Components:
-    """The bridge's components as one link sees them; its owner thread calls.
+    """The bridge's components on one link; its owner thread calls the methods.
 
     They send a heartbeat once a second, answer commands and report targets and camera poses.
     Only `show` may be called from other threads.
@@ -77,15 +77,15 @@ class Components:
         self._hints_told: dict[AlertId, int] = {}  # when
 
     def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
-        """Queue a message for the ground; the oldest are dropped when the queue is full."""
+        """Queue a text for the ground station; the oldest are dropped if the queue is full."""
         self._outbound.append(item)
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of everything that waits here."""
+        """Lengths of the queues."""
         return {"outbound": len(self._outbound), "targets": self._camera.targets}
 
     def announce(self) -> None:
-        """The link was opened: the next heartbeat is due at once."""
+        """The link was opened: send the next heartbeat at once."""
         self._next_heartbeat_ns = 0
 
     def heartbeat(self, link: Link, now_ns: int) -> None:
@@ -108,7 +108,7 @@ class Components:
             link.send(message, component)
 
     def serve_camera(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Targets and camera pose to the ground, where the link has room for them."""
+        """Send targets and camera view to the ground station, if the link has room."""
         if link.congested:
             return
         while self._outbound:
@@ -146,8 +146,8 @@ class Components:
         return self._is_trusted and message.get_srcSystem() in self._config.ground_systems
 
     def _refuse(self, link: Link, message: Any) -> None:
-        """Deny an order to one of our components and report its sender once; all senders after the
-        first few share one alert.
+        """Deny a command to one of our components and report its sender once. From the fourth
+        sender on one alert covers all.
         """
         ours = (self._config.localizer_component, self._config.camera_component)
         if message.target_system not in (0, link.system_id) or message.target_component not in ours:
@@ -166,8 +166,8 @@ class Components:
             self._shared.report(alert(refused, system=system, why=why))
 
     def _localizer_command(self, link: Link, message: Any, time_ns: int) -> None:
-        """What gates injection and what hints at the place; others are refused in the protocol's
-        way.
+        """Process the commands that enable injection or give a search position; others are denied
+        as the protocol demands.
         """
         enable = self._shared.enable
         result = mavlink.MAV_RESULT_UNSUPPORTED

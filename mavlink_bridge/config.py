@@ -101,7 +101,7 @@ class InjectionConfig(StrictModel):
 
 
 class SourceSwitchConfig(StrictModel):
-    """Automatic change of the EKF source set when GNSS is judged bad (42007)."""
+    """Automatic change of the EKF source set when GNSS is bad (42007)."""
 
     enabled: bool = False
     gnss_set: int = Field(default=1, ge=1, le=3)
@@ -118,7 +118,7 @@ class SourceSwitchConfig(StrictModel):
 
 
 class InjectionEnableConfig(StrictModel):
-    """In mode ``rc`` a channel's pulse width or a command decides between shadow and inject."""
+    """In mode ``rc`` an RC channel's pulse width or a command selects shadow or inject."""
 
     channel: int = Field(default=9, ge=1, le=18)
     inject_above_us: int = Field(default=1700, ge=900, le=2100)
@@ -129,7 +129,7 @@ class InjectionEnableConfig(StrictModel):
 
 
 class CameraConfig(StrictModel):
-    """What the ground station is told about the camera, and how it is mounted."""
+    """Description of the camera for the ground station, and its mounting."""
 
     announce: bool = True
     vendor: str = Field(default="PiLoT companion", max_length=31)
@@ -212,7 +212,7 @@ SystemId = Annotated[int, Field(ge=1, le=255)]
 
 
 class BridgeConfig(StrictModel):
-    """Everything the bridge needs to know.
+    """All settings of the bridge.
 
     connection strings: ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT``,
     ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``.

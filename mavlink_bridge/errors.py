@@ -8,7 +8,7 @@ class BridgeError(Exception):
 
 
 class EndpointError(BridgeError):
-    """A connection string that names no endpoint, or an endpoint that can never be opened."""
+    """A connection string that is invalid, or an endpoint that can never be opened."""
 
 
 class SigningKeyError(BridgeError):
@@ -16,7 +16,7 @@ class SigningKeyError(BridgeError):
 
 
 class ConnectionSilentError(BridgeError):
-    """No autopilot is heard where one should be."""
+    """No heartbeat of an autopilot on the connection."""
 
 
 class BridgeStateError(BridgeError):
@@ -32,8 +32,8 @@ class ParameterError(BridgeError):
 
 
 class TlogError(BridgeError):
-    """A .tlog file that cannot be opened, or is none."""
+    """A .tlog file that cannot be opened, or is not one."""
 
 
 class MissionError(BridgeError):
-    """A mission that the flight controller does not hand over."""
+    """A mission that the flight controller does not send."""

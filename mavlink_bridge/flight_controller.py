@@ -1,4 +1,4 @@
-"""The flight controller's end of the bridge: what comes goes to its part, what is due is done."""
+"""The flight controller's side of the bridge: dispatches messages and sends what is due."""
 
 from __future__ import annotations
 
@@ -99,12 +99,12 @@ class FlightControllerEnd:
         self._mode: Mode = "off"
 
     def shadow_score(self, now_ns: int) -> ShadowScore:
-        """How vision compared with GNSS over the last two minutes."""
+        """Comparison of vision with GNSS over the last two minutes."""
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
     def on_gnss(self, now_ns: int) -> bool | None:
-        """Whether GNSS makes the EKF's position; None where its source set is not known. A receiver
-        that tells what it is told by us (GPS_INPUT) is none; nor is one beside which we are fused.
+        """Whether the EKF uses GNSS; None if its source set is unknown. False if the receiver is
+        our GPS_INPUT, or if vision is fused beside it.
         """
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
@@ -115,39 +115,39 @@ class FlightControllerEnd:
         return None if current is None else self.sources.on_gnss
 
     def set_map_id(self, map_id: str) -> None:
-        """Before `recall`: which map the fixes are of."""
+        """Before `recall`: the id of the map."""
         if self._no_go is not None:
             self._no_go.about = map_id
 
     def recall(self) -> None:
-        """Before the link begins: what a process that was killed knew."""
+        """Before the link starts: restore the state of a process that was killed."""
         self._interlock.recall()
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """After the link has ended; before, where that is not in order."""
+        """Call after the link has ended; for a restart, before it."""
         self._interlock.end(clean_shutdown=clean_shutdown)
 
     def inhibit(self, of: AlertId) -> None:
-        """Until `clear`: what the alert inhibits does not begin."""
+        """Until `clear`, what the alert inhibits does not start."""
         if Inhibits.INJECTION in CATALOGUE[of].inhibits:
             self._interlock.inhibited_by |= {of}
         if Inhibits.EKF_OK in CATALOGUE[of].inhibits:
             self.outcome.ekf_ok_inhibited_by |= {of}
 
     def clear(self, of: AlertId) -> None:
-        """The alert inhibits nothing any more."""
+        """End the inhibition by this alert."""
         self._interlock.inhibited_by -= {of}
         self.outcome.ekf_ok_inhibited_by -= {of}
 
     @property
     def injecting(self) -> bool:
-        """Whether fixes are sent right now: mode, gate and the shadow score's interlock."""
+        """Whether fixes are being sent: mode, pilot's enable and shadow check."""
         return self._mode == self._shared.mode() == "inject"
 
     @property
     def injection_fault(self) -> Alert | None:
-        """Why the EKF does not have what it should, as it was told: positions are not sent, or are
-        not followed. None while all is well, and in other modes than ``inject``.
+        """Alert, as reported, if positions are not sent or the EKF does not follow. None otherwise,
+        and in modes other than ``inject``.
         """
         if not self.injecting:
             return None
@@ -155,8 +155,8 @@ class FlightControllerEnd:
         return self.sender.refusal or (verdict.reason if verdict is not None else None)
 
     def figures(self) -> Figures:
-        """Counters and measures for a record, None where one is not known; keys are prefixed by
-        where they come from.
+        """Counters and measurements for a record, None where unknown; the prefix of a key names its
+        source.
         """
         injector, clock = self.sender.injector, self._tracker.clock
         result: Figures = {}
@@ -177,14 +177,14 @@ class FlightControllerEnd:
         return result
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of everything that waits in this end, by name."""
+        """Lengths of all queues, by name."""
         parts = (self.sender, self.outcome, self.components, self.time_sync)
         return {name: length for part in parts for name, length in part.waiting().items()}
 
     # --- messages in ----------------------------------------------------------------------------
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """One message from the flight controller's link (also from others, routed by it)."""
+        """Process one message of the flight controller's link, also those that it routes."""
         kind = message.get_type()
         if kind in COMMANDS_IN:
             self.components.command(link, message, time_ns)
@@ -236,13 +236,13 @@ class FlightControllerEnd:
     # --- the clockwork --------------------------------------------------------------------------
 
     def on_open(self, link: Link) -> None:
-        """Announce at once, and ask for everything again."""
+        """Announce at once, and request everything again."""
         self.components.announce()
         self.requests.reset()
         self.time_sync.reset()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Everything that is due; returns when the next thing is."""
+        """Do everything that is due; returns when the next is."""
         config = self._shared.config
         state = self._tracker.snapshot(now_ns)
         link.system_id = config.system_id or state.system_id or 0
@@ -298,7 +298,9 @@ class FlightControllerEnd:
         return sender.injector.next_due_ns(now_ns)
 
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """What came of it, ten times a second: score, verdict, source switch."""
+        """Check the effect of the sent positions ten times a second: score, verdict,
+        source switch.
+        """
         sender = self.sender
         self.outcome.compare(state, now_ns, on_gnss=self.on_gnss(now_ns))
         self._strangers.check(link, now_ns)

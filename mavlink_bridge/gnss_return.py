@@ -1,4 +1,4 @@
-"""Whether a GNSS receiver that comes back says where the vehicle is, while vision flies it."""
+"""Checks whether a GNSS receiver that returns is right, while the EKF uses vision."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GnssRefusal:
-    """Why a receiver is not believed. size: in the unit that `why` names."""
+    """Why a receiver is not accepted. size: in the unit that `why` names."""
 
     size: float
     why: GnssDisagreement
@@ -71,13 +71,13 @@ class GnssReturnCheck:
         self._looked_ns = 0
 
     def reset(self) -> None:
-        """Nothing is known of the receiver."""
+        """Forget the receiver."""
         self._reports.clear()
         self.refusal, self.accepted, self._anchor = None, False, None
 
     def look(self, state: VehicleState, vision: PropagatedFix | None, now_ns: int) -> None:
-        """Take in the newest report; ten times a second. vision: None while it is not trusted, and
-        then what was found before stands.
+        """Process the newest report; call it ten times a second. vision: None while it is not
+        reliable; the last result then stays.
         """
         velocity = np.array((state.local_velocity_ned or (0.0, 0.0))[:2])
         passed_s = min((now_ns - self._looked_ns) * 1e-9, 1.0)

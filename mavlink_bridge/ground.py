@@ -1,4 +1,4 @@
-"""The separate ground link: telemetry bandwidth is not spent on injection there."""
+"""The separate ground link, so that its messages use no bandwidth of the injection."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TICK_NS = 20_000_000
 
 
 class GroundEnd:
-    """Runs in the ground link's thread, and only its components are filled from outside."""
+    """Runs in the ground link's thread; other threads only fill its components' queues."""
 
     def __init__(self, shared: Shared) -> None:
         self.components = Components(shared, ground=True)
@@ -28,7 +28,7 @@ class GroundEnd:
         self.components.announce()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """Commands for our components; a ground station's heartbeat says who is to be answered."""
+        """Process commands to our components, and heartbeats of ground stations."""
         if message.get_type() == "HEARTBEAT":
             if message.get_srcSystem() in self._shared.config.ground_systems:
                 link.keep_peer()

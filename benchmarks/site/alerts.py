@@ -5,27 +5,41 @@ from __future__ import annotations
 import re
 
 from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
-from mavlink_bridge.alerts.catalogue import CATALOGUE, body, cleared
+from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
+from mavlink_bridge.alerts.injection import INJECTION
+from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
+from mavlink_bridge.alerts.vehicle import VEHICLE
 from mavlink_bridge.alerts.words import MapOffsetUse
 
-_HEAD = f"""# Alerts
+_HEAD = f"""---
+hide: [toc]
+---
 
-Made from the catalogue by `python -m benchmarks.site`; do not edit. Every text begins with
-`{PREFIX.strip()}`. The identifier stands in `events.csv` and `health.json`. *Output held*: nothing
-is sent. *Exclude and reset*: also, the next fix increments `reset_counter`. *Inhibit*: injection
-and the switch to vision do not start; injection that is running continues. *Event*: it happens once
-and does not end. A text in brackets is sent when the alert is cleared; after other alerts, the next
-status follows (`localization tracking`, `injecting`, `the EKF follows`, `fixes are in time again`).
+# Alerts
 
-| identifier | text | raised when | cleared when | severity, action |
-|---|---|---|---|---|
+Made from the catalogue by `python -m benchmarks.site`; do not edit.
+
+An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `health.json` with its
+identifier. *Fix*: a position from vision. *Output held*: no position is sent. *Exclude and reset*:
+as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the switch
+to vision do not start; injection that is running continues. *Event*: it has no end. The end of an
+alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the text in
+brackets. The end of the rest shows by the next status, for example `localization tracking`.
 """
-_MEANING = """
-## What it means and what to do
+_TABLE = """
+## {}
 
-| identifier | meaning | what the operator does |
-|---|---|---|
+| identifier | text | severity, action | raised when | ends when | meaning | what to do |
+|---|---|---|---|---|---|---|
 """
+_GROUPS = {
+    "Checks of the positions (integrity monitor)": (*INTEGRITY, *MONITOR, *SOURCES),
+    "Output of positions to the autopilot": INJECTION,
+    "Flight controller and MAVLink": VEHICLE,
+    "Localization, video and the program": HEALTH,
+    "Targets": TARGETS,
+    "Commands from the console": CONSOLE,
+}
 _ACTIONS = {
     OutputAction.NONE: "",
     OutputAction.HOLD: "hold",
@@ -34,25 +48,24 @@ _ACTIONS = {
 
 
 def alerts_page() -> str:
-    """Its text, Markdown."""
-    rows = "".join(_row(spec) for spec in CATALOGUE.values())
-    meanings = "".join(
-        f"| `{spec.id.value}` | {spec.meaning} | {spec.operator} |\n" for spec in CATALOGUE.values()
+    """The page, Markdown."""
+    return _HEAD + "".join(
+        _TABLE.format(title) + "".join(map(_row, specs)) for title, specs in _GROUPS.items()
     )
-    return _HEAD + rows + _MEANING + meanings
 
 
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
     ended = spec.cleared or "event"
-    if spec.reports_end:
-        ended += f" (`{body(cleared(spec.id))}`)"
+    if spec.reports_end and spec.cleared_text is not None:
+        ended += f" (`{spec.cleared_text}`)"
     inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
     action = ", ".join(
         [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]
     )
     text = shown.removeprefix(PREFIX)
-    return f"| `{spec.id.value}` | {text} | {spec.raised} | {ended} | {action} |\n"
+    cells = (f"`{spec.id.value}`", text, action, spec.raised, ended, spec.meaning, spec.operator)
+    return f"| {' | '.join(cells)} |\n"
 
 
 def _value(field: str, spec: AlertSpec) -> str:

@@ -172,8 +172,11 @@ def _kind(kind: Any) -> str:
 
 
 def _bounds(info: ArgumentInfo | OptionInfo) -> str:
-    bounds = [f"at least {info.min:g}"] if info.min is not None else []
-    return " and ".join([*bounds, *([f"at most {info.max:g}"] if info.max is not None else [])])
+    if info.min is not None and info.max is not None:
+        return f"{info.min:g} to {info.max:g}"
+    if info.max is not None:
+        return f"at most {info.max:g}"
+    return f"at least {info.min:g}" if info.min is not None else ""
 
 
 def _default(parameter: _Parameter) -> str:

@@ -1,3 +1,3 @@
-"""``companion calibrate``, on the ground: finds the camera's numbers in what was filmed, and writes
-them. In flight ``companion.calibration_watch`` only looks whether they hold.
+"""``companion calibrate``: estimates camera and mounting from recorded images on the ground, and
+writes them. In flight ``companion.calibration_watch`` only checks them.
 """

@@ -1,4 +1,4 @@
-"""What the autopilot says about the moments around each exposure, ready for any time offset."""
+"""The autopilot's data around each exposure, for any time offset."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class AutopilotRecord(Protocol):
 
 @dataclass(frozen=True)
 class AutopilotWindow:
-    """About one stamp, at T times `OFFSETS_S` from it; NaN where the autopilot does not know.
+    """Data around one timestamp, at T times `OFFSETS_S` from it; NaN where unknown.
 
     camera: (T, 3, 3) world from the camera's housing (gimbal axes, x along the boresight), without
     the deployment's mounting correction; body: (T, 3, 3) world from body; place: (T, 3) metres in
@@ -48,7 +48,7 @@ class AutopilotWindow:
 
     @property
     def has_place(self) -> bool:
-        """Whether the EKF's position is known all around."""
+        """Whether the EKF's position is known throughout."""
         return bool(np.isfinite(self.place).all())
 
     def motion(self, offset_s: float = 0.0) -> tuple[Array, Array]:
@@ -65,7 +65,7 @@ class AutopilotWindow:
 def autopilot_window_at(
     autopilot: AutopilotRecord, time_ns: int, frame: LocalFrame, geoid_m: float, mount: Array
 ) -> AutopilotWindow | None:
-    """About a stamp; None where attitude or gimbal are not known all around it.
+    """The window around a timestamp; None if attitude or gimbal are not known throughout.
 
     mount: (3, 3), the deployment's own correction, which `gimbal_at` has in it already.
     """

@@ -1,4 +1,4 @@
-"""The two accounts of a flight, and by how much a set of numbers contradicts them.
+"""Residuals of a flight's images and autopilot data for a set of calibration values.
 
 Pictures: the pixels in which they show the map's points, whatever the pose. Autopilot: attitude
 (through the gimbal) and place, at the stamp less the lateness. Everything is vectorised over the
@@ -24,7 +24,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 
 @dataclass(frozen=True)
 class CalibrationFrame:
-    """One picture with what was said about it. time_ns: its stamp."""
+    """One image with the autopilot's data. time_ns: its timestamp."""
 
     time_ns: int
     pose: Pose
@@ -34,7 +34,7 @@ class CalibrationFrame:
 
 @dataclass(frozen=True)
 class Guess:
-    """All that is looked for. shared: (COUNT,), see `UNKNOWNS`; rotations (K, 3, 3), places (K, 3):
+    """All estimated values. shared: (COUNT,), see `UNKNOWNS`; rotations (K, 3, 3), places (K, 3):
     world from camera of every frame.
     """
 
@@ -43,13 +43,15 @@ class Guess:
     places: Array
 
     def moved(self, shared: Array, frames: Array) -> Guess:
-        """By steps (COUNT,) and (K, 6): metres, and left rotation vectors, world axes."""
+        """The values after steps (COUNT,) and (K, 6): metres, and left rotation vectors, world
+        axes.
+        """
         turned = Rotation.from_rotvec(frames[:, 3:]).as_matrix() @ self.rotations
         return Guess(self.shared + shared, turned, self.places + frames[:, :3])
 
 
 class CalibrationProblem:
-    """The observations of K frames with N parts in all, about a deployment's numbers.
+    """Observations of K frames with N patches in all, relative to a deployment's values.
 
     camera, mount (3, 3), arm_m (3,): the deployment's.
     """
@@ -79,23 +81,23 @@ class CalibrationProblem:
 
     @property
     def start(self) -> Guess:
-        """The deployment's numbers, and the poses that came with the frames."""
+        """The deployment's values and the recorded poses."""
         return self._start
 
     @property
     def grounds(self) -> Array:
-        """(K, 2): east and north of the middle of what each picture shows, m."""
+        """(K, 2): east and north of the ground point in the middle of each image, m."""
         begins = np.flatnonzero(np.diff(self.owner, prepend=-1))
         counts = np.diff(np.append(begins, len(self.owner)))
         middles: Array = np.add.reduceat(self._points[:, :2], begins, axis=0) / counts[:, None]
         return middles
 
     def camera_of(self, shared: Array) -> Camera:
-        """The camera's model under these numbers."""
+        """The camera model with these values."""
         return changed_camera(self._camera, shared)
 
     def pixels(self, guess: Guess) -> Array:
-        """(N, 2): predicted less seen, weighted by each part's own information, px."""
+        """(N, 2): predicted minus measured, weighted by each patch's information, px."""
         away = self._points - guess.places[self.owner]
         x, y, z = np.einsum("nji,nj->in", guess.rotations[self.owner], away)
         c = self.camera_of(guess.shared)
@@ -105,7 +107,7 @@ class CalibrationProblem:
         return weighted
 
     def attitudes(self, guess: Guess) -> Array:
-        """(K, 3): seen against said, rotation vectors in the camera's axes, rad."""
+        """(K, 3): estimated against reported, rotation vectors in the camera's axes, rad."""
         late_s = float(guess.shared[u.LATE])
         heading = so3_exp([0.0, 0.0, -guess.shared[u.HEADING]])  # clockwise from north, in ENU
         mount = self._mount @ so3_exp(guess.shared[u.MOUNT]) @ GIMBAL_FROM_CAMERA
@@ -115,7 +117,7 @@ class CalibrationProblem:
         return turned
 
     def places(self, guess: Guess) -> Array:
-        """(K, 3): seen less said, metres; NaN where nothing was said."""
+        """(K, 3): estimated minus reported, metres; NaN where nothing was reported."""
         late_s, s = float(guess.shared[u.LATE]), guess.shared
         place = at(self._place, -late_s)
         arm = at(self._body, -late_s) @ (self.arm_m + s[u.ARM])
@@ -127,7 +129,7 @@ class CalibrationProblem:
 
 
 def changed_camera(camera: Camera, shared: Array) -> Camera:
-    """A camera's model with the optics' numbers added to it."""
+    """A camera model with estimated corrections added."""
     scale = float(np.exp(shared[u.FOCAL]))
     right, down = shared[u.CENTRE]
     bent = np.array(camera.distortion)

@@ -1,4 +1,4 @@
-"""``companion calibrate flight``: from a record with pictures to the numbers of its deployment."""
+"""``companion calibrate flight``: estimates calibration values from a record with images."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ _OURS = ("inject", "rc")
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What a flight says. solution: see `solve`; before, after: mean distance of the pictures'
-    parts from where the map has them, px of the stream, poses free; frames, parts: how many were
-    used. gnss_bias_m: of the receiver, which no flight shows, in `covariance` already. notes:
-    sentences for the reader.
+    """Result of a calibration flight. solution: see `solve`; before, after: mean distance of the
+    image patches from their map positions, px of the stream, poses free; frames, parts: numbers
+    used. gnss_bias_m: constant error of the receiver, already in `covariance`. notes: sentences for
+    the reader.
     """
 
     camera: Camera
@@ -61,7 +61,7 @@ class Calibrated:
 
     @property
     def shared(self) -> Array:
-        """The likeliest numbers, (COUNT,), as differences from the deployment's."""
+        """The most probable values, (COUNT,), as differences from the deployment's."""
         return self.solution.guess.shared
 
     @property
@@ -72,8 +72,8 @@ class Calibrated:
 
 @dataclass(frozen=True)
 class _ChosenFrame:
-    """One that was chosen, on the disk: two hundred of a 4K camera fill 5 GB. window: by the
-    autopilot; pose: where it was registered.
+    """A chosen frame on disk, since two hundred frames of a 4K camera fill 5 GB of memory. window:
+    the autopilot's data; pose: the registered one.
     """
 
     recorded: RecordedFrame
@@ -87,7 +87,7 @@ def calibrate(
     frames: int = 200,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Calibrated:
-    """Numbers of the record's deployment by its own pictures, over its map.
+    """Estimate the values of the record's deployment from its images over its map.
 
     frames: at most so many pictures are read, spread over the flight. progress: told how many are
     read, and of how many (each twice). `RecordError` where the
@@ -145,7 +145,7 @@ def _tell(progress: Callable[[int, int], None], begun: int, total: int, done: in
 
 
 def mount_of(config: CompanionConfig) -> Array:
-    """(3, 3): the deployment's correction from the camera's housing to the gimbal."""
+    """(3, 3): the mounting correction from the camera's housing to the gimbal."""
     c = config.bridge.camera
     return Mount.from_degrees(c.mount_roll_deg, c.mount_pitch_deg, c.mount_yaw_deg).rotation
 
@@ -153,7 +153,9 @@ def mount_of(config: CompanionConfig) -> Array:
 def _chosen(
     record: FlightRecord, stack: MapStack, mount: Array, most: int
 ) -> tuple[list[_ChosenFrame], float]:
-    """At most so many accepted estimates with their pictures, and the receiver's own error, m."""
+    """At most so many accepted estimates with their images, and the receiver's constant
+    error, m.
+    """
     config, bridge = record.config, record.config.bridge
     autopilot = RecordedAutopilot(bridge, record.log, record.tables.start_ns)
     good = [
@@ -193,7 +195,7 @@ def _chosen(
 
 
 def _stream_camera(record: FlightRecord, pictures: list[_ChosenFrame]) -> Camera:
-    """The deployment's at the size of the first picture that can be read."""
+    """The deployment's camera at the size of the first readable image."""
     for picture in pictures:
         if (frame := _read(picture, record.flight.camera.camera)) is not None:
             return frame.camera
@@ -201,7 +203,7 @@ def _stream_camera(record: FlightRecord, pictures: list[_ChosenFrame]) -> Camera
 
 
 def _read(picture: _ChosenFrame, camera: Camera) -> Frame | None:
-    """None of one that was cut off, as by a loss of power."""
+    """Read an image; None if it was cut off, for example by a power loss."""
     try:
         return picture.recorded.load(camera, picture.time_ns)
     except StreamDecodeError:
@@ -209,7 +211,7 @@ def _read(picture: _ChosenFrame, camera: Camera) -> Frame | None:
 
 
 def _unzoomed(camera: FeedConfig, autopilot: RecordedAutopilot, time_ns: int) -> bool:
-    """Whether a picture was taken with the model's own focal length, as far as it is told."""
+    """Whether an image was taken with the model's focal length, as far as it is recorded."""
     if camera.zoom is None:
         return True
     level = autopilot.zoom_at(time_ns, camera.zoom.hold_s)
@@ -218,7 +220,7 @@ def _unzoomed(camera: FeedConfig, autopilot: RecordedAutopilot, time_ns: int) ->
 
 
 def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
-    """What a flight's mean place may be off by for the receiver's sake, m, 1 sigma.
+    """Error of a flight's mean position because of the receiver, m, 1 sigma.
 
     accuracies_m: what the receiver said of itself at each picture whose place counts; None where it
     did not say. Errors that last all flight do not average out: the sigma of their mean is the mean

@@ -1,4 +1,4 @@
-"""From views of the board to the camera's model, and how well it is known."""
+"""Estimate the camera model and its uncertainty from views of the board."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a picture shows points of the map: measured part by part, without a camera's model.
+"""Measure where an image shows points of the map, patch by patch, without a camera model.
 
 Each part of the picture (13 of them side by side) is shifted by itself until its features lie on
 the map's, by least squares over the anchors in it. What is left over in one direction, or grows
@@ -34,8 +34,8 @@ _LEAST_SCALE = 0.02
 
 @dataclass(frozen=True)
 class Parts:
-    """What one picture shows. points: (N, 3) world; pixels: (N, 2) of the stream's own picture,
-    distorted as it came; information: (N, 2, 2), 1/px², of equal noise everywhere.
+    """Measurements of one image. points: (N, 3) world; pixels: (N, 2) of the original distorted
+    image; information: (N, 2, 2), 1/px².
     """
 
     points: Array
@@ -44,7 +44,7 @@ class Parts:
 
 
 class PictureReader:
-    """Renders the map where a picture was taken, and measures where it shows the map's points.
+    """Renders the map at an image's pose and measures where the image shows the map's points.
 
     camera: as it is believed to be; wrong by per cents it still finds every point.
     """
@@ -57,7 +57,7 @@ class PictureReader:
         self._undistorter = Undistorter(camera, self._working)
 
     def read(self, frame: Frame, pose: Pose, sweep: Sweep | None) -> Parts | None:
-        """The parts of a picture that was taken at `pose`; None where it cannot be compared."""
+        """The patches of an image taken at `pose`; None if they cannot be compared."""
         view = self._renderer.render(pose, self._working, wait=True)
         if np.count_nonzero(view.depth) < 0.2 * view.depth.size:
             return None
@@ -107,7 +107,7 @@ class PictureReader:
         self, points: Array, uv: Array, number: NDArray[np.int64], shift: Array,
         curvature: Array, good: NDArray[np.bool_],
     ) -> Parts:  # fmt: skip
-        """One point per good part, the anchor next to its middle, and where the picture has it."""
+        """One point for each good patch: the anchor nearest its middle, and its measured pixel."""
         chosen = []
         for k in np.flatnonzero(good):
             members = np.flatnonzero(number == k)

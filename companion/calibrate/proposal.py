@@ -1,4 +1,4 @@
-"""From what a flight says to a deployment: what changes, what it is worth, and the file."""
+"""Convert the result of a calibration to changes of the deployment file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ class SettingChange:
 
 
 def changes(config: CompanionConfig, found: Calibrated) -> tuple[SettingChange, ...]:
-    """All settings that the flight's numbers replace, together: they were found together."""
+    """All settings that the flight's estimate replaces. They were estimated together and must be
+    replaced together.
+    """
     s, told = found.shared, config.camera.model
     camera = changed_camera(found.camera, s)
     size = told.camera().resized(found.camera.width, found.camera.height)
@@ -82,7 +84,7 @@ def _mounting(config: CompanionConfig, found: Calibrated) -> list[SettingChange]
 
 
 def _sigmas(config: CompanionConfig, found: Calibrated) -> list[SettingChange]:
-    """What the localizer may now believe of its camera."""
+    """The new sigmas of the camera model."""
     sigma = found.sigmas
     told = config.localizer.calibration
     values = {
@@ -101,7 +103,7 @@ def _sigmas(config: CompanionConfig, found: Calibrated) -> list[SettingChange]:
 
 
 def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[SettingChange, ...]:
-    """What a board changes; config: None where there is no deployment yet."""
+    """The settings that a board calibration changes; config: None if there is no deployment yet."""
     model = None if config is None else config.camera.model
     told = None if config is None else config.localizer.calibration
     c = lens.camera
@@ -134,7 +136,7 @@ def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[Se
 
 
 def changed(config: CompanionConfig, wanted: tuple[SettingChange, ...]) -> CompanionConfig:
-    """The deployment with its changes. `SettingsError` where the result is none."""
+    """The deployment with its changes. Raises `SettingsError` if it is invalid."""
     document = config.model_dump()
     _apply(document, wanted)
     return validated(CompanionConfig, document)
@@ -151,8 +153,9 @@ def _apply(document: dict[str, Any], wanted: tuple[SettingChange, ...]) -> None:
 
 
 def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
-    """`ConfigError` where a deployment file is another than the flight's: differences from one
-    mounting, written over another's, would be neither's. What was written already may stand there.
+    """Raise `ConfigError` if the deployment file differs from the flight's. The estimate is a
+    difference from the flown mounting and is wrong for another one. Values that were already
+    written may differ.
     """
     document = load_config(path).model_dump()
     for change in wanted:
@@ -168,8 +171,8 @@ def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
 
 
 def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -> Path:
-    """Replace the deployment file, if the result is one; the old one stays beside it under the name
-    that is returned. Both may be read by whom the old one might.
+    """Replace the deployment file if the result is valid. The old file is kept beside it; its name
+    is returned. Access rights stay the same.
     """
     document = with_current_keys(CompanionConfig, read_settings(path, ConfigError), str(path))
     _apply(document, wanted)
@@ -191,7 +194,9 @@ def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -
 
 
 def blind_spots(found: Calibrated) -> tuple[str, ...]:
-    """What this flight cannot tell apart: weak eigenvectors of its information, in words."""
+    """Combinations of values that this flight cannot separate, in words: weak eigenvectors of its
+    information.
+    """
     D = np.diag(u.USEFUL)
     information = D @ found.solution.information @ D
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))

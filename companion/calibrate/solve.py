@@ -1,4 +1,4 @@
-"""Least squares over all frames: the shared numbers and every frame's pose together.
+"""Least squares over all frames: the shared values and every frame's pose.
 
 The pictures' noise is white between parts; attitude and place by the autopilot wander for seconds,
 so each is a Gauss-Markov process (`wander`) whose strength and memory are taken from what is left
@@ -34,8 +34,8 @@ _CONVERGED = 1e-3  # of a sigma
 
 @dataclass(frozen=True)
 class Solution:
-    """guess: the likeliest numbers and poses. covariance: (COUNT, COUNT) of the shared numbers, the
-    weak priors included; information: likewise, of the flight alone. pixel_sigma: of a part, px.
+    """guess: the most probable values and poses. covariance: (COUNT, COUNT) of the shared values,
+    with the weak priors; information: the same of the flight alone. pixel_sigma: of a patch, px.
     """
 
     guess: Guess
@@ -48,7 +48,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Noise:
-    """What is believed of the errors; weight: (N,) of the parts."""
+    """Assumed measurement noise; weight: (N,) of the patches."""
 
     pixel_sigma: float
     weight: Array
@@ -59,8 +59,8 @@ class _Noise:
 def solve(
     evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None, sigmas: Array = u.SIGMAS
 ) -> Solution:
-    """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value;
-    sigmas: (COUNT,) of the weak priors, how wrong the given numbers may be.
+    """Estimate the values. fixed: (COUNT,) bool, keep their value; sigmas: (COUNT,) of the weak
+    priors.
     """
     guess = evidence.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed

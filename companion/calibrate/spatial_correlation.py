@@ -59,8 +59,8 @@ class ImageNormalEquations:
 def pictures_part(
     gain: Array, count: int, pictures: ImageNormalEquations, grounds: Array
 ) -> tuple[Array, Array]:
-    """The pictures' part (C, C) of the shared numbers' covariance if each erred for itself, and the
-    factor (C,) of each sigma of it that how they do err asks for, at least 1.
+    """The images' part (C, C) of the shared values' covariance for independent image errors, and
+    the factor (C,) by which correlation increases each sigma, at least 1.
 
     gain: (C, C + 6 K), the first rows of the normal equations' inverse; count: C; grounds: (K, 2),
     east and north of what each picture shows, m.

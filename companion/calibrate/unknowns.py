@@ -1,4 +1,4 @@
-"""The numbers that a flight is asked for: what they are, how wrong they may be, what would do."""
+"""The values that a flight estimates, their prior sigmas and their useful accuracy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from localizer.geometry.pose import Array
 
 @dataclass(frozen=True)
 class Unknown:
-    """One number. sigma: how wrong a deployment may be (a weak prior); useful: below this sigma the
-    flight has told it. scale: of the shown unit against the number's own.
+    """One value. sigma: prior of a deployment (weak); useful: accuracy from which the flight counts
+    as informative. scale: from the value to the shown unit.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Views of the board: which are worth keeping, and what is still missing."""
+"""Views of the board: which to keep, and which are missing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class BoardView:
 
 
 class BoardViews:
-    """Takes pictures of one camera in their order, and keeps the views that tell something new."""
+    """Takes images of one camera in order and keeps the views that add information."""
 
     def __init__(self, width: int, height: int) -> None:
         self._size = (width, height)
@@ -49,7 +49,7 @@ class BoardViews:
         self.views: list[BoardView] = []
 
     def take(self, image: Image) -> str:
-        """A picture (H, W, 3); what became of it, in words."""
+        """Add an image (H, W, 3); returns the result in words."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         corners, names, _, _ = self._detector.detectBoard(grey)
         if names is None or len(names) < _LEAST_CORNERS:
@@ -72,7 +72,7 @@ class BoardViews:
         return "taken"
 
     def missing(self) -> list[str]:
-        """What the next views should show; nothing left: enough."""
+        """What the next views should show; empty: enough."""
         wanted = []
         cells = np.zeros((_ROWS, _COLUMNS), int)
         for view in self.views:
@@ -99,7 +99,9 @@ class BoardViews:
         return wanted
 
     def _is_still(self, ids: Array, pixels: Array) -> bool:
-        """Whether the corners lie where they lay before: no blur, no sheared rows."""
+        """Whether the corners have not moved, so that there is no blur and no rolling-shutter
+        shear.
+        """
         if self._last is None:
             return False
         common, now, before = np.intersect1d(ids, self._last[0], return_indices=True)

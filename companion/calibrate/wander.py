@@ -1,4 +1,4 @@
-"""Errors that last from one picture to the next: how large they are, and for how long.
+"""Errors that are correlated in time: their sigma and correlation time.
 
 Each source is a Gauss-Markov process. Places err along the world's axes, each for itself. Attitudes
 err about the camera's axes, and about the vertical: a heading's error turns a camera that looks

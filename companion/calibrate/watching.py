@@ -1,4 +1,4 @@
-"""A stream watched for views of the board, until there are enough."""
+"""Collect views of the board from a stream until there are enough."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _QUIET_PICTURES = 30  # of the same word, after which it is said again
 
 @dataclass(frozen=True)
 class Filmed:
-    """What was seen. missing: what was not."""
+    """Result of the collection. missing: views that are still missing."""
 
     views: tuple[BoardView, ...]
     missing: tuple[str, ...]
@@ -28,7 +28,7 @@ class Filmed:
 
 
 def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> Filmed:
-    """Watch for at most so long, or to the end of a file or folder, or until nothing is missing.
+    """Watch for at most this time, to the end of a file or folder, or until all views are there.
 
     told: views, the newest picture's fate and what is missing, whenever that changes. keep: folder
     for the pictures that were taken.

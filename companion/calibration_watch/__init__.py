@@ -1,3 +1,3 @@
-"""In flight: checks by the fixes themselves whether the camera is as the deployment says. It raises
-alerts and changes no number; ``companion.calibrate`` estimates the numbers.
+"""Check in flight whether focal length, boresight and timestamps are as configured. It raises
+alerts and changes no parameter; ``companion.calibrate`` estimates them.
 """

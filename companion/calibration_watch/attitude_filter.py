@@ -1,4 +1,4 @@
-"""Boresight and time offset from how the registered camera looks, against gimbal and autopilot.
+"""Estimate boresight and time offset from the registered attitude, gimbal and autopilot.
 
 What is mounted wrong, or what the gimbal or compass gets wrong, is off by the same angle always;
 what is stamped late is off by the turn rate times the delay.
@@ -30,7 +30,9 @@ _LEVEL_TURN = 0.2  # below this horizontal part of the axis "forward" is the pic
 
 
 class AttitudeFilter:
-    """Takes sightings in the order of their times, a few times a second; one thread."""
+    """Kalman filter of boresight and time offset. Takes observations in time order, a few times a
+    second; one thread.
+    """
 
     def __init__(self) -> None:
         self._x = np.zeros(4)
@@ -39,22 +41,22 @@ class AttitudeFilter:
 
     @property
     def boresight_rad(self) -> tuple[CalibrationEstimate, CalibrationEstimate, CalibrationEstimate]:
-        """By which the camera is off in yaw (about the vertical), pitch and roll."""
+        """Boresight error in yaw (about the vertical), pitch and roll."""
         return self._figure(0), self._figure(1), self._figure(2)
 
     @property
     def late_s(self) -> CalibrationEstimate:
-        """By how much pictures are stamped late, s."""
+        """Delay of the frames' timestamps, s."""
         return self._figure(_LATE)
 
     def forget_stamps(self) -> None:
-        """How late pictures are is not known."""
+        """Reset the time offset to unknown."""
         self._forget([_LATE])
 
     def take(
         self, seen: CalibrationObservation, known: AutopilotObservation, seconds: float
     ) -> None:
-        """A sighting so many seconds after the one before."""
+        """Add an observation, so many seconds after the one before."""
         self._cov = self._cov + np.diag(np.square(_WALKS) * min(seconds, 10.0))
         if known.ned_from_camera is None or known.turn is None:
             return

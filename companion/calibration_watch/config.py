@@ -1,4 +1,4 @@
-"""From when on a calibration is called wrong."""
+"""Limits of the calibration watch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CalibrationLimits:
-    """A figure beyond its limit by four sigmas raises an alert and inhibits injection."""
+    """An error above its limit by four sigmas raises an alert and inhibits injection."""
 
     enabled: bool = True
     focal_share: float = 0.025  # focal length error

@@ -1,4 +1,4 @@
-"""How far the ground is, and how much of it the camera sees: what its errors are multiplied with.
+"""Distance to the ground and width of the view, which scale the effect of calibration errors.
 
 The height above take-off is neither: an aircraft that left a hill flies over a valley below zero,
 and a lens that zooms sees another piece of the same ground. The registered pictures know both.
@@ -19,18 +19,20 @@ _LONG_AGO_NS = 10_000_000_000  # the ground below may be another since
 
 
 class GroundView:
-    """Takes the registered pictures. horizontal_fov_deg: the camera's, where none says another."""
+    """Tracks ground distance and width of the view from registered frames. horizontal_fov_deg: used
+    where an observation has none.
+    """
 
     def __init__(self, horizontal_fov_deg: float) -> None:
         self._fov_deg = horizontal_fov_deg
         self._newest: CalibrationObservation | None = None
 
     def add(self, sighting: CalibrationObservation) -> None:
-        """A registered picture that was accepted against the map."""
+        """Add a registered frame that was accepted against the map."""
         self._newest = sighting
 
     def height_m(self, state: VehicleState, now_ns: int) -> float | None:
-        """Above the ground, at the least favourable of what is known; None where nothing is.
+        """Height above the ground, the largest of the known ones; None if none is known.
 
         now_ns: of what it is asked for; ground that was seen long before says nothing of it.
         """
@@ -41,7 +43,7 @@ class GroundView:
         return max(known, default=None)
 
     def width_m(self, state: VehicleState, now_ns: int) -> float:
-        """Of the ground from one side of the picture to the other."""
+        """Width of the ground in the frame, m."""
         newest = self._newest
         if newest is not None and now_ns - newest.time_ns < _HOLDS_NS:
             return newest.depth_m * _spread(newest.horizontal_fov_deg)
@@ -50,5 +52,5 @@ class GroundView:
 
 
 def _spread(fov_deg: float) -> float:
-    """Width of what is seen, per distance."""
+    """Width of the view divided by its distance."""
     return 2.0 * math.tan(math.radians(fov_deg) / 2.0)

@@ -42,18 +42,18 @@ Policy = Literal["tell", "apply"]
 
 
 class MapOffsetTelemetry(Protocol):
-    """What is asked of the autopilot: the bridge."""
+    """The bridge's telemetry that the estimator reads."""
 
     def state(self) -> VehicleState:
-        """What the vehicle says about itself."""
+        """Newest state of the vehicle."""
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
+        """The EKF's latitude, longitude and altitude at a time, while the EKF uses GNSS."""
         ...
 
     def report_alert(self, alert: Alert) -> None:
-        """An alert for the operator."""
+        """Report an alert to the operator."""
         ...
 
 
@@ -70,13 +70,13 @@ class MapOffset:
 
     @property
     def direction(self) -> Direction:
-        """Of the map from GNSS."""
+        """Direction from GNSS to the map."""
         north, east = self.ne_m
         return _WINDS[round(math.degrees(math.atan2(east, north)) / 45.0) % 8]
 
 
 def estimate(blocks: Array, bias_m: float) -> MapOffset:
-    """The shift from blocks (N, 2) of median differences, north and east, metres.
+    """Estimate the offset from blocks (N, 2) of median differences, north and east, metres.
 
     Blocks beyond three robust sigmas of the median are left out. bias_m: sigma of GNSS's own
     error, per axis, which no averaging takes away.
@@ -93,7 +93,8 @@ def estimate(blocks: Array, bias_m: float) -> MapOffset:
 
 
 class MapOffsetEstimator:
-    """A judge of fixes (`FixInjection.add_judge`) that passes them on unchanged or shifted.
+    """Estimates the map offset. As a check of fixes (`FixInjection.add_judge`) it returns them
+    unchanged or shifted.
 
     It comes before the other judges, so that they compare with GNSS what is injected. It keeps its
     estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the vehicle's receiver
@@ -143,7 +144,7 @@ class MapOffsetEstimator:
         }
 
     def judge(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
-        """Learn from the fix, and apply what is known, if that is the policy."""
+        """Compare the fix with GNSS; return it shifted if the offset is applied."""
         if seen.state is TrackingState.TRACKING and not self._gnss_is_ours:
             self._waiting.append(fix)
         while self._waiting and fix.time_ns - self._waiting[0].time_ns >= _WAITS_NS:
@@ -192,7 +193,7 @@ class MapOffsetEstimator:
         )
 
     def _shifted(self, fix: VisionFix) -> VisionFix:
-        """The fix in GNSS's place. What is applied creeps to what is known, without a jump."""
+        """The fix corrected by the applied offset, which changes slowly, without a jump."""
         shift = self._shift
         usable = shift is not None and shift.significant and math.hypot(*shift.ne_m) <= _LARGEST_M
         if shift is not None and usable:

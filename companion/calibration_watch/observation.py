@@ -1,4 +1,4 @@
-"""One registered picture, as evidence of how the camera is made and mounted."""
+"""A registered frame as evidence of the camera's focal length, boresight and time offset."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CalibrationObservation:
-    """What the map says of one picture.
+    """Pose of one registered frame, and the autopilot's data of the same time.
 
     place: latitude, longitude (degrees) and height above the ellipsoid (m) of the vehicle;
     sigma_m: horizontal, 1 sigma. ned_from_camera: (3, 3), OpenCV axes. depth_m: of the ground along
@@ -29,7 +29,7 @@ class CalibrationObservation:
 
 @dataclass(frozen=True)
 class AutopilotObservation:
-    """What the autopilot says of the same moment; None where it does not know.
+    """The autopilot's data at the time of a frame; None where unknown.
 
     ned_from_camera: (3, 3) by gimbal and attitude; turn: its rotation vector (3,) over a second,
     NED, rad. north_east_m: of the EKF on GNSS, from the sighting's place. gnss_height_m,
@@ -51,9 +51,9 @@ class CalibrationEstimate:
     sigma: float
 
     def exceeds(self, limit: float) -> bool:
-        """Beyond the limit, and sure to be wrong at all."""
+        """Whether the error is above the limit with four sigmas of confidence."""
         return abs(self.value) > limit and abs(self.value) > 4.0 * self.sigma
 
     def is_within(self, limit: float) -> bool:
-        """Surely below the limit."""
+        """Whether the error is below the limit with confidence."""
         return abs(self.value) + 2.0 * self.sigma < limit

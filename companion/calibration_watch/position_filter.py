@@ -1,4 +1,4 @@
-"""Focal length and time offset from where vision says the vehicle is.
+"""Estimate focal length and time offset from vision's position.
 
 A focal length that is long by a share e puts the camera e times the ground's distance too far back
 along its optical axis: the error changes with the axis (a turn, another gimbal pitch) and with the
@@ -39,7 +39,9 @@ _ZOOMED = 3  # sightings in a row that contradict what was known: the lens may b
 
 
 class PositionFilter:
-    """Takes sightings in the order of their times, a few times a second; one thread."""
+    """Kalman filter of focal length and time offset. Takes observations in time order, a few times
+    a second; one thread.
+    """
 
     def __init__(self) -> None:
         self._x = np.zeros(_SIZE)
@@ -51,26 +53,26 @@ class PositionFilter:
 
     @property
     def focal(self) -> CalibrationEstimate:
-        """Share by which the focal length is long."""
+        """Relative error of the focal length; positive: too long."""
         return self._figure(_F)
 
     @property
     def late_s(self) -> CalibrationEstimate:
-        """By how much pictures are stamped late, s."""
+        """Delay of the frames' timestamps, s."""
         return self._figure(_T)
 
     def forget_motion(self) -> None:
-        """The way since the last sighting is not known: a gap, or a jump of vision's own."""
+        """Reset the motion since the last observation: after a gap or a jump of vision."""
         for at in (_P, _V, _A):
             self._loosen(at, 2)
 
     def forget_stamps(self) -> None:
-        """How late pictures are is not known."""
+        """Reset the time offset to unknown."""
         self._loosen(_T, 1)
 
     def predict(self, moved: Array, faster: Array, seconds: float) -> None:
-        """What the IMU says: displacement beyond what the velocity leads to, and change of
-        velocity, (2,) each, over so many seconds.
+        """Predict with the IMU over so many seconds: displacement beyond the velocity's, and change
+        of velocity, (2,) each.
         """
         h = seconds
         transition = np.eye(_SIZE)
@@ -95,7 +97,7 @@ class PositionFilter:
         known: AutopilotObservation,
         climb_mps: float,
     ) -> None:
-        """A sighting at `place` (2,), north and east of a fixed point, m."""
+        """Add an observation at `place` (2,), north and east of a fixed point, m."""
         axis = seen.ned_from_camera[:, 2]
         behind = seen.depth_m * axis  # by which a share of 1 would put the camera back
         # Heights first: they tell a lens from a lag, which is all horizontal.
@@ -159,7 +161,7 @@ class PositionFilter:
         return agreed
 
     def _correct(self, H: Array, innovation: float, sigma: float) -> bool:
-        """One scalar measurement; False if it is an outlier, which is left out."""
+        """Update with one scalar measurement; False if it is an outlier, which is ignored."""
         PH = self._cov @ H
         S = float(H @ PH) + sigma**2
         if innovation**2 > _OUTLIER**2 * S:
@@ -171,7 +173,9 @@ class PositionFilter:
         return True
 
     def _loosen(self, at: int, count: int, *, keep: bool = False) -> None:
-        """Forget some states, and how they are tied to the others. keep: not their values."""
+        """Increase the variance of some states and remove their correlations. keep: keep their
+        values.
+        """
         for i in range(at, at + count):
             self._cov[i, :] = self._cov[:, i] = 0.0
             self._cov[i, i] = _SIGMAS[i] ** 2

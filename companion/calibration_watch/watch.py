@@ -1,4 +1,4 @@
-"""The watch: sightings in, figures out. No threads and no clock of its own."""
+"""The calibration watch: observations in, estimates out. It has no threads and no clock."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ _KEEPS_NS, _KEPT = 1_000_000_000, 20  # what was known at earlier times
 
 @dataclass(frozen=True)
 class CalibrationFigures:
-    """What is known by now. focal: share by which it is long; late_s: of the stamps, the surer of
-    two accounts; boresight_deg: the worst angle, about `axis`.
+    """The current estimates. focal: relative error, positive: too long; late_s: delay of the
+    timestamps, from the more certain of two filters; boresight_deg: the largest angle, about
+    `axis`.
     """
 
     focal: CalibrationEstimate
@@ -52,7 +53,7 @@ class CalibrationFigures:
 
 @dataclass(frozen=True)
 class _Known:
-    """What was known at a time, to go back to."""
+    """Saved state of the filters, to restore later."""
 
     time_ns: int
     position: PositionFilter
@@ -60,7 +61,7 @@ class _Known:
 
 
 class CalibrationWatch:
-    """One thread. `add` sightings, then `step`."""
+    """Use from one thread. Call `add` with observations, then `step`."""
 
     def __init__(self, limits: CalibrationLimits) -> None:
         self._limits = limits
@@ -78,13 +79,13 @@ class CalibrationWatch:
         self._doubted_ns: int | None = None
 
     def add(self, sighting: CalibrationObservation) -> None:
-        """A registered picture that was accepted against the map."""
+        """Add a registered frame that was accepted against the map."""
         if self._limits.enabled:
             self._waiting.append(sighting)
 
     def distrust(self, since_ns: int) -> None:
-        """Pictures from a time on are not of their time (frozen, repeated): they are left out, and
-        what they have taught already is forgotten. For as long as they last.
+        """Exclude frames from this time on, because they are frozen or repeated, and undo what the
+        filters learned from them. Call it as long as this lasts.
         """
         self._waiting = deque((s for s in self._waiting if s.time_ns <= since_ns), _QUEUE)
         if self._last_ns <= since_ns:
@@ -97,11 +98,11 @@ class CalibrationWatch:
         self._last, self._last_ns = None, since_ns
 
     def doubt_stamps(self, since_ns: int) -> None:
-        """From a time on the stamps may be others: what was known of them before says nothing."""
+        """The timestamps may change at this time: discard the estimated time offset."""
         self._doubted_ns = since_ns
 
     def step(self, now_ns: int, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
-        """Take in what has come; a few times a second."""
+        """Process the new observations; call it a few times a second."""
         if not self._limits.enabled:
             return
         state = vehicle.state()
@@ -115,7 +116,7 @@ class CalibrationWatch:
                 self._take(seen, state, vehicle, track)
 
     def figures(self) -> CalibrationFigures:
-        """What is known by now."""
+        """The current estimates."""
         angles = self._attitude.boresight_rad
         worst = max(range(3), key=lambda i: abs(angles[i].value) / max(angles[i].sigma, 1e-6))
         angle, late = angles[worst], self._lateness()
@@ -126,12 +127,13 @@ class CalibrationWatch:
         return CalibrationFigures(self._position.focal, late, boresight, AXES[worst])
 
     def known_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
-        """By how much a position is wrong for what was found, metres."""
+        """Position error that the estimated calibration errors cause, metres."""
         focal_m = abs(self._position.focal.value) * self._depth_m if focal else 0.0
         return focal_m + (abs(self._lateness().value) * speed_mps if time else 0.0)
 
     def _lateness(self) -> CalibrationEstimate:
-        """The way over ground counts; the turns of the camera only where they say the same.
+        """Time offset from the motion over ground; the camera's rotation is used only where it
+        agrees.
 
         A gimbal's angles may be late themselves. A camera without gimbal turns with the autopilot's
         own attitude: there the surer account counts, if the other does not speak against it.
@@ -218,7 +220,7 @@ class _History:
             self._rows.append((time_ns, value))
 
     def at(self, time_ns: int) -> float | None:
-        """The value; None where no report is near."""
+        """The interpolated value; None without a report near that time."""
         if not self._rows or not self._rows[0][0] <= time_ns <= self._rows[-1][0] + _STALE_NS:
             return None
         times, values = zip(*self._rows, strict=True)
@@ -226,7 +228,7 @@ class _History:
 
 
 def _tells(figure: CalibrationEstimate) -> bool:
-    """Whether it says anything but zero."""
+    """Whether the estimate differs from zero significantly."""
     return abs(figure.value) > 2.0 * figure.sigma
 
 
@@ -235,7 +237,7 @@ def _agree(a: CalibrationEstimate, b: CalibrationEstimate, sigmas: float = 3.0) 
 
 
 def _fused(a: CalibrationEstimate, b: CalibrationEstimate) -> CalibrationEstimate:
-    """Both accounts, each by its variance."""
+    """Combine both estimates, weighted by their variances."""
     wa, wb = 1.0 / a.sigma**2, 1.0 / b.sigma**2
     return CalibrationEstimate((wa * a.value + wb * b.value) / (wa + wb), 1.0 / math.sqrt(wa + wb))
 
@@ -249,7 +251,9 @@ def _camera(gimbal: GimbalAttitude | None) -> Array | None:
 def _gnss_offset(
     seen: CalibrationObservation, state: VehicleState, place: tuple[float, ...] | None
 ) -> tuple[float, float] | None:
-    """North and east of the EKF from the sighting, if the EKF is where the receiver is."""
+    """North and east offset of the EKF from the observation, if the EKF agrees with the
+    receiver.
+    """
     if place is None or state.gps_latitude_deg is None or state.gps_longitude_deg is None:
         return None
     if state.latitude_deg is None or state.longitude_deg is None:

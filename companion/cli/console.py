@@ -1,4 +1,4 @@
-"""``companion console``: the operator's page, as a process of its own."""
+"""``companion console``: the operator's page in its own process."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def require_extra() -> None:
 
 
 def serve(site: ConsoleSite) -> None:
-    """Serve until interrupted. The address is printed once it can be opened."""
+    """Serve until interrupted. Prints the address when the page can be opened."""
     from companion.console.serving import Server
 
     def tell() -> None:
@@ -83,7 +83,7 @@ def serve(site: ConsoleSite) -> None:
 
 
 def _end_with_input() -> None:
-    """The flight that started this process holds the other end: when it is gone, so is this."""
+    """End when the standard input closes: the flight process that started this one has ended."""
     while sys.stdin.buffer.read(1):
         pass
     os._exit(0)

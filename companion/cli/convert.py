@@ -104,7 +104,7 @@ def _on_earth(separation_m: float) -> float:
 
 
 def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame | None, float | None]:
-    """The ENU frame and the geoid's separation there, as far as they are told."""
+    """The ENU frame and the geoid separation there, as far as given."""
     if map_cache is not None and origin is not None:
         raise ConfigError("give either --map or --origin LAT,LON,HEIGHT")
     if origin is not None:
@@ -121,7 +121,7 @@ def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame | Non
 def _dated(
     poses: Sequence[StampedPose], times: Path | None, *, needed: bool
 ) -> tuple[StampedPose, ...]:
-    """The poses with the file's times, or with the names that it has for their times."""
+    """The poses with the file's times, or with the file's names for their times."""
     if times is None:
         if needed and any(pose.time_ns is None for pose in poses):
             raise ConfigError("these poses have no times: give --times timestamps.txt")

@@ -1,5 +1,6 @@
-"""``companion doctor``: the examination as a table, and the writing of parameters; ``self-test``:
-does the program compute rightly on this computer."""
+"""``companion doctor``: the checks as a table, and the writing of parameters; ``self-test``:
+whether the program computes correctly on this computer.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +76,7 @@ def doctor_command(
 
 
 def print_diagnosis(console: Console, diagnosis: Diagnosis, left_out: Sequence[str] = ()) -> None:
-    """A table that fits 80 columns, then a line or two for each thing that is not right.
+    """Print a table of 80 columns, then one or two lines for each failed check.
 
     left_out: what was not examined, which a title that says "fit" must not hide.
     """

@@ -170,7 +170,7 @@ def evaluate_command(
 def place_finder(
     stack: MapStack, config: LocalizerConfig, known: KnownOfPlace | None
 ) -> Iterator[PlaceFinder | None]:
-    """Who finds a place without a prior, where that is asked for."""
+    """The search for a position without a prior, if the option selects it."""
     opened = None if known is None else open_relocalizer(stack.cache, config)
     if known is None or opened is None:
         yield None
@@ -215,7 +215,7 @@ def _text(value: float | None, digits: int) -> str:
 
 
 def _prepare(folder: Path) -> None:
-    """Make the report's folder and try it, before minutes are spent on what goes into it."""
+    """Create the report's folder and check that it is writable, before the long computation."""
     with writing(made_folder(folder, "--report"), "--report"), TemporaryFile(dir=folder):
         pass
 
@@ -250,7 +250,7 @@ def _write_trajectories(
 
 
 def _shown(frames: list[EvaluatedFrame]) -> list[int]:
-    """The worst frames; at most half of them rejected ones, if others were localized."""
+    """The worst frames; at most half of them rejected, if others were localized."""
     order = worst_first(frames)
     rejected = [i for i in order if frames[i].translation_error_m is None]
     localized = [i for i in order if frames[i].translation_error_m is not None]

@@ -1,4 +1,4 @@
-"""How an operator's interrupt ends a process that has nothing to put away yet."""
+"""Ends a process that needs no clean-up at the operator's interrupt."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ INTERRUPTED = 130  # the shell's convention: 128 + SIGINT
 
 
 def end_at_once(*_: object) -> None:
-    """A signal handler. One that raised would do so wherever the interpreter happens to be: in an
-    import, a destructor or a compiler's callback, some of which catch it or print it and go on.
+    """Signal handler that exits at once. An exception could be raised inside an import, a
+    destructor or a compiler callback, which may catch it and continue.
     """
     os._exit(INTERRUPTED)

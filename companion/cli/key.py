@@ -1,4 +1,4 @@
-"""``companion key``: makes the key that MAVLink links are signed with, and installs it."""
+"""``companion key``: make and install the key for MAVLink signing."""
 
 from __future__ import annotations
 

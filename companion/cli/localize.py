@@ -1,4 +1,4 @@
-"""``companion localize``: where were these images taken? Their true poses need not be known."""
+"""``companion localize``: estimate where images were taken, without true poses."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def _row(name: str, prior: str) -> PoseRow:
 
 
 def _print(found: Sequence[LocalizedImage], frame: LocalFrame) -> int:
-    """Where a single image was taken, and how many of several were localized."""
+    """Print the position of a single image, or how many of several were localized."""
     for image in found:
         if image.problem:
             text = escape(f"{image.name}: {image.problem}")

@@ -1,4 +1,4 @@
-"""``companion map``: build tile caches and look at them."""
+"""``companion map``: build and inspect tile caches."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ def export(
 
 
 def _make_overview(cache: Path) -> None:
-    """The map's features from above, and how far it is."""
+    """Compute the overview for relocalization, with progress."""
     from localizer.config import LocalizerConfig
     from localizer.map.cache.cache import TileCache
     from localizer.relocalization.relocalizer import open_relocalizer
@@ -328,7 +328,7 @@ def _make_overview(cache: Path) -> None:
 
 
 def _require_place(*files: Path) -> None:
-    """Files that can be written as far as can be seen: told before the minutes that it takes."""
+    """Check that the files can be written, before the long computation."""
     for file in files:
         if file.is_dir():
             raise typer.BadParameter(f"--out {file}: is a folder; give a file's name")

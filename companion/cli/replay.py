@@ -1,4 +1,4 @@
-"""``companion replay``: a recorded flight localized again and compared."""
+"""``companion replay``: localize a recorded flight again and compare."""
 
 from __future__ import annotations
 

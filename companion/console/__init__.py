@@ -1,1 +1,1 @@
-"""The operator's page: a process of its own, which the flight does not notice."""
+"""The operator's page, in its own process, which cannot slow the flight down."""

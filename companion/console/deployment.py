@@ -1,4 +1,4 @@
-"""The deployment file: shown with its keys' help, checked before it is written, kept before."""
+"""The deployment file in the console: show with help, check before writing, keep the old file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOST_BYTES = 64 << 10
 
 
 def shown(path: Path, editable: bool) -> dict[str, Any]:
-    """The file's text, and the help; credentials only for somebody who may change the file."""
+    """The file's text and the help; credentials only for someone who may change the file."""
     try:
         text = plain_text(path)
     except (OSError, ValueError) as error:
@@ -36,7 +36,7 @@ def shown(path: Path, editable: bool) -> dict[str, Any]:
 
 
 def check(path: Path, text: str) -> CompanionConfig:
-    """What the text would be as the deployment; `ConfigError` names what is wrong.
+    """Check the text as a deployment; `ConfigError` names what is wrong.
 
     Read from a file beside the real one, since relative paths begin there.
     """
@@ -50,7 +50,7 @@ def check(path: Path, text: str) -> CompanionConfig:
 
 
 def replace(path: Path, text: str) -> Path:
-    """Write a text that holds; returns where the old one is kept."""
+    """Write a valid text; returns the path of the old one."""
     check(path, text)
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     kept = path.with_name(f"{path.name}.{stamp}.old")
@@ -86,7 +86,7 @@ def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, 
 
 @contextlib.contextmanager
 def _beside(path: Path, text: str) -> Iterator[Path]:
-    """A file of that text in the same folder; gone afterwards, if it is still there."""
+    """A temporary file with that text in the same folder."""
     try:
         number, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".yaml", dir=path.parent)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The doctor, run as a process beside the page: what it says line by line, and how it ended."""
+"""Runs ``companion doctor`` as a process and reads its output line by line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MOST_LINES = 400
 
 
 class Examination:
-    """One at a time."""
+    """Runs one check at a time."""
 
     def __init__(self, deployment: Path) -> None:
         self._deployment = deployment
@@ -22,12 +22,16 @@ class Examination:
         self._code: int | None = None
 
     def report(self) -> dict[str, Any]:
-        """What it said until now. code: of the doctor, None while it runs or before the first."""
+        """The output so far. code: exit code of the doctor, None while it runs or
+        before the first.
+        """
         running = self._task is not None and not self._task.done()
         return {"running": running, "lines": list(self._lines), "code": self._code}
 
     def begin(self, beside_flight: bool) -> bool:
-        """Start it; False where one runs. beside_flight: a flight has the vehicle and the feed."""
+        """Start it; False if one is running. beside_flight: a flight uses the vehicle
+        and the feed.
+        """
         if self._task is not None and not self._task.done():
             return False
         self._lines, self._code = [], None

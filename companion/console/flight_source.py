@@ -1,4 +1,4 @@
-"""The flight that runs, over its local socket; it may come, go and come again."""
+"""The running flight as a source, over its local socket; it may end and start again."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _READ = 1 << 20
 
 
 class FlightSource:
-    """Connects again and again; what it showed last stays, marked as not connected."""
+    """Reconnects again and again; the last data stay, marked as not connected."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -34,21 +34,21 @@ class FlightSource:
 
     @property
     def is_connected(self) -> bool:
-        """Whether the flight is there."""
+        """Whether the flight is connected."""
         return self._connection is not None
 
     async def changed(self) -> None:
-        """Returns when something new came, or the flight came or went."""
+        """Returns when there are new data, or the connection changed."""
         await self._event.wait()
 
     def watch(self, wanted: bool) -> None:
-        """Ask the flight for pictures, or not."""
+        """Request frames from the flight, or stop."""
         if wanted != self._wanted:
             self._wanted = wanted
             self._send({"kind": "watch", "frames": wanted})
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """Send an order and wait for what becomes of it."""
+        """Send an order and wait for its result."""
         if self._connection is None:
             return False, "no flight is connected"
         number = next(self._numbers)
@@ -63,7 +63,7 @@ class FlightSource:
             self._answers.pop(number, None)
 
     async def run(self) -> None:
-        """Connect, read, and begin again."""
+        """Connect and read, again and again."""
         while True:
             try:
                 await self._serve()

@@ -1,4 +1,4 @@
-"""The pictures that a flight kept, with the map as it was seen from where they were taken."""
+"""The frames that a record kept, with views of the map from their poses."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from localizer.geometry.pose import Pose, quaternion_from_matrix
 
 
 class KeptPictures:
-    """Gives each picture once, when its time has come. pictures: of the map; without, there is no
-    view of it.
+    """Returns each frame once, at its time. pictures: renderer of the map; without it there is no
+    map view.
     """
 
     def __init__(self, tables: RecordTables, pictures: MapPictures | None) -> None:
@@ -30,7 +30,7 @@ class KeptPictures:
         self._shown: int | None = None
 
     def newest(self, now_ns: int) -> Message | None:
-        """The newest up to a time; None where there is none, or it is the one that was given."""
+        """The newest frame up to a time; None if there is none or it was already returned."""
         camera = self._tables.camera
         known = [p for p in self._kept if p[0] <= now_ns]
         if not known or camera is None or known[-1][0] == self._shown:

@@ -1,4 +1,4 @@
-"""A picture for the page: the video as JPEG, the map's edges in it, and the map as seen from there.
+"""Images for the page: the video as JPEG, the map's edges in it, and the map from the same pose.
 
 Nothing is rendered: what the localizer compared the frame with comes along with its depth, and is
 carried to the estimated pose.
@@ -31,7 +31,7 @@ WIDTHS_PX = (480, 640, 800, 960)  # of the pictures that pages get, so that they
 
 @dataclass(frozen=True)
 class ReferenceImage:
-    """The reference view: rgb (h, w, 3), depth (h, w) m along the axis, 0 where nothing is."""
+    """The rendered view: rgb (h, w, 3), depth (h, w) m along the axis, 0 without a surface."""
 
     rgb: np.ndarray
     depth: np.ndarray
@@ -41,8 +41,8 @@ class ReferenceImage:
 
 @dataclass(frozen=True)
 class OverlayFrame:
-    """A frame with its pose and reference; both None while nothing is localized. camera: of the
-    image as it was sent.
+    """A frame with its pose and rendered view; both None while nothing is localized. camera: of the
+    image as sent.
     """
 
     image: np.ndarray
@@ -73,7 +73,7 @@ def unpack(message: Message) -> OverlayFrame:
 
 
 def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]) -> bytes:
-    """What the page gets: uint32 length of the head, the head, then its parts one after the other.
+    """The message for the page: uint32 length of the header, the header, then its parts.
 
     The head's `parts` are the lengths of JPEG, edges (uint16 pairs, pixels) and the map's JPEG.
     width_px: the picture is not wider.
@@ -103,7 +103,7 @@ def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]
 
 
 def narrowed(picture: OverlayFrame, width_px: int) -> OverlayFrame:
-    """No wider than that: what a screen cannot show is neither sent nor drawn."""
+    """The image reduced to this width, because a screen cannot show more."""
     camera = picture.camera
     if camera.width <= width_px:
         return picture
@@ -119,7 +119,7 @@ def utc_ms(monotonic_ns: int) -> float:
 
 
 def edges(picture: OverlayFrame) -> np.ndarray:
-    """Where the map's edges lie in the picture at the estimated pose: (n, 2) uint16 pixels."""
+    """Pixels of the map's edges in the frame at the estimated pose: (n, 2) uint16."""
     nothing = np.empty((0, 2), np.uint16)
     view = picture.view
     if view is None or picture.pose is None:
@@ -137,7 +137,7 @@ def edges(picture: OverlayFrame) -> np.ndarray:
 
 
 def map_at_pose(picture: OverlayFrame) -> np.ndarray | None:
-    """The map as the camera saw it from the estimated pose, distortion included, half size.
+    """The map rendered as the camera saw it, with distortion, at half size.
 
     For each pixel the ray is followed to the depth that the reference has where it passes; the
     reference was rendered at the predicted pose, so two steps are enough.
@@ -180,7 +180,7 @@ def _between_knots(at: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def footprint(picture: OverlayFrame) -> list[list[float]]:
-    """The corners of what the reference sees, (east, north) m; those in the sky are left out."""
+    """Corners of the ground in view, (east, north) m, without those in the sky."""
     view = picture.view
     if view is None:
         return []

@@ -1,4 +1,4 @@
-"""The records that lie beside the deployment's own, to list and to download."""
+"""The records beside the deployment's own, to list and to download."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CHUNK = 256 << 10
 
 @dataclass(frozen=True)
 class RecordFolder:
-    """One record. started_utc_ns: None where it does not say."""
+    """One record. started_utc_ns: None if unknown."""
 
     name: str
     path: Path
@@ -28,7 +28,7 @@ class RecordFolder:
 
 
 class Records:
-    """Knows a record only by a name that it listed itself: no path comes from outside."""
+    """Finds records by names that it listed itself, so no path is taken from a request."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder

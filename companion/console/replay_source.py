@@ -1,4 +1,4 @@
-"""A finished flight as a source of the page: its record, played, with a time bar.
+"""A finished flight as a source: plays its record, with a time bar.
 
 The map's view of a kept picture is rendered again at the recorded pose; where autopilot and
 receiver were comes from the .tlog.
@@ -26,8 +26,8 @@ _HEARD_NS = 2_000_000_000  # a place of autopilot or receiver holds so long
 
 
 class ReplaySource:
-    """Plays the record's rows at the pace at which they were flown. pictures: of its map; without,
-    there is neither the map's view nor the autopilot's track.
+    """Plays the record's rows at their original speed. pictures: of its map; without it there is
+    neither the map view nor the autopilot's track.
     """
 
     def __init__(self, tables: RecordTables, pictures: MapPictures | None = None) -> None:
@@ -50,7 +50,7 @@ class ReplaySource:
 
     @property
     def is_connected(self) -> bool:
-        """A record is always there."""
+        """Always true."""
         return True
 
     def watch(self, wanted: bool) -> None:
@@ -61,7 +61,7 @@ class ReplaySource:
         await self._event.wait()
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """share: go to that part of the flight, 0 to 1; play: go on, or stand still."""
+        """share: jump to this part of the flight, 0 to 1; play: continue or pause."""
         share, play = order.get("share"), order.get("play")
         if isinstance(share, int | float) and 0 <= share <= 1:
             self._at_s = float(share) * self._length_s
@@ -75,7 +75,7 @@ class ReplaySource:
         return True, "done"
 
     async def run(self) -> None:
-        """Play until cancelled; at the end it stands."""
+        """Play until cancelled; stops at the end."""
         self.newest.take(Message({"kind": "hello", "mode": "record", **self._limits()}))
         while True:
             await self._show()

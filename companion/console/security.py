@@ -1,4 +1,4 @@
-"""Who may ask what: checked for every request and every WebSocket, before anything else sees it.
+"""Checks every request and WebSocket before anything else handles it.
 
 Attacks thought of: a page of another site that the operator also has open (Origin, Host, a header
 that forms cannot set), a name that is made to point here (Host), somebody on the network (token,
@@ -53,7 +53,7 @@ _HEADERS = (
 
 
 def read_token(path: Path | None) -> str | None:
-    """The token in a file that its owner alone can read; `ConfigError` for any other."""
+    """The token in a file that only its owner can read; `ConfigError` otherwise."""
     if path is None:
         return None
     try:
@@ -93,7 +93,7 @@ class _Bucket:
 
 
 class RequestGuard:
-    """An ASGI application that lets through only what may pass to `app`."""
+    """An ASGI application that passes allowed requests to `app`."""
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ class RequestGuard:
         await self._app(scope, _bounded(receive), _with_headers(send))
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
-        """Status and reason; None lets it pass."""
+        """Status and reason of the refusal; None if the request is allowed."""
         headers: dict[bytes, list[bytes]] = {}
         for name, value in scope["headers"]:
             headers.setdefault(name.lower(), []).append(value)
@@ -141,7 +141,7 @@ class RequestGuard:
         return refusal
 
     def _is_foreign(self, scope: Scope, headers: dict[bytes, list[bytes]]) -> bool:
-        """Whether another site's page may be behind it."""
+        """Whether the request may come from another site's page."""
         host, origin = _only(headers, b"host"), _only(headers, b"origin")
         same = f"{'https' if self._config.tls_certificate else 'http'}://{host}".lower()
         if b"origin" in headers and (origin is None or origin.lower() != same):

@@ -1,4 +1,6 @@
-"""The page's server: Starlette behind `security.Guarded`, fed by a `ConsoleSource`."""
+"""The page's server: Starlette behind `security.RequestGuard`, with the data of a
+`ConsoleSource`.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +44,8 @@ Answer = Callable[[Request], Awaitable[Response]]
 
 @dataclass(frozen=True)
 class ConsoleSite:
-    """What the server serves. deployment: the file, None in a replay; token: needed of everybody,
-    None on loopback without one.
+    """What the server serves. deployment: the file, None in a replay; token: required from every
+    client, None on loopback without one.
     """
 
     config: ConsoleConfig
@@ -56,11 +58,11 @@ class ConsoleSite:
 
 
 class RefusedError(CompanionError):
-    """A request that is understood and not done."""
+    """A valid request that is refused."""
 
 
 class Pages:
-    """The pages that are open, and the pictures that they share."""
+    """The open pages, and the images that they share."""
 
     def __init__(self, source: ConsoleSource) -> None:
         self._source = source
@@ -158,7 +160,7 @@ def _width_px(wished: Any) -> int:
 
 
 class Views:
-    """One method an address. Errors that have a name become one line."""
+    """One method for each address. Named errors become one line."""
 
     def __init__(self, site: ConsoleSite) -> None:
         self._site = site

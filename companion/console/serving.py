@@ -22,7 +22,7 @@ _MOST_CONNECTIONS = 64
 
 
 class RequestTimeoutProtocol(H11Protocol):
-    """Closes what does not bring a whole request in time, and the oldest such where many wait."""
+    """Closes connections whose request is not complete in time, and the oldest of too many."""
 
     _deadline: asyncio.TimerHandle | None = None
 

@@ -1,4 +1,4 @@
-"""Where the page's states and pictures come from: a flight that runs, or a record of one."""
+"""Source of the page's data: a running flight, or a record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map itself from above, as the tiles that a browser's map asks for (z, x, y, web mercator)."""
+"""The map from above as web map tiles (z, x, y, web mercator)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class TileName:
 
 
 class TopTiles:
-    """Draws on demand, one at a time, and keeps the last ones."""
+    """Renders on demand, one tile at a time, and caches the last ones."""
 
     def __init__(self, map_path: Path) -> None:
         self._cache = TileCache.open(map_path)

@@ -41,8 +41,8 @@ class Angles:
 
 @dataclass(frozen=True)
 class AutopilotAngles:
-    """What an autopilot says of a camera: its position, the body's attitude (FRD to NED), and the
-    gimbal's (`GimbalFrame` says against what).
+    """Pose of a camera as an autopilot reports it: its position, the body's attitude (FRD to NED),
+    and the gimbal's (relative to `GimbalFrame`).
     """
 
     name: str

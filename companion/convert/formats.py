@@ -42,8 +42,8 @@ _IMAGES_TXT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 @dataclass(frozen=True)
 class MapReference:
-    """What is known of the map. heights: of photos' tags, None if not known. tell: takes what is
-    odd about a source and does not make it wrong.
+    """What is known of the map. heights: datum of photo tags, None if unknown. tell: called with
+    warnings about a source.
     """
 
     map_frame: LocalFrame | None

@@ -41,7 +41,7 @@ _SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 @dataclass(frozen=True)
 class Heights:
-    """What the heights in photos' tags are above. separation_m: of the geoid from the ellipsoid."""
+    """Datum of the heights in photo tags. separation_m: of the geoid from the ellipsoid."""
 
     datum: Literal["amsl", "ellipsoidal"]
     separation_m: float = 0.0
@@ -83,7 +83,9 @@ def read_photos(
 
 
 def _require_measured(path: Path, photos: dict[str, dict[str, str]]) -> None:
-    """No photo's angles are all 0.00: to a hundredth of a degree level and north is no gimbal."""
+    """Raise if all angles of a photo are 0.00: no gimbal is level and north to a hundredth of a
+    degree.
+    """
     zero = [
         name
         for name, tags in photos.items()
@@ -128,7 +130,7 @@ def _require_one_datum(
 
 
 def _home_m(tags: dict[str, str]) -> float:
-    """The height of where it took off, as the photo has it; NaN where it is not told."""
+    """Height of the take-off point from the photo's tags; NaN if unknown."""
     height, above = (_number(tags, f"{kind}Altitude") for kind in ("Absolute", "Relative"))
     return float("nan") if height is None or above is None else height - above
 

@@ -114,8 +114,8 @@ def location(row: Row, time_ns: int) -> LocationFix:
 def reported_location(
     frame: str, place: tuple[float, float, float], sigma_m: float | None, time_ns: int
 ) -> LocationFix:
-    """What somebody else says: latitude, longitude (degrees), height above the ellipsoid (m).
-    sigma_m: horizontal, None where it is not told.
+    """Position by another source: latitude, longitude (degrees), height above the ellipsoid (m).
+    sigma_m: horizontal, None if unknown.
     """
     known = sigma_m is not None and math.isfinite(sigma_m)
     variance = 0.0 if sigma_m is None or not known else sigma_m**2
@@ -129,8 +129,8 @@ def reported_location(
 
 
 def diagnostics(row: Row, time_ns: int) -> dict[str, Any]:
-    """What holds of one estimate, accepted or not; `DIAGNOSTICS_SCHEMA`. A number that is not known
-    is left out.
+    """Diagnostics of one estimate, accepted or not; `DIAGNOSTICS_SCHEMA`. Unknown numbers are left
+    out.
     """
     numbers = {name: _number(row.get(name)) for name in _NUMBERS}
     return {
@@ -216,7 +216,7 @@ def target_on_map(row: Row) -> GeoJSON:
 
 
 def event(row: Row, time_ns: int) -> Log:
-    """What the companion told."""
+    """An event of the companion."""
     level = _LEVELS.get(str(row["level"]), Log.INFO)
     alert, text = str(row.get("alert") or ""), str(row["text"])  # of 0.1 a record has no alerts
     return Log(timestamp=stamp(time_ns), level=level, message=text, name="companion", file=alert)

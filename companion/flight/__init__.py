@@ -1,1 +1,1 @@
-"""The flight process: what runs, and how its parts are wired."""
+"""The flight process: its components and their connections."""

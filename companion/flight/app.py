@@ -1,4 +1,4 @@
-"""The companion process: the table of parts made, started, and stopped in order.
+"""The companion process: builds, starts and stops the components of the table in order.
 
 Data flows one way: feed -> engine -> (bridge, targets, recorder), over the channels of
 `companion.flight.channels`. What runs stands in `companion.flight.component_table`.
@@ -61,7 +61,7 @@ class Companion:
         self._is_up = False
 
     def prepare(self) -> None:
-        """Make what takes long and needs neither link nor feed: for a standby."""
+        """Build what takes long and needs neither link nor camera, for a standby process."""
         try:
             self._parts.make(self._up, ahead=True)
         except BaseException:
@@ -69,12 +69,12 @@ class Companion:
             raise
 
     def put_away(self) -> None:
-        """Close what was prepared and does not fly."""
+        """Close what was prepared but is not used."""
         self._up.close()
         self._parts.forget()
 
     def run(self) -> None:
-        """Fly until stopped. Raises what ended the feed, after everything is shut down.
+        """Fly until stopped. Raises the error that ended the video, after the shutdown.
 
         Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
         behind would keep the process from ending.
@@ -107,7 +107,7 @@ class Companion:
             raise feed.error
 
     def _fly(self, up: ExitStack, lost: str) -> Feed:
-        """From the start of the parts to the end of the feed, or to the order to stop."""
+        """Run from the start of the components to the end of the video or the call of `stop`."""
         self._parts.start(up)
         integrity_monitor = self._parts.get(IntegrityMonitor)
         if integrity_monitor is not None:
@@ -129,7 +129,7 @@ class Companion:
         return feed
 
     def stop(self) -> bool:
-        """End `run` in order, soon. False on the way up, which goes on.
+        """End `run` soon, in order. Returns False during the start, which continues.
 
         For a signal handler: it takes no lock, since what it interrupts may hold that one.
         """
@@ -137,16 +137,16 @@ class Companion:
         return self._is_up
 
     def discard_record(self) -> None:
-        """Remove the record of a start that comes to nothing. It may be at any of its steps."""
+        """Remove the record of a failed start, at any of its steps."""
         for undo in self._parts.abandonments:
             undo()
 
     def _is_clean_shutdown(self, error: type[BaseException] | None) -> bool:
-        """Whether `run` comes to an end as it should. error: what ends it, or None."""
+        """Whether `run` ends normally. error: what ended it, or None."""
         return error is None and self._parts[Feed].error is None
 
     def _turns(self) -> dict[str, int]:
-        """When each thread without which no position comes began its newest turn, ns, by name."""
+        """Time of the last run of each thread that is needed for a position, ns, by name."""
         parts, last_ticks_ns = self._parts, self._parts[DualThreadEngine].last_ticks_ns()
         last_ticks_ns |= {"feed": parts[Feed].last_tick_ns, **parts[Bridge].last_ticks_ns()}
         health, integrity_monitor = parts.get(HealthMonitor), parts.get(IntegrityMonitor)
@@ -156,7 +156,7 @@ class Companion:
         return last_ticks_ns
 
     def _untold_turns(self) -> dict[str, int]:
-        """The turns of what nobody else tells of. What hangs on a frame's way, health tells."""
+        """Time of the last run of the threads that no other component monitors."""
         health = self._parts.get(HealthMonitor)
         ends = self._is_stopping or self._parts[Feed].ended.is_set()
         return {} if health is None or ends else {"health": health.last_tick_ns}

@@ -1,4 +1,4 @@
-"""A few estimates a second as evidence of the calibration, and of how far the ground is."""
+"""Pass some estimates a second to the calibration watch, with the distance to the ground."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CalibrationObserver:
         self._next_ns = 0
 
     def add_fix(self, estimate: PoseEstimate, bundle: ReferenceBundle, fix: VisionFix) -> None:
-        """Hand on what the map confirmed. Never blocks."""
+        """Pass on a registration against the map. Never blocks."""
         time_ns = estimate.exposure_time_ns
         if estimate.state is not TrackingState.TRACKING or time_ns < self._next_ns:
             return

@@ -1,4 +1,4 @@
-"""What flows between the parts of the process.
+"""Channels between the components of the process.
 
 Each part subscribes to what it needs when it is made; the sender knows none of them.
 """
@@ -18,19 +18,19 @@ P = ParamSpec("P")
 
 
 class Channel(Generic[P]):
-    """Hands what is sent to every subscriber, on the sender's thread, in the order in which they
-    subscribed. Subscribers only queue, or do what is as cheap: whoever sends must not wait.
+    """Calls every subscriber with each sent value, on the sender's thread, in the order of
+    subscription. Subscribers must return at once, for example after queueing the value.
     """
 
     def __init__(self) -> None:
         self._subscribers: tuple[Callable[P, None], ...] = ()
 
     def subscribe(self, take: Callable[P, None]) -> None:
-        """Have `take` called with everything that is sent from now on."""
+        """Call `take` with every value that is sent from now on."""
         self._subscribers = (*self._subscribers, take)
 
     def send(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Serve every subscriber; the first error among them is raised when all have been."""
+        """Call every subscriber; raise the first of their errors when all were called."""
         failed: Exception | None = None
         for take in self._subscribers:
             try:

@@ -1,4 +1,4 @@
-"""The table of components: how each one of the flight process is made, started and stopped.
+"""The table of components: how each component of the flight process is built, started and stopped.
 
 A new component is a line in `COMPONENTS` and a function that makes it. It takes what it needs from
 the components above it and subscribes to the channels that it reads.
@@ -262,7 +262,7 @@ def _detector(making: BuildContext) -> BoxDetector:
 
 
 def _target_counts(making: BuildContext) -> Callable[[], dict[str, int]]:
-    """What was asked of the targets and could not be reported, for the health and the report."""
+    """Counts of clicks and detections without a position, for health and report."""
     targets, times = making.later(TargetReporter), making.get(FrameTimes)
     has_detector = making.config.targets.detector is not None
     detector = making.later(BoxDetector) if has_detector else None
@@ -382,8 +382,8 @@ def _feed(making: BuildContext) -> Feed:
 
 
 def _console(making: BuildContext) -> Publisher:
-    """Everything it asks of the flight is a look at what is there; it subscribes last, and what it
-    keeps of a picture is a reference.
+    """Build the console's server. It only reads from the flight. It subscribes last and keeps
+    references to frames, no copies.
     """
     config, bridge, channels = making.config, making[Bridge], making.channels
     assert config.console is not None  # or the part is not wanted
@@ -578,8 +578,8 @@ COMPONENTS: tuple[Component[Any], ...] = (
 def _levels(
     integrity_monitor: IntegrityMonitor | None, estimate: PoseEstimate
 ) -> tuple[float, float] | None:
-    """The estimate's protection levels: injection, which is served before, had the monitor judge
-    it in this same call. What is not for injection was not judged.
+    """The estimate's protection levels. Injection runs before, so the monitor has judged the
+    estimate; estimates that are not for injection have none.
     """
     level = None if integrity_monitor is None else integrity_monitor.level
     if level is None or not is_for_injection(estimate):
@@ -592,7 +592,9 @@ def _level(severity: int) -> str:
 
 
 def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
-    """The vehicle keeps an origin until it is switched off: a wrong one must never be sent."""
+    """Raise if the configured origin is far from the map: the vehicle keeps a wrong origin until it
+    is switched off.
+    """
     if config.bridge.origin is not None:
         finding = check_origin(config.bridge.origin, cache)
         if not finding.ok:
@@ -600,7 +602,7 @@ def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
 
 
 def _bridge_config(config: CompanionConfig) -> BridgeConfig:
-    """The bridge announces the feed's real camera, and keeps its state beside the record."""
+    """The bridge's settings, with the camera of the video and a state folder beside the record."""
     camera = config.camera.model.camera()
     announced = config.bridge.camera.model_copy(
         update={
@@ -621,7 +623,7 @@ def _state_file(config: CompanionConfig) -> Path | None:
 
 
 def _forbid_memory(config: CompanionConfig) -> InhibitMemory | None:
-    """Of this map and this camera: what was found of another says nothing."""
+    """File of inhibitions for this map and camera; those of another map or camera are ignored."""
     file = _state_file(config)
     if file is None:
         return None

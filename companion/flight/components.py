@@ -1,4 +1,4 @@
-"""The machinery of the table of parts: made and started in its order, undone in the reverse."""
+"""Build and start the components of the table in order; stop and close them in reverse."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _always(_: CompanionConfig) -> bool:
 
 @dataclass(frozen=True)
 class Component(Generic[T]):
-    """One line of the table. All parts are made before the first is started.
+    """One row of the table. All components are built before the first is started.
 
     close and stop are called only for what was made and started. What a part needs is looked up by
     its class in `BuildContext`, and nothing else is found there.
@@ -48,7 +48,7 @@ class Component(Generic[T]):
 
 
 class BuildContext:
-    """What a part is made from: the settings, the channels, and the parts that it depends on."""
+    """What a component is built from: the settings, the channels, and its dependencies."""
 
     def __init__(self, part: Component[Any], assembly: Assembly) -> None:
         self._part = part
@@ -57,24 +57,22 @@ class BuildContext:
         self.channels, self.clock = assembly.channels, assembly.clock
 
     def __getitem__(self, kind: type[T]) -> T:
-        """The part of that class."""
+        """The component of that class."""
         self._require_named(kind, self._part.depends)
         return self._assembly[kind]
 
     def get(self, kind: type[T]) -> T | None:
-        """The part of that class; None in a deployment without it."""
+        """The component of that class; None in a deployment without it."""
         self._require_named(kind, self._part.depends)
         return self._assembly.get(kind)
 
     def later(self, kind: type[T]) -> Callable[[], T]:
-        """How to get a part that is not made yet, to be called after the start."""
+        """A function that returns a component which is not built yet; call it after the start."""
         self._require_named(kind, self._part.later)
         return lambda: self._assembly[kind]
 
     def if_abandoned(self, undo: Callable[[], None]) -> None:
-        """Have `undo` called if this start comes to nothing. It may be called at any moment from
-        now on, by a signal's handler too.
-        """
+        """Call `undo` if this start fails. A signal handler may call it at any time from now on."""
         self._assembly.abandonments.append(undo)
 
     def _require_named(self, kind: type, named: tuple[type, ...]) -> None:
@@ -86,7 +84,7 @@ class BuildContext:
 
 
 class Assembly:
-    """The parts of one process, by their class. clock: CLOCK_MONOTONIC, ns, or a record's time."""
+    """The components of one process, by class. clock: CLOCK_MONOTONIC, ns, or a record's time."""
 
     def __init__(
         self,
@@ -102,17 +100,17 @@ class Assembly:
         self._made: dict[type, Any] = {}
 
     def __getitem__(self, kind: type[T]) -> T:
-        """A part that is made."""
+        """A component that is built."""
         found: T = self._made[kind]
         return found
 
     def get(self, kind: type[T]) -> T | None:
-        """A part, or None if it is not made."""
+        """A component, or None if it is not built."""
         found: T | None = self._made.get(kind)
         return found
 
     def make(self, up: ExitStack, *, ahead: bool = False) -> None:
-        """Make every part that is not made yet; `up` closes them in the reverse order.
+        """Build every component that is not built yet; `up` closes them in reverse.
 
         ahead: only what a standby makes.
         """
@@ -125,17 +123,17 @@ class Assembly:
                 up.callback(part.close, made)
 
     def hand_over(self) -> None:
-        """What follows is no end in order."""
+        """The following stop is no clean shutdown: state for a restart is kept."""
         for part in self._parts:
             if part.hand_over is not None and part.kind in self._made:
                 part.hand_over(self._made[part.kind])
 
     def forget(self) -> None:
-        """What was made is closed: it is made again."""
+        """The built components were closed; they will be built again."""
         self._made.clear()
 
     def start(self, up: ExitStack) -> None:
-        """Start every part; `up` stops them in the reverse order."""
+        """Start every component; `up` stops them in reverse."""
         for part in self._parts:
             made = self._made[part.kind]
             if part.start is not None:

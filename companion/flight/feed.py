@@ -1,4 +1,4 @@
-"""The camera's frames, read on a thread of their own until the source ends."""
+"""Reads the camera's frames on its own thread until the source ends."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ _log = logging.getLogger(__name__)
 
 
 class Feed:
-    """Hands every frame of a source on. ended: set when the source has no more; error: what ended
-    it, None for a regular end. failures: frames on which whoever takes them failed; none of that
-    ends the flight.
+    """Passes on every frame of a source. ended: set when the source ends; error: what ended it,
+    None for a normal end. failures: number of frames whose receiver raised; the flight continues.
     """
 
     def __init__(self, source: FrameSource, take: Callable[[Frame], None]) -> None:
@@ -40,7 +39,7 @@ class Feed:
 
     @property
     def last_tick_ns(self) -> int:
-        """Since when a frame is being handed on, CLOCK_MONOTONIC; now while the next is awaited."""
+        """Since when a frame is being processed, CLOCK_MONOTONIC; now while waiting for one."""
         taken_ns = self._taken_ns
         return time.monotonic_ns() if taken_ns is None else taken_ns
 

@@ -1,4 +1,4 @@
-"""One picture of the process's health, once a second: to the bridge, the record and the log."""
+"""Assess the health once a second and report it to the bridge, the record and the log."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ _OF_STATE = {
 
 @dataclass(frozen=True)
 class HealthStatus:
-    """alerts: that are true now, worst first. is_reported: another component has reported the worst
-    one.
+    """alerts: the active ones, most severe first. is_reported: another component has already
+    reported the first.
     """
 
     level: HealthLevel
@@ -65,9 +65,9 @@ class HealthStatus:
 
 @dataclass(frozen=True)
 class HealthInputs:
-    """What else may say how well it goes: is the record complete, the autopilot's own idea of its
-    position's sigma in metres, the monitor, nodes of the map that cannot be read, the map's shift,
-    counts of targets, why a lost place cannot be searched.
+    """Further inputs: completeness of the record, sigma of the autopilot's position in metres,
+    integrity monitor, unreadable map nodes, map offset, counts of targets, and why no search is
+    possible.
     """
 
     is_recorded: Callable[[], bool] = lambda: True
@@ -80,7 +80,7 @@ class HealthInputs:
 
 
 class HealthMonitor:
-    """Watches the parts and reports transitions, and keeps ``health.json``.
+    """Assesses all components, reports changes, and writes ``health.json``.
 
     Above 200 lines: every condition that can be true is ranked here, in one place.
     """
@@ -132,7 +132,7 @@ class HealthMonitor:
             self._file.stop()
 
     def end(self, how: str) -> None:
-        """The flight ends, and how: the last report says it instead of what was true until then."""
+        """The flight ends for this reason; the last report states it."""
         self._ended = how
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
@@ -163,7 +163,7 @@ class HealthMonitor:
         self._write(status.level.value, status.line, status.alerts)
 
     def _last_state(self, status: HealthStatus) -> str:
-        """What was true until the end. A camera that ended before says nothing of the flight."""
+        """State before the end. If the camera ended earlier, the state before that."""
         if status.alerts[0].id is AlertId.NO_FRAME:
             arrived, estimate = self._estimates[-1]
             age_s = time.monotonic() - arrived
@@ -172,7 +172,7 @@ class HealthMonitor:
         return f"{status.line} until then"
 
     def assess(self) -> HealthStatus:
-        """What is true now."""
+        """The current health."""
         feed = self._feed_state()
         if feed in _OF_FEED:
             level, of = _OF_FEED[feed]
@@ -196,7 +196,7 @@ class HealthMonitor:
         return status if is_old else replace(status, alerts=(*status.alerts, *self._notes(feed)))
 
     def _tracking(self, estimate: PoseEstimate, engine: EngineHealth) -> HealthStatus:
-        """While frames come and the position is not lost."""
+        """Health while frames are processed and the position is not lost."""
         level, news = _of_state(estimate)
         overload = self._overload(engine)
         held = self._integrity_monitor.reason if self._integrity_monitor is not None else None
@@ -214,7 +214,7 @@ class HealthMonitor:
         return HealthStatus(level, (news,))
 
     def _notes(self, feed: StreamState) -> tuple[Alert, ...]:
-        """What else is true. Coarser levels replace unreadable parts of the map."""
+        """Further active alerts, for example unreadable parts of the map."""
         notes = (
             (self._unreadable_nodes() > 0, AlertId.MAP_UNREADABLE),
             (feed is StreamState.SCALED, AlertId.VIDEO_SCALED),
@@ -223,7 +223,7 @@ class HealthMonitor:
         return tuple(alert(of) for holds, of in notes if holds)
 
     def _overload(self, engine: EngineHealth) -> Alert | None:
-        """Too few frames are localized of those that come."""
+        """Alert if too few of the received frames are localized."""
         now_s, came = time.monotonic(), engine.frames_in
         self._came.append((now_s, came))
         while now_s - self._came[0][0] > _RATE_S:
@@ -237,8 +237,8 @@ class HealthMonitor:
         return alert(AlertId.OVERLOADED, done=done, offered=offered)
 
     def _lost(self, estimate: PoseEstimate, engine: EngineHealth) -> tuple[Alert, ...]:
-        """Since when there is no fix, how far off the autopilot may be, and that no search will
-        answer.
+        """Alerts of a lost position: duration, the autopilot's uncertainty, and why no search is
+        possible.
 
         Not whether the map is being searched: that begins and ends every few seconds, and each time
         the loss would be reported again (`engine.searching` in health.json has it).
@@ -254,7 +254,7 @@ class HealthMonitor:
         return tuple(alerts)
 
     def _lacks(self, engine: EngineHealth) -> AlertId | None:
-        """Why a lost place cannot be searched now; None where it can."""
+        """Why the map cannot be searched now; None if it can."""
         return AlertId.SEARCH_HANGS if engine.search_hangs else self._search_lacks()
 
     def _write(self, level: str, text: str, alerts: tuple[Alert, ...]) -> None:
@@ -285,7 +285,7 @@ class HealthMonitor:
 
 
 def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
-    """Active findings with their figures, and the newest protection level."""
+    """Active alerts with their values, and the newest protection level."""
     if monitor is None:
         return None
     level = monitor.level
@@ -297,7 +297,7 @@ def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
 
 
 def _file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:
-    """``health.json``; a disk that does not take it is reported once."""
+    """Writer of ``health.json``; a failing disk is reported once."""
     path = folder / "health.json"
     return NewestFile(path, lambda e: event("warning", f"{path} cannot be written: {e}"))
 
@@ -320,7 +320,9 @@ def _error(engine: EngineHealth) -> AlertId:
 
 
 def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
-    """What is missing before the first estimate. lacks: for a search of the map."""
+    """Alert that says what is missing before the first estimate. lacks: why no search
+    is possible.
+    """
     if engine.searching or (lacks is not None and engine.searches):
         return lacks or AlertId.SEARCHING
     if engine.last_error:
@@ -329,7 +331,7 @@ def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
 
 
 def _of_state(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
-    """BRIDGING: how long the odometry has carried the pose on, and how far off it may be (95 %).
+    """Alert of the tracking state. BRIDGING: duration and 95 % bound of the error.
 
     A second or two of it is no news: a shadow of a cloud, a car that fills the frame.
     """
@@ -351,7 +353,7 @@ def _is_lost(estimate: PoseEstimate) -> bool:
 
 
 def _finite(value: Any) -> Any:
-    """What is no finite number as null: JSON has none, and strict readers refuse it."""
+    """Replace numbers that are not finite by null, because JSON has none."""
     if isinstance(value, dict):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, float) and not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""Turns estimates into fixes for the flight controller, unless a judge objects.
+"""Convert estimates to fixes and pass them to the bridge, unless a check holds them.
 
 Each fix is made once, for injection and for those who only observe.
 """
@@ -31,13 +31,13 @@ _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 
 
 def is_for_injection(estimate: PoseEstimate) -> bool:
-    """Whether a fix is made of the estimate, and judged, at all."""
+    """Whether the estimate is converted to a fix and checked at all."""
     return estimate.accepted and estimate.state in _INJECTED
 
 
 class JumpCounter:
-    """How often the estimate has jumped (`VisionFix.reset_count`), so that the EKF is told and does
-    not fight it.
+    """Counts the jumps of the estimate (`VisionFix.reset_count`), so that the EKF resets to the new
+    position.
 
     DEGRADED keeps the filter's track: only a new start after LOST is a jump, as the first is, and
     the map found again after BRIDGING, whose drift it ends.
@@ -48,7 +48,7 @@ class JumpCounter:
         self._state = TrackingState.INITIALIZING
 
     def note(self, state: TrackingState) -> None:
-        """Take in the tracking state of a frame."""
+        """Process the tracking state of a frame."""
         before, self._state = self._state, state
         is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
         found_again = before is TrackingState.BRIDGING and state is TrackingState.TRACKING
@@ -56,7 +56,7 @@ class JumpCounter:
 
 
 class FixInjection:
-    """Hands the bridge a fix for every accepted estimate while tracking.
+    """Passes a fix to the bridge for every accepted estimate while tracking.
 
     Runs on the localization thread, and converts there: 0.12 ms in the median (two geodetic
     conversions and two rotations, no look at the map), no more than waking another thread would
@@ -72,15 +72,17 @@ class FixInjection:
         self._unjudged = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
 
     def add_judge(self, judge: Judge) -> None:
-        """Have `judge` asked about every fix from now on, after those that are there already."""
+        """Call `judge` with every fix from now on, after the earlier ones; it may hold or change
+        it.
+        """
         self._judges = (*self._judges, judge)
 
     def add_observer(self, observer: Observer) -> None:
-        """Have `observer` see every fix from now on, after its injection."""
+        """Call `observer` with every fix from now on, after its injection."""
         self._observers = (*self._observers, observer)
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
-        """Inject an estimate, if it may be. Never blocks."""
+        """Inject an estimate if all checks pass. Never blocks."""
         self._jumps.note(estimate.state)
         if not is_for_injection(estimate):
             return
@@ -99,7 +101,7 @@ class FixInjection:
             observer(estimate, bundle, fix)
 
     def _judged(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:
-        """The fix as all judges leave it."""
+        """The fix after all checks; None if one holds it."""
         failed = False
         try:
             for judge in self._judges:

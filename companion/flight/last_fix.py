@@ -1,4 +1,4 @@
-"""Where the camera was last found, kept in a small file: a restart in the air goes on from there.
+"""Keeps the last confirmed position in a small file, from which a restart in flight continues.
 
 A process that died a few seconds ago has lost its memory, not the place: the tracker itself would
 have coasted over such a gap. What the EKF moved since then is added. Older than `prior.recall_s`,
@@ -43,9 +43,9 @@ LocalAt = Callable[[int], tuple[float, ...] | None]
 
 @dataclass(frozen=True)
 class LastFix:
-    """time_ns: CLOCK_MONOTONIC of `boot`. The camera's WGS84 place; sigma_m: worst axis. local_ned:
-    the EKF's position at that time, m; autopilot_ns, origin: since the autopilot's boot, and where
-    (latitude, longitude, altitude AMSL) that position is counted from, None where not known.
+    """time_ns: CLOCK_MONOTONIC of `boot`. Position of the camera, WGS84; sigma_m: worst axis.
+    local_ned: the EKF's position at that time, m; autopilot_ns: time since the autopilot's boot;
+    origin of local_ned: latitude, longitude, altitude AMSL; None where unknown.
     """
 
     boot: str
@@ -59,8 +59,8 @@ class LastFix:
     origin: tuple[float, float, float] | None = None
 
     def has_same_origin(self, state: VehicleState, time_ns: int) -> bool:
-        """Whether the EKF still counts its position from where it did: not after a reboot of the
-        autopilot, whose clock restarted, nor about another origin.
+        """Whether the EKF still uses the same origin: not after a reboot of the autopilot, and not
+        with another origin.
         """
         offset_ns, origin = state.clock_offset_ns, _place(state.origin)
         since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS
@@ -79,7 +79,7 @@ def _place(origin: Origin | None) -> tuple[float, float, float] | None:
 
 
 def read_last_fix(path: Path, boot: str) -> LastFix | None:
-    """What a process of this boot left; None where nothing may be trusted."""
+    """The position that a process of this boot wrote; None if it cannot be trusted."""
     try:
         status = os.lstat(path)
         if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
@@ -111,7 +111,7 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
 
 
 def _is_place(fix: LastFix) -> bool:
-    """Whether the numbers can be what a flight was; comparisons are false for NaN."""
+    """Whether the numbers are plausible; False for NaN."""
     metres = (fix.height_m, *fix.local_ned)
     return (
         0 <= fix.time_ns < 1 << 63
@@ -123,7 +123,7 @@ def _is_place(fix: LastFix) -> bool:
 
 
 class FixMemory:
-    """Keeps the newest confirmed place while flying, and knows that of the process before.
+    """Writes the newest confirmed position in flight, and holds that of the process before.
 
     trusted: whether nobody withholds fixes now; state: what the vehicle says about itself.
     Thread-safe: estimates come on the localization thread, which only leaves them here; the file is
@@ -155,13 +155,11 @@ class FixMemory:
         self._thread.start()
 
     def hand_over(self) -> None:
-        """What follows is no end in order: the next process goes on from what is kept."""
+        """The following stop is no clean shutdown: the file stays for the next process."""
         self._leaves = True
 
     def stop(self) -> None:
-        """Stop keeping. A flight that ended in order leaves no fix to start from. A disk that does
-        not respond is not waited for.
-        """
+        """Stop. After a clean shutdown the file is removed. Does not wait for a disk that hangs."""
         self._stop.set()
         if joined(self._thread) and self._path is not None and not self._leaves:
             try:
@@ -170,12 +168,12 @@ class FixMemory:
                 _log.warning("the last fix is not removed: %s", error)
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Note a place that the map confirmed. Never blocks."""
+        """Note a position that the map confirmed. Never blocks."""
         if estimate.accepted and estimate.state is TrackingState.TRACKING:
             self._newest, self._before = estimate, None
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """Where the camera is by the process before, until this one has found it itself."""
+        """Prior from the process before, until this one has found the position itself."""
         last = self._before
         if last is None:
             return None
@@ -218,7 +216,7 @@ class FixMemory:
                 self._failed = True
 
     def _write(self, estimate: PoseEstimate, path: Path) -> None:
-        """Whole or not at all. No fsync: a computer that loses its power starts another boot."""
+        """Replace the file atomically. No fsync: after a power loss the boot id differs anyway."""
         local = self._local_at(estimate.exposure_time_ns)
         if local is None:
             return

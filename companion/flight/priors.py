@@ -1,4 +1,6 @@
-"""Where the camera is by other means than the map, for a start and for the search after a loss."""
+"""Pose priors from the autopilot and other sources, for the start and for the search
+after a loss.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +39,10 @@ _BESIDE_M, _REPORT_S = 3.0, 0.5  # of the receiver: an EKF farther off follows s
 
 
 class AutopilotSource(Protocol):
-    """What is asked of the autopilot: the bridge in flight, a record's messages afterwards."""
+    """Telemetry that the priors read: from the bridge in flight, from a record afterwards."""
 
     def state(self) -> VehicleState:
-        """What the vehicle says about itself."""
+        """Newest state of the vehicle."""
         ...
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
@@ -57,13 +59,15 @@ class AutopilotSource(Protocol):
 
 
 def drift_sigma_m(seconds: float) -> float:
-    """Sigma of an EKF's position, horizontal, so long after its last absolute measurement."""
+    """Horizontal sigma of an EKF's position, so many seconds after its last absolute
+    measurement.
+    """
     return min(SENSORS.ekf_drift.sigma_m(seconds), _LARGEST_SIGMA_M)
 
 
 def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] | None:
-    """The EKF's position (north, east, down), m, at a time; a little ahead of its newest report by
-    its velocity: a picture is often newer than that (10 Hz).
+    """The EKF's position (north, east, down), m, at a time. It is extrapolated by the velocity if
+    the frame is newer than the last report (10 Hz).
     """
     known = autopilot.local_at(time_ns)
     if known is not None:
@@ -78,8 +82,8 @@ def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] |
 
 @dataclass(frozen=True)
 class Belief:
-    """How far the autopilot's position can be trusted. independent: it does not derive from our own
-    fixes. sigma_m: horizontal, one sigma; None: nothing is known.
+    """Quality of the autopilot's position. independent: not derived from our own fixes. sigma_m:
+    horizontal, one sigma; None: unknown.
     """
 
     sigma_m: float | None
@@ -87,7 +91,7 @@ class Belief:
 
 
 class PositionBelief:
-    """Follows GNSS and our own fixes: what the EKF's position is worth at any time.
+    """Estimates the quality of the EKF's position at any time from GNSS and our own fixes.
 
     Thread-safe: estimates come on the localization thread, states from the bridge's.
     """
@@ -99,12 +103,12 @@ class PositionBelief:
         self._fix_ns: int | None = None
 
     def note_fix(self, time_ns: int) -> None:
-        """A fix of ours was accepted, and went to the EKF."""
+        """Our fix was accepted and sent to the EKF."""
         with self._lock:
             self._fix_ns = time_ns
 
     def at(self, state: VehicleState, now_ns: int, *, on_gnss: bool = True) -> Belief:
-        """What the position of this state is worth now. on_gnss: GNSS, if healthy, makes it."""
+        """Quality of this state's position now. on_gnss: whether healthy GNSS determines it."""
         healthy = on_gnss and gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
         with self._lock:
             if healthy:
@@ -124,7 +128,7 @@ class PositionBelief:
 
 
 def _is_beside_receiver(state: VehicleState) -> bool:
-    """Whether the EKF's position is where the receiver's is."""
+    """Whether the EKF's position agrees with the receiver's."""
     ekf = (state.latitude_deg, state.longitude_deg)
     receiver = (state.gps_latitude_deg, state.gps_longitude_deg)
     if ekf[0] is None or ekf[1] is None or receiver[0] is None or receiver[1] is None:
@@ -135,7 +139,7 @@ def _is_beside_receiver(state: VehicleState) -> bool:
 
 
 class AutopilotPose:
-    """The camera's pose as the autopilot's position, attitude and gimbal tell it.
+    """The camera's pose from the autopilot's position, attitude and gimbal angles.
 
     on_gnss: whether GNSS, if healthy, makes the autopilot's position, None where nobody knows: then
     it does where the receiver says the same place. One that was led by our own fixes is none to
@@ -155,7 +159,7 @@ class AutopilotPose:
         self.belief = PositionBelief(config)
 
     def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
-        """Note a fix of ours. Never blocks.
+        """Note one of our fixes. Never blocks.
 
         reaches_ekf: whether positions go to it. One in shadow, or withheld, holds no EKF in place:
         taken for one that does, it would let the search look too near where a drifted EKF is.
@@ -165,20 +169,20 @@ class AutopilotPose:
 
     @property
     def sigma_m(self) -> float | None:
-        """Horizontal sigma of the autopilot's position now; None where it is not known."""
+        """Horizontal sigma of the autopilot's position now; None where unknown."""
         return self._believed(self._autopilot.state(), time.monotonic_ns()).sigma_m
 
     @property
     def sensors(self) -> AuxiliarySensors:
-        """These accounts, as the localizer asks for them."""
+        """These data in the form that the localizer needs."""
         return AuxiliarySensors(
             self.rotation, self.displacement, lambda _time_ns: self.height_m, self.clearance_m
         )
 
     @property
     def height_m(self) -> float | None:
-        """The vehicle's height above that of the map's origin, m, by its barometer; None: unknown.
-        Its world z is less by what the Earth falls away on the way there.
+        """Barometric height above the map's origin, m; None: unknown. The world's z is smaller by
+        the Earth's curvature.
         """
         altitude_m = self._autopilot.state().altitude_amsl_m
         if altitude_m is None or not math.isfinite(altitude_m):
@@ -187,8 +191,8 @@ class AutopilotPose:
         return altitude_m + self._extrinsics.geoid_separation_m - origin_m
 
     def clearance_m(self, time_ns: int) -> float | None:
-        """The vehicle's height above what lies below it, by its rangefinder; None without a reading
-        of about that CLOCK_MONOTONIC time, or where the vehicle leans too much for it to look down.
+        """Height above the ground by the rangefinder, m; None without a reading at about that
+        CLOCK_MONOTONIC time, or if the vehicle is tilted too much.
         """
         state, attitude = self._autopilot.state(), self._autopilot.attitude_at(time_ns)
         away_s = abs(time_ns - state.rangefinder_time_ns) * 1e-9
@@ -199,7 +203,7 @@ class AutopilotPose:
 
     @property
     def velocity(self) -> Array | None:
-        """The EKF's velocity (3,) in the map's axes, m/s; None while it knows none."""
+        """The EKF's velocity (3,) in the map's axes, m/s; None where unknown."""
         state = self._autopilot.state()
         if state.local_velocity_ned is None or state.ekf_flags & _CONST_POSITION:
             return None
@@ -211,7 +215,7 @@ class AutopilotPose:
         return bool(self._autopilot.state().ekf_flags & _ATTITUDE)
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """The camera's pose at a CLOCK_MONOTONIC time; None while the autopilot does not know."""
+        """The camera's pose at a CLOCK_MONOTONIC time; None while unknown."""
         state = self._autopilot.state()
         belief = self._believed(state, time_ns)
         if belief.sigma_m is None:
@@ -227,12 +231,14 @@ class AutopilotPose:
         return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
-        """The camera's rotation (3, 3) in the map's axes by the autopilot's attitude and gimbal."""
+        """The camera's rotation (3, 3) in the map's axes, from the autopilot's attitude
+        and gimbal.
+        """
         gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
 
     def displacement(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
-        """The way (3,) in the map's axes between two times by the EKF, and its sigma (m).
+        """Displacement (3,) in the map's axes between two times by the EKF, and its sigma (m).
 
         Inertial as long as none of our fixes goes to the EKF: while a place is on trial. The map
         origin's axes stand for the vehicle's, 0.1° at 10 km.
@@ -261,17 +267,17 @@ class AutopilotPose:
 
 
 class PriorSources:
-    """Sources of a pose prior, asked in order; the first answer counts."""
+    """Sources of a pose prior; the first that has one is used."""
 
     def __init__(self, *sources: PriorProvider) -> None:
         self._sources = sources
 
     def add(self, source: PriorProvider) -> None:
-        """Have `source` asked, too, where those that are there already know nothing."""
+        """Add a source that is used if the earlier ones have no prior."""
         self._sources = (*self._sources, source)
 
     def at(self, time_ns: int) -> PosePrior | None:
-        """A prior for that CLOCK_MONOTONIC time; None if nobody knows."""
+        """A prior for that CLOCK_MONOTONIC time; None if no source has one."""
         for source in self._sources:
             prior = source(time_ns)
             if prior is not None:

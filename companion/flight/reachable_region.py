@@ -26,8 +26,8 @@ _GUST_M_S = 8.0  # by which a wind carries an aircraft that holds nothing, beyon
 
 @dataclass(frozen=True)
 class _ConfirmedPosition:
-    """A confirmed place (2,), east and north, m, and the velocity (2,), m/s, there. begun: the
-    IMU's integral then, of its run number `run`; None until its record has reached it.
+    """A confirmed position (2,), east and north, m, with its velocity (2,), m/s. begun: the IMU's
+    integral at that time, of its run number `run`; None until the IMU record reaches it.
     """
 
     time_ns: int
@@ -38,8 +38,8 @@ class _ConfirmedPosition:
 
 
 class ReachableRegion:
-    """Estimates come on the localization thread and `follow` is called by the feed's, some times a
-    second; `region` is asked by the search's thread.
+    """Estimates arrive on the localization thread. `follow` is called on the video thread some
+    times a second, `region` on the search thread.
     """
 
     def __init__(self, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
@@ -48,7 +48,7 @@ class ReachableRegion:
         self._seen: _ConfirmedPosition | None = None
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Note a place that the map confirmed."""
+        """Note a position that the map confirmed."""
         if not estimate.accepted or estimate.state is not TrackingState.TRACKING:
             return
         velocity = self._vehicle.state().local_velocity_ned or (0.0, 0.0, 0.0)
@@ -58,12 +58,12 @@ class ReachableRegion:
             self._seen = _ConfirmedPosition(estimate.exposure_time_ns, place, moving)
 
     def follow(self) -> None:
-        """Take in what the IMU read meanwhile; some ten samples."""
+        """Process the new IMU samples, about ten."""
         with self._lock:
             self._follow()
 
     def region(self, time_ns: int) -> SearchRegion | None:
-        """Where the camera is at a CLOCK_MONOTONIC time; None before it was ever seen."""
+        """Region of the camera at a CLOCK_MONOTONIC time; None before the first fix."""
         with self._lock:
             self._follow()
             seen, end, run = self._seen, self._track.at(self._track.newest_ns), self._track.restarts
@@ -88,7 +88,9 @@ class ReachableRegion:
 
 
 def _way(seen: _ConfirmedPosition, end: InertialDisplacement | None) -> Array | None:
-    """East and north since then by the IMU, m; None where its record does not reach back."""
+    """East and north displacement since then by the IMU, m; None where its record does not reach
+    back.
+    """
     if seen.begun is None or end is None:
         return None
     t = (end.time_ns - seen.begun.time_ns) * 1e-9

@@ -1,4 +1,4 @@
-"""The flight's record: estimates, targets and events as CSV, written on a thread of its own."""
+"""The flight's record: estimates, targets and events as CSV, written on its own thread."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ EVENT_COLUMNS = ("time_ns", "level", "text", "alert")
 
 
 def fresh_folder(folder: Path) -> Path:
-    """`folder`, or with a number behind it if it holds a record already: a restart in the air must
-    not overwrite the flight's first half.
+    """`folder`, or `folder` with a number if it already holds a record, so that a restart in flight
+    does not overwrite it.
     """
     candidate, number = folder, 2
     while (candidate / "estimates.csv").exists():
@@ -65,7 +65,7 @@ def fresh_folder(folder: Path) -> Path:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove the record of a start that failed: at most column names stand in it.
+    """Remove the record of a failed start, whose files hold at most column names.
 
     The start may have ended between any two of its steps, so none of this need exist.
     """
@@ -82,7 +82,7 @@ def remove_empty(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, config: CompanionConfig) -> None:
-    """``record.json``: settings, the map's hash, versions and what time it was, on both clocks.
+    """Write ``record.json``: settings, the map's hash, versions, and the time on both clocks.
 
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
     """
@@ -114,7 +114,7 @@ def _unwritable(folder: Path, error: OSError) -> ReportError:
 def _estimate_row(
     estimate: PoseEstimate, levels: tuple[float, float] | None, frame: LocalFrame
 ) -> tuple[Any, ...]:
-    """What stands in `ESTIMATE_COLUMNS` for an estimate."""
+    """The values of `ESTIMATE_COLUMNS` for an estimate."""
     pose = estimate.world_from_camera
     position = frame.position(pose.translation)
     sigma = estimate.covariance.diagonal() ** 0.5
@@ -135,7 +135,7 @@ def _estimate_row(
 
 
 def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
-    """What stands in `TARGET_COLUMNS` for a target's fix."""
+    """The values of `TARGET_COLUMNS` for a target's fix."""
     position = frame.position(fix.position_world)
     horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
     return (
@@ -193,8 +193,8 @@ class Recorder:
         self._thread.start()
 
     def estimate(self, estimate: PoseEstimate, levels: tuple[float, float] | None = None) -> None:
-        """Record one estimate (accepted or not; the trajectory has the accepted ones). levels: its
-        protection levels, horizontal and vertical, m; None where none was computed.
+        """Record one estimate, accepted or not; the trajectory has the accepted ones. levels: its
+        horizontal and vertical protection levels, m; None if none was computed.
         """
         self._put("estimates", lambda: _estimate_row(estimate, levels, self._frame))
         if estimate.accepted:
@@ -205,12 +205,12 @@ class Recorder:
         self._put("targets", lambda: _target_row(fix, self._frame))
 
     def event(self, level: str, text: str, alert: str = "") -> None:
-        """Record something that happened, at the current time. alert: its identifier, if any."""
+        """Record an event at the current time. alert: its identifier, if any."""
         row = (time.monotonic_ns(), level, text, alert)
         self._put("events", lambda: row)
 
     def snapshot(self, frame: Frame) -> None:
-        """Keep the frame's image, named by its exposure time, if it is time for one."""
+        """Keep the frame's image, named by its exposure time, if the interval has passed."""
         if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
             self._next_snapshot_ns = frame.exposure_time_ns + self._interval_ns
             with self._pictures_lock:
@@ -223,8 +223,8 @@ class Recorder:
                 self._written(frame)
 
     def close(self) -> bool:
-        """Write what is queued and close the files. False: the disk stands still, and is left
-        behind.
+        """Write the queue and close the files. Returns False if the disk hangs; it is not waited
+        for.
         """
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
@@ -244,7 +244,7 @@ class Recorder:
         return writer
 
     def _put(self, name: str, row: Callable[[], Iterable[Any]]) -> bool:
-        """Queue what makes a row: its coordinates and figures are the recorder's thread's work."""
+        """Queue the data of a row; the recorder's thread computes coordinates and figures."""
         try:
             self._rows.put_nowait((name, row))
         except queue.Full:
@@ -307,7 +307,7 @@ class Recorder:
 
 
 class RecordKeeper:
-    """The record of one process, if the disk takes one (this may be a restart in the air).
+    """The record of one process, if the disk allows one. A start may be a restart in flight.
 
     say_incomplete: tells the operator why something is missing in it; from any thread.
     """
@@ -323,7 +323,7 @@ class RecordKeeper:
     def open(
         self, config: CompanionConfig, record: RecordConfig, claim: Callable[[Path], None]
     ) -> None:
-        """Begin a record in a folder of its own. claim: called with it before it is made."""
+        """Create a record in its own folder. claim: called with the folder before it is created."""
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
@@ -337,7 +337,7 @@ class RecordKeeper:
             raise
 
     def link(self) -> None:
-        """Let ``latest`` beside the record point to it, unless a record itself has that name."""
+        """Point the link ``latest`` beside the record to it, unless a record has that name."""
         if self.folder is None or self.folder.name.startswith(LATEST_NAME):
             return
         link = self.folder.parent / LATEST_NAME
@@ -352,7 +352,7 @@ class RecordKeeper:
             _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
-        """Write what is queued, close the files, and put the targets on maps."""
+        """Write the queue, close the files, and write the targets' map files."""
         answers = self.recorder is None or self.recorder.close()
         if self.folder is not None and answers:
             try:
@@ -361,6 +361,6 @@ class RecordKeeper:
                 _log.warning("no maps of the targets: %s", error)
 
     def failed(self, why: str) -> None:
-        """Something is missing in the record from now on."""
+        """Mark the record as incomplete."""
         self.is_complete = False
         self._say_incomplete(why)

@@ -1,4 +1,4 @@
-"""Where are we, while nobody knows: the map is searched in one frame, on a thread of its own.
+"""Search the map with one frame while no position is known, on its own thread.
 
 The answer is no fix: it is a place that the tracker puts on trial (`PosePrior.independent`).
 """
@@ -56,7 +56,7 @@ Event = Callable[[str, str], None]
 
 @dataclass(frozen=True)
 class Hint:
-    """Where the operator says that we are: east and north in the map's frame, metres."""
+    """The operator's approximate position: east and north in the map's frame, metres."""
 
     centre: tuple[float, float]
     radius_m: float
@@ -65,8 +65,8 @@ class Hint:
 
 @dataclass(frozen=True)
 class RelocalizationHypothesis:
-    """A place that was found, with the query that it answers, and where the camera could have been
-    then by its IMU; None where nobody knows.
+    """A found pose, the query that it answers, and the region of the camera at that time by its
+    IMU; None where unknown.
     """
 
     query: PlaceQuery
@@ -76,7 +76,7 @@ class RelocalizationHypothesis:
     def followed(
         self, query: PlaceQuery, velocity: Array | None, reach: SearchRegion | None
     ) -> PlaceQuery | None:
-        """A later frame's query, narrowed to where the camera can have got to; None after too long.
+        """A later frame's query, limited to where the camera can be; None after too long.
 
         velocity: (3,) m/s in the map's axes by the EKF, None where it knows none; reach: as then.
         """
@@ -107,7 +107,7 @@ class RelocalizationHypothesis:
         )
 
     def velocity_to(self, later: Relocalization) -> Array | None:
-        """The camera's velocity (3,), m/s, from here to where it was found later."""
+        """The camera's velocity (3,), m/s, from this position to a later one."""
         elapsed_s = self._elapsed_s(later.exposure_time_ns)
         if elapsed_s < _LEAST_BASE_S:
             return None
@@ -119,8 +119,8 @@ class RelocalizationHypothesis:
 
 
 def _on_plane(query: PlaceQuery) -> PlaceQuery:
-    """With the height above the plane through the map's origin, which rises above the Earth: by 8 m
-    in 10 km. Nobody knows by how much where nobody knows the place.
+    """The query with its height above the tangent plane at the map's origin, which is 8 m above the
+    Earth's surface at 10 km; unchanged if the region is unknown.
     """
     if query.region is None:
         return query
@@ -139,7 +139,7 @@ def _speed_sigma(velocity: Array | None) -> float:
 def place_on_map(
     cache: TileCache, latitude_deg: float, longitude_deg: float, radius_m: float
 ) -> tuple[float, float] | None:
-    """East and north, metres; None where no part of the map's box lies within the radius."""
+    """East and north, metres; None if no part of the map's box is within the radius."""
     place = cache.frame.enu_from_geodetic(
         latitude_deg, longitude_deg, cache.manifest.origin.height_m
     )
@@ -150,7 +150,7 @@ def place_on_map(
 
 
 class PlaceSearch:
-    """Finds a place in a frame with what the autopilot knows besides.
+    """Searches the position with a frame and the autopilot's data.
 
     The map's overview is opened (or, the first time, computed) on a thread of its own, so that
     neither the start nor a search waits for it. reach: where the camera can be at a time since the
@@ -180,28 +180,30 @@ class PlaceSearch:
         self._thread = threading.Thread(target=self.prepare, name="overview", daemon=True)
 
     def start(self) -> None:
-        """Begin to make the search ready."""
+        """Start to prepare the search."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Give up what is being prepared."""
+        """Cancel the preparation."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(_STOP_S)
 
     def close(self) -> None:
-        """Release the renderer and its loader; no search runs any more."""
+        """Release the renderer and its loader. No search may run."""
         self.stop()
         if self._open is not None:
             self._open.close()
             self._open = None
 
     def hint(self, east_m: float, north_m: float, radius_m: float) -> None:
-        """The operator says where we are, map frame: the next searches look there. Never a fix."""
+        """Set the operator's position, map frame: the next searches look there. It is
+        never a fix.
+        """
         self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
 
     def hint_at(self, hint: PlaceHint) -> bool:
-        """The same in WGS84, with twice the operator's sigma; False where that is off the map."""
+        """The same in WGS84, with twice the operator's sigma; False if it is off the map."""
         radius_m = _HINT_SIGMAS * hint.radius_m
         at = place_on_map(self._cache, hint.latitude_deg, hint.longitude_deg, radius_m)
         if at is None:
@@ -211,8 +213,8 @@ class PlaceSearch:
         return True
 
     def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
-        """The camera's pose at the frame's exposure, to be tried; None where nothing convinces, or
-        where what was found took so long that the next call looks again about there.
+        """The camera's pose at the frame's exposure, as a hypothesis. None if there is no clear
+        result, or if the search took so long that the next call must search again near it.
         """
         if self._open is None:
             return None
@@ -244,7 +246,7 @@ class PlaceSearch:
         )
 
     def _query(self, frame: Frame) -> PlaceQuery | None:
-        """What the autopilot knows; None while it knows neither attitude nor height."""
+        """The autopilot's data; None while attitude and height are unknown."""
         rotation = self._autopilot.rotation(frame.exposure_time_ns)
         height_m = self._autopilot.height_m
         if rotation is None or height_m is None:
@@ -260,8 +262,8 @@ class PlaceSearch:
         )
 
     def region(self, time_ns: int) -> SearchRegion | None:
-        """The operator's word, else where the autopilot is, else where the aircraft can have got
-        to; None: the whole map, now and then in any case: the last place seen may be wrong.
+        """Search region: the operator's position, else that of the autopilot, else the reachable
+        region; None: the whole map, which some searches always cover.
         """
         hint = self._hint
         if hint is not None and time.monotonic() - hint.time_s < _HINT_S:
@@ -274,7 +276,7 @@ class PlaceSearch:
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 
     def prepare(self) -> None:
-        """Make the search ready on this thread; report what prevents it."""
+        """Prepare the search on this thread; report what prevents it."""
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)

@@ -1,4 +1,4 @@
-"""A flight process that is ready but does not fly: map and network open, kernels compiled."""
+"""A flight process that waits with map and network open and kernels compiled."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def ready(
     restart: bool = False,
     lost_settings: str = "",
 ) -> Companion | None:
-    """The flight process: at once, or once a standby is released; None of one that never is.
+    """Return the flight process: at once, or when the standby is released; None if it never is.
 
     pulse, again, lost_settings: see `Companion`; a standby flies after another died, and so always
     again.
@@ -33,7 +33,7 @@ def ready(
 
 
 def _stand_by(companion: Companion) -> Companion | None:
-    """Make what takes long, then wait for a line on the standard input.
+    """Prepare what takes long, then wait for a line on standard input.
 
     None where it ends without one: the supervisor is gone. Neither link nor feed is opened before.
     """

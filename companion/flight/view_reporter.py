@@ -1,4 +1,4 @@
-"""Where the camera looks, a few times a second: the newest estimate becomes a `CameraView`."""
+"""Report the camera's view a few times a second, as `CameraView` of the newest estimate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 class ViewReporter:
-    """Casts the ray on a thread of its own, at most `rate_hz` times a second.
+    """Computes the ground point on its own thread, at most `rate_hz` times a second.
 
     look: takes the view; must not block.
     """
@@ -49,7 +49,7 @@ class ViewReporter:
         joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Offer an estimate; only accepted ones are reported. Never blocks."""
+        """Submit an estimate; only accepted ones are reported. Never blocks."""
         if estimate.accepted:
             self._newest = estimate
             self._came.set()

@@ -1,4 +1,4 @@
-"""How vision does, in a few numbers once a second that any ground station can plot and watch."""
+"""Quality of vision in a few numbers once a second, for plots in any ground station."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NONE, _WEAK, _FULL = 0.0, 1.0, 2.0
 
 
 class VitalSigns:
-    """Counts estimates and tells every second, on a thread of its own.
+    """Counts estimates and sends the numbers every second, on its own thread.
 
     VPS_SIGNAL 0 no position, 1 one that is not to be relied on (initializing, degraded, bridging),
     2 tracking; VPS_RATE accepted positions a second; VPS_AGE seconds since the newest one's

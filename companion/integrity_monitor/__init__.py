@@ -1,1 +1,1 @@
-"""The monitor: an independent monitor with its own evidence and the last word before injection."""
+"""The integrity monitor: checks every fix with independent evidence before it is injected."""

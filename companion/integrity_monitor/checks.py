@@ -1,4 +1,4 @@
-"""All checks together: evidence in, findings out. No threads and no clock of its own."""
+"""All checks of the integrity monitor: evidence in, alerts out. No threads and no clock."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ _QUEUE = 256
 
 @dataclass(frozen=True)
 class IntegrityLimits:
-    """What stands in other parts of the configuration. gnss_is_ours: the receiver that the vehicle
-    reports is our own injection; horizontal_fov_deg: of the camera.
+    """Settings from other parts of the configuration. gnss_is_ours: the vehicle's receiver is our
+    GPS_INPUT; horizontal_fov_deg: of the camera.
     """
 
     alert_limit_m: float = 10.0
@@ -61,7 +61,7 @@ class IntegrityLimits:
 
 
 class IntegrityChecks:
-    """Every method is called under one lock, or from one thread.
+    """Call every method under one lock, or from one thread.
 
     Above 200 lines: each check has a few lines here that hand it its evidence and take its finding.
     """
@@ -110,7 +110,7 @@ class IntegrityChecks:
 
     @property
     def reason(self) -> Alert | None:
-        """Why output is held; None while it is not."""
+        """Alert that holds the output; None while it is not held."""
         action = self.action
         held = (one for one in self._active() if one.spec.action is action)
         return next(held).alert() if action is not OutputAction.NONE else None
@@ -133,12 +133,14 @@ class IntegrityChecks:
 
     @property
     def _is_only_uncertain(self) -> bool:
-        """Whether the protection level alone holds output: how the position changes is right."""
+        """Whether the protection level alone holds the output, so that position changes
+        are valid.
+        """
         holding = {one.spec.id for one in self._active() if one.spec.action >= OutputAction.HOLD}
         return holding == {AlertId.HPL_OVER_LIMIT}
 
     def restore(self, found: ActiveAlerts) -> None:
-        """Alerts of the process before this one stay active until evidence clears them."""
+        """Keep alerts of the previous process active until evidence clears them."""
         for of, (figure, word) in found.items():
             self._debouncers[of].restore(figure, word)
 
@@ -148,13 +150,13 @@ class IntegrityChecks:
         return self._level
 
     def standing(self) -> dict[str, float]:
-        """The active alerts by identifier, with their figures."""
+        """The active alerts by identifier, with their values."""
         return {one.spec.id.value: one.figure for one in self._active()}
 
     # --- evidence -----------------------------------------------------------------------------
 
     def see(self, time_ns: int, image: Image) -> None:
-        """A picture (H, W, 3) uint8 at its exposure time."""
+        """Add a frame (H, W, 3) uint8 at its exposure time."""
         if self._picture is not None and time_ns <= self._picture[0]:
             self._backwards += 1
             return
@@ -162,7 +164,7 @@ class IntegrityChecks:
         self._picture = (time_ns, self._pictures.add(time_ns, image))
 
     def add_observation(self, sighting: CalibrationObservation) -> None:
-        """A registered picture, for what it says of the camera and of the ground."""
+        """Add a registered frame, for the checks of calibration and ground."""
         self._calibration.add(sighting)
         self._ground.add(sighting)
 
@@ -174,9 +176,9 @@ class IntegrityChecks:
         *,
         held: bool = False,
     ) -> VisionFix | None:
-        """The fix, if it may be injected; with another reset count where the last were wrong. One
-        of the odometry that its protection level alone speaks against is `position_withheld`, and
-        its velocity as uncertain as the IMU has found it wrong.
+        """Return the fix if it may be injected, with a new reset count if earlier fixes were wrong;
+        None holds it. A fix of the odometry that only its protection level holds is marked
+        `position_withheld`; its velocity gets the scale error that the IMU has shown.
 
         attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
         reason against it.
@@ -214,7 +216,7 @@ class IntegrityChecks:
         return replace(fix, reset_count=resets, position_covariance_ned=covariance)
 
     def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[Alert]:
-        """Look at everything, a few times a second; the alerts to report."""
+        """Run all checks, a few times a second; returns the alerts to report."""
         state = vehicle.state()
         self._track.follow(vehicle)
         self._jumps.hear(state)
@@ -226,7 +228,7 @@ class IntegrityChecks:
         return [alert for alert in updates if alert is not None]
 
     def _doubt_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
-        """By how much the newest fix, or the time stamps since, make positions uncertain."""
+        """Position uncertainty from recent steps of the position or the timestamps."""
         if not state.armed:
             self._steps.begins_anew()
         elif self._jumps.announced and admitted:
@@ -240,8 +242,8 @@ class IntegrityChecks:
             self._steps.stamps_are_right()
 
     def _leave_out_old_pictures(self) -> None:
-        """Frozen or repeated frames show no motion, which looks like late time stamps (ArduPilot: a
-        frozen hover was blamed on them).
+        """Exclude frozen or repeated frames from the calibration watch: without motion they look
+        like late timestamps.
         """
         if self._picture is None:
             return
@@ -253,7 +255,7 @@ class IntegrityChecks:
             self._calibration.distrust(time_ns - int(verdict.still_s * 1e9))
 
     def _follow(self, now_ns: int, state: VehicleState) -> None:
-        """Fixes whose time the IMU's record has reached, in order."""
+        """Process the fixes whose time the IMU record has reached, in order."""
         while self._waiting:
             fix, leaps = self._waiting[0]
             if not self._motion.ready(fix) and now_ns - fix.time_ns < _WAITS_NS:
@@ -266,7 +268,7 @@ class IntegrityChecks:
     # --- judgement ----------------------------------------------------------------------------
 
     def _results(self, now_ns: int, state: VehicleState) -> dict[AlertId, CheckResult]:
-        """Of each check, at a time: None as `bad` where it has no evidence."""
+        """The result of each check at a time; `bad` is None without evidence."""
         newest = self._newest
         fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
         height = state.altitude_relative_m
@@ -313,7 +315,7 @@ class IntegrityChecks:
         }
 
     def _known_m(self, state: VehicleState, height_m: float | None) -> float:
-        """By how much a fix is wrong for what was found of calibration and tilt, metres."""
+        """Position error from the estimated calibration and tilt errors, metres."""
         speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
         focal, late = (
             self._debouncers[AlertId.FOCAL_LENGTH].raised,
@@ -345,7 +347,7 @@ class IntegrityChecks:
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
-        """Whether the EKF moved by metres during a frozen frame; in a hover that is not known.
+        """Whether the EKF moved by metres during a frozen frame; unknown in a hover.
 
         The EKF keeps its speed at first: it follows a frozen position after a second or two.
         """
@@ -355,7 +357,7 @@ class IntegrityChecks:
         return speed >= _MOVED_SPEED_MPS and speed * verdict.still_s >= _MOVED_M
 
     def _still_s(self, now_ns: int, state: VehicleState) -> float:
-        """How long a hover may look still: the limit in the picture is metres on the ground."""
+        """How long a hover may show no motion; the limit depends on the distance to the ground."""
         ground_m = self._config.picture.still_share * self._ground.width_m(state, now_ns)
         return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)
 
@@ -404,7 +406,7 @@ class IntegrityChecks:
 def _beyond(
     figure: CalibrationEstimate, limit: float, scale: float, word: CalibrationError
 ) -> CheckResult:
-    """Beyond its limit for sure, surely not, or not known."""
+    """Check result: bad if surely above the limit, good if surely below, otherwise unknown."""
     bad = figure.exceeds(limit)
     if not bad and not figure.is_within(limit):
         return CheckResult(None)
@@ -412,8 +414,8 @@ def _beyond(
 
 
 def _moving_now(state: VehicleState, time_ns: int) -> VehicleState:
-    """The state at a time, without a velocity of long before: an EKF that has lost its position
-    says none any more (ArduPilot ends LOCAL_POSITION_NED), and its last one would stand.
+    """The state at a time, without an outdated velocity: an EKF without a position stops
+    LOCAL_POSITION_NED, and the last velocity would stay.
     """
     old = time_ns - state.local_time_ns > _OLD_NS
     return replace(state, local_velocity_ned=None) if old else state

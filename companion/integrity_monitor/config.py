@@ -1,4 +1,4 @@
-"""The monitor's keys in a deployment's configuration."""
+"""The integrity monitor's keys in the deployment file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavlink_bridge.config import StrictModel
 
 @dataclass(frozen=True)
 class VideoCheckConfig:
-    """Limits of the check of the pictures themselves."""
+    """Limits of the check of the frames."""
 
     still_share: float = 3e-4  # motion below which a frame is frozen, as a share of its width
     still_s: float = 3.0  # time after which a frozen frame is reported
@@ -25,7 +25,7 @@ class VideoCheckConfig:
 
 @dataclass(frozen=True)
 class MotionCheckConfig:
-    """Limits of vision's motion against the IMU's, as mean deviations over 1, 3 and 10 s."""
+    """Limits of the mean deviation of vision from the IMU over 1, 3 and 10 s."""
 
     limit_1s_m: float = 1.5
     limit_3s_m: float = 1.0
@@ -34,7 +34,7 @@ class MotionCheckConfig:
 
 
 class ProtectionConfig(StrictModel):
-    """The budget of a protection level: what a fix's covariance does not know of, each as one
+    """Error sources of the protection level that the fix's covariance does not contain, each as one
     standard deviation along an axis.
 
     The covariance holds what `localizer.calibration` states of the camera. Where that is the result
@@ -52,13 +52,13 @@ class ProtectionConfig(StrictModel):
     time_bias_s: float = Field(SENSORS.time_bias_s, exclude=True)  # time error, times the speed
 
     def of_camera(self, *, calibrated: bool) -> ProtectionConfig:
-        """The budget of a camera whose deployment states what its calibration left, or guesses."""
+        """The constants for a camera with its stated calibration, or the defaults."""
         share = self.calibrated_share if calibrated else self.calibration_share
         return self.model_copy(update={"calibration_share": share})
 
 
 class IntegrityMonitorConfig(StrictModel):
-    """The independent monitor: what it watches and when it withholds fixes."""
+    """Settings of the integrity monitor."""
 
     enabled: bool = True
     picture: VideoCheckConfig = Field(VideoCheckConfig(), exclude=True)

@@ -1,4 +1,4 @@
-"""Alerts over time: raised and cleared after a while, so that they do not flap.
+"""Raise and clear alerts after a delay, so that they do not alternate.
 
 Alerts that inhibit injection are kept over a restart: a turn or a climb showed them, and may in
 minutes again. Without that, a process that replaces a killed one would begin after two seconds.
@@ -21,8 +21,8 @@ _LARGEST = 1e4  # per cent, degrees, milliseconds; of what is kept
 
 @dataclass(frozen=True)
 class CheckResult:
-    """A check's answer. bad: None where there is no evidence, which changes nothing. figure, word:
-    the alert's values, as far as it has them: in which sense, or of which component.
+    """Result of a check. bad: None without evidence, which changes nothing. figure, word: values of
+    the alert, such as its direction or component.
     """
 
     bad: bool | None
@@ -46,7 +46,7 @@ class AlertDebouncer:
         self._told_ns = 0
 
     def update(self, now_ns: int, result: CheckResult) -> Alert | None:
-        """Take in a result; the alert to report, if there is news."""
+        """Add a result; returns the alert to report, if it changed."""
         silent_ns, self._updated_ns = now_ns - self._updated_ns, now_ns
         if result.bad is None:
             if not self.raised:
@@ -68,7 +68,7 @@ class AlertDebouncer:
         return self.alert() if self.raised else cleared(self.spec.id)
 
     def restore(self, figure: float, word: CalibrationError) -> None:
-        """It was active in a process before this one: evidence clears it, as any other."""
+        """The alert was active in a previous process; evidence clears it as usual."""
         self.raised, self.figure, self.word = True, figure, word
 
     def alert(self) -> Alert:
@@ -89,14 +89,14 @@ ActiveAlerts = Mapping[AlertId, tuple[float, CalibrationError]]
 
 
 class InhibitMemory:
-    """Of active alerts that inhibit injection; see `RestartMemory`."""
+    """Remembers active alerts that inhibit injection; see `RestartMemory`."""
 
     def __init__(self, memory: RestartMemory) -> None:
         self._memory = memory
         self._kept: frozenset[AlertId] = frozenset()
 
     def recall(self) -> ActiveAlerts:
-        """What was active in the process before; empty for nothing."""
+        """The alerts that were active in the previous process."""
         kept = self._memory.recall()
         told = None if kept is None else kept[0].get("inhibits")
         rows = told.items() if isinstance(told, dict) else ()
@@ -107,7 +107,7 @@ class InhibitMemory:
         return found
 
     def note(self, found: ActiveAlerts) -> None:
-        """What is active now."""
+        """Remember the active alerts."""
         if found.keys() == self._kept:
             return
         self._kept = frozenset(found)
@@ -117,7 +117,7 @@ class InhibitMemory:
             self._memory.drop()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """The end; see `RestartMemory.stop`."""
+        """Stop; see `RestartMemory.stop`."""
         self._memory.stop(clean_shutdown=clean_shutdown)
 
 

@@ -1,4 +1,4 @@
-"""The EKF's answer: refusals, and jumps onto what it is fed."""
+"""Detects that the EKF rejects positions or jumps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class EkfWatch:
         return CheckResult(ratio > _REFUSED, ratio)
 
     def jumped(self, state: VehicleState, now_ns: int, *, agrees: bool) -> CheckResult:
-        """Whether the EKF's position leapt, until the IMU has agreed with vision for a while.
+        """Size of the EKF's jump, until the IMU has agreed with vision for a while.
 
         agrees: there is evidence that vision moves as the IMU does; no evidence is no agreement.
         On the ground an EKF begins with a jump: from its origin onto the first position.
@@ -49,7 +49,9 @@ class EkfWatch:
         return CheckResult(self._unconfirmed_m > 0.0, self._unconfirmed_m)
 
     def _leap(self, state: VehicleState) -> float:
-        """Metres by which the position is off what the last velocity leads to; 0 for a flight."""
+        """Distance between the position and the one predicted by the last velocity, metres; 0 for
+        normal flight.
+        """
         last = self._last
         if state.local_position_ned is None or state.local_velocity_ned is None:
             self._last = None

@@ -1,4 +1,4 @@
-"""Compares vision's heading with the gyros': a frame that turned puts the position elsewhere.
+"""Compares vision's heading with the gyros', to detect a rotated frame of reference.
 
 A map frame turned by 5 degrees about home puts a hover at 120 m 10 m aside. From then on the
 position moves as the IMU does, so its motion shows no fault. The turn itself does, against gyros
@@ -26,7 +26,7 @@ _KEPT = 64
 
 @dataclass(frozen=True)
 class HeadingChange:
-    """Of one fix: vision's heading less the gyros' and less the autopilot's, rad."""
+    """Of one fix: vision's heading minus the gyros' and minus the autopilot's, rad."""
 
     time_ns: int
     against_gyros: float
@@ -35,7 +35,7 @@ class HeadingChange:
 
 
 def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
-    """None where one of the two headings is not known."""
+    """The heading change of a fix; None if one of the headings is unknown."""
     yaw_rad = fix.yaw_rad
     if attitude is None or yaw_rad is None:
         return None
@@ -48,18 +48,18 @@ def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
 
 
 class HeadingHistory:
-    """Of some fixes in the order of their times, the newest."""
+    """Heading changes of the newest fixes in time order."""
 
     def __init__(self) -> None:
         self._turns: deque[HeadingChange] = deque(maxlen=_KEPT)
 
     def add(self, turn: HeadingChange | None) -> None:
-        """Of another fix; one without a heading says nothing."""
+        """Add a fix; one without a heading is ignored."""
         if turn is not None:
             self._turns.append(turn)
 
     def apart(self, turn: HeadingChange) -> float:
-        """How far a fix is turned against the median of these, rad; 0 where too few have a heading.
+        """Rotation of a fix from the median of the history, rad; 0 with too few headings.
 
         The gyros' heading suffers where ATTITUDE was lost in a turn, and the autopilot's own may
         step: only what both contradict is a turn.
@@ -75,7 +75,7 @@ class HeadingHistory:
         )
 
     def contradict(self, turn: HeadingChange) -> bool:
-        """Whether a fix is turned by more than noise and gyros explain."""
+        """Whether a fix is rotated by more than noise and gyro drift explain."""
         if not self._turns:
             return False
         newest = self._turns[-1]

@@ -1,4 +1,4 @@
-"""The monitor's thread, and its last word on every fix."""
+"""Runs the integrity checks on their own thread and checks every fix before injection."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class IntegrityMonitor:
         self._thread = threading.Thread(target=self._run, name="integrity", daemon=True)
 
     def start(self) -> None:
-        """Start watching, with what forbade in a process that was killed."""
+        """Start the thread, with the inhibitions of a process that was killed."""
         if self._memory is not None:
             self._monitor.restore(self._memory.recall())
             self._inhibit(self._monitor.inhibiting)
@@ -80,38 +80,38 @@ class IntegrityMonitor:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching. A thread that hangs is left behind."""
+        """Stop the thread; a thread that hangs is not waited for."""
         self._stop.set()
         self._thread.join(2.0 * _LOCK_S)
 
     def close(self) -> None:
-        """An orderly end: nothing is remembered."""
+        """Clean shutdown: nothing is kept for a restart."""
         if self._memory is not None:
             self._memory.stop()
 
     def hand_over(self) -> None:
-        """What follows is no end in order: what is remembered stays so."""
+        """The following stop is no clean shutdown: inhibitions are kept for the restart."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=False)
 
     def watch(self, last_ticks_ns: Callable[[], Mapping[str, int]]) -> None:
-        """Report components that stall. last_ticks_ns: when each began its newest turn,
+        """Report components that stall. last_ticks_ns: time of the last run of each,
         CLOCK_MONOTONIC ns.
         """
         self._turns = last_ticks_ns
 
     def see(self, time_ns: int, image: Image) -> None:
-        """Offer a picture; the newest is looked at. Never blocks."""
+        """Submit a frame; the newest is checked. Never blocks."""
         self._picture = (time_ns, image)
 
     def add_observation(self, sighting: CalibrationObservation) -> None:
-        """Offer a registered picture, as evidence of the calibration and of the ground."""
+        """Submit a registered frame for the calibration watch and the distance to the ground."""
         with self._asked() as answers:
             if answers:
                 self._monitor.add_observation(sighting)
 
     def judge(self, fix: VisionFix) -> VisionFix | None:
-        """The fix as it may be injected; None withholds it."""
+        """The fix as it may be injected; None holds it."""
         try:
             if self._hangs():
                 return None
@@ -128,14 +128,14 @@ class IntegrityMonitor:
         return admitted
 
     def submit(self, fix: VisionFix) -> None:
-        """Judge a fix and hand it to the bridge, if it may be injected."""
+        """Check a fix and pass it to the bridge if it may be injected."""
         admitted = self.judge(fix)
         if admitted is not None:
             self._bridge.submit(admitted)
 
     @property
     def reason(self) -> Alert | None:
-        """Why output is held; None while it is not."""
+        """Alert that holds the output; None while it is not held."""
         if self._hangs() or self._failed.raised:
             return self._failed.alert()
         with self._asked() as answers:
@@ -148,13 +148,15 @@ class IntegrityMonitor:
             return self._monitor.level if answers else None
 
     def standing(self) -> dict[str, float]:
-        """The findings that stand, by name, with their figures."""
+        """The active alerts by name, with their values."""
         with self._asked() as answers:
             return self._monitor.standing() if answers else {}
 
     @contextmanager
     def _asked(self) -> Iterator[bool]:
-        """The monitor's lock; False where it is not given: who asks must not hang, too."""
+        """Acquire the monitor's lock; False after a time limit, so that the caller does
+        not hang.
+        """
         given = not self._hangs() and self._lock.acquire(timeout=_LOCK_S)
         try:
             yield given
@@ -176,7 +178,7 @@ class IntegrityMonitor:
             self.turn()
 
     def turn(self) -> None:
-        """Look at everything once; ten times a second by its thread."""
+        """Run all checks once; the thread calls it ten times a second."""
         self.last_tick_ns = self._clock()
         self._works("taking turns")
         picture, self._picture = self._picture, None
@@ -199,7 +201,7 @@ class IntegrityMonitor:
             self._bridge.report_alert(alert)
 
     def _tell_what_stands(self, now_ns: int) -> None:
-        """Report a stalled component: its last state would be taken for the present one."""
+        """Report a stalled component, because its last state is outdated."""
         last_ticks_ns = self._turns()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
@@ -214,7 +216,7 @@ class IntegrityMonitor:
             return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_TURNS
 
     def _fail(self, what: str) -> None:
-        """Note a failure of the monitor; the next turn reports it."""
+        """Note a failure of the monitor; the next run reports it."""
         with self._failures:
             count = self._fails[what] = self._fails.get(what, 0) + 1
         if count == 1:

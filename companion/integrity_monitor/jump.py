@@ -1,4 +1,4 @@
-"""A position that no flight explains: held until it proves itself, or the right one is back."""
+"""Holds a position that is farther from the last one than the aircraft can have flown."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ Metres = tuple[float, float]
 
 
 class EkfDisplacement:
-    """The way over ground by the EKF's velocity (LOCAL_POSITION_NED, 32)."""
+    """Horizontal displacement by the EKF's velocity (LOCAL_POSITION_NED, 32)."""
 
     def __init__(self) -> None:
         self._way: deque[tuple[int, Metres, Metres]] = deque(maxlen=_KEPT)  # time, velocity, way
 
     def add(self, state: VehicleState) -> None:
-        """Integrate the EKF's newest velocity. A gap in its time stamps restarts the integral."""
+        """Integrate the EKF's newest velocity. A gap in the timestamps restarts the integral."""
         if state.local_velocity_ned is None:
             return
         north, east, _ = state.local_velocity_ned
@@ -53,12 +53,12 @@ class EkfDisplacement:
         self._way.append((state.local_time_ns, (north, east), way))
 
     def moved(self, from_ns: int, to_ns: int) -> Metres | None:
-        """North and east from one time to another, metres; None where it is not known."""
+        """North and east displacement between two times, metres; None where unknown."""
         a, b = self._at(from_ns), self._at(to_ns)
         return None if a is None or b is None else (b[0] - a[0], b[1] - a[1])
 
     def _at(self, time_ns: int) -> Metres | None:
-        """The way at a time: between two velocities, or up to a second beyond the record."""
+        """The integral at a time: interpolated, or extrapolated by up to a second."""
         if not self._way:
             return None
         k = min(bisect_left(self._way, time_ns, key=lambda one: one[0]), len(self._way) - 1)
@@ -80,7 +80,7 @@ class _Passed:
 
 
 class _Held:
-    """The fixes that are held, as long as one follows the other."""
+    """The held fixes, as long as each is consistent with the one before."""
 
     def __init__(self, first: VisionFix) -> None:
         self.first = self.newest = first
@@ -104,7 +104,7 @@ class _Held:
 
 
 class JumpCheck:
-    """A position that is farther from the last than any flight explains is held for a while.
+    """Holds a position that is farther from the last one than flight explains, for some seconds.
 
     Meanwhile the last one that passed is carried on by the EKF's velocity, which the held ones do
     not reach. A fix that comes to where it leads passes at once. What moves otherwise, or whose
@@ -130,7 +130,7 @@ class JumpCheck:
         """
 
     def hear(self, state: VehicleState) -> None:
-        """The vehicle's state, a few times a second whether fixes come or not."""
+        """Update with the vehicle's state, a few times a second, with or without fixes."""
         self._reckoning.add(state)
 
     def admit(
@@ -142,7 +142,7 @@ class JumpCheck:
         agrees: bool,
     ) -> bool:
         """Whether the fix may pass. attitude: the autopilot's at the fix's time; agrees: vision
-        moves as the IMU does, or nobody knows.
+        moves as the IMU does, or this is unknown.
         """
         self._reckoning.add(state)
         was_held = self._held
@@ -184,7 +184,7 @@ class JumpCheck:
         self._passed, self._held = _Passed(fix, (north, east)), None
 
     def _is_turned(self, turn: HeadingChange) -> bool:
-        """Whether a fix's frame turned against that of the last ones that passed.
+        """Whether a fix is rotated against the last accepted ones.
 
         What gyros may have drifted grows: once a frame was seen to be turned, a fix is of the one
         whose heading is nearer.
@@ -197,7 +197,7 @@ class JumpCheck:
         return self._headings.contradict(turn)
 
     def _hold(self, fix: VisionFix) -> _Held:
-        """The held fixes with this one; a fix that does not follow them starts a new series."""
+        """The held fixes with this one; an inconsistent fix starts a new series."""
         held = self._held
         if held is None or not self._follows(held.newest, fix):
             held = self._held = _Held(fix)
@@ -209,7 +209,9 @@ class JumpCheck:
         return held
 
     def _moves_otherwise(self, held: _Held, since_s: float) -> bool:
-        """Whether what is held moved as the EKF's velocity does not: a turned frame on the way."""
+        """Whether the held fixes move differently from the EKF's velocity, as in a
+        rotated frame.
+        """
         led = self._reckoned(held.first, held.newest)
         if led is None:
             return False
@@ -219,7 +221,7 @@ class JumpCheck:
         )
 
     def _leap(self, last: _Passed, fix: VisionFix) -> PositionStep:
-        """How far the fix is from where the last one leads, and how far it may be."""
+        """Distance of the fix from the position predicted from the last one, and its limit."""
         dt = max(_seconds(last.fix, fix), 0.0)
         sigma = _SIGMAS * _sigmas(last.fix, fix)
         # While another is held, to let the allowance grow would let it pass by waiting (5 degrees
@@ -238,25 +240,25 @@ class JumpCheck:
         )
 
     def _reckoned(self, last: VisionFix, fix: VisionFix) -> Metres | None:
-        """Where the EKF's velocity leads; None where it did not lead rightly before."""
+        """Position predicted by the EKF's velocity; None where that prediction failed before."""
         return (
             self._reckoning.moved(last.time_ns, fix.time_ns) if self._led >= _CALM_FIXES else None
         )
 
     def _off(self, last: VisionFix, led: Metres, fix: VisionFix) -> Metres:
-        """From where a fix leads to another, metres."""
+        """Distance from the prediction of one fix to another, metres."""
         there, here = self._place.ned(last), self._place.ned(fix)
         return here[0] - there[0] - led[0], here[1] - there[1] - led[1]
 
     def _follows(self, held: VisionFix, fix: VisionFix) -> bool:
-        """Whether the fix follows the held one as an aircraft flies: the EKF may know no speed."""
+        """Whether the fix can follow the held one in flight; the EKF's speed may be unknown."""
         apart_m = math.hypot(*self._off(held, (0.0, 0.0), fix))
         reach_m = _FASTEST_MPS * max(_seconds(held, fix), 0.0)
         return apart_m <= self._config.unreported_jump_m + reach_m + _SIGMAS * _sigmas(held, fix)
 
 
 def _reckoned_m(dt: float) -> float:
-    """One sigma of the way that the EKF reckons without positions."""
+    """One sigma of the EKF's displacement during dead reckoning."""
     known_s = min(dt, _RECKONS_S)
     return SENSORS.ekf_drift.sigma_m(known_s)
 

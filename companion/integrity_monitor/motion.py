@@ -40,7 +40,7 @@ _LEAST_FIXES = 3  # of a window
 
 @dataclass(frozen=True)
 class MotionVerdict:
-    """settled: there is evidence at all. share: the largest mean deviation as a share of its limit;
+    """settled: whether there is evidence. share: the largest mean deviation divided by its limit;
     deviation_m: that deviation. still_s: how long the position has not moved.
     """
 
@@ -69,7 +69,9 @@ class MotionCheck:
         self._still = StillPosition(config.still_m)
 
     def add(self, fix: VisionFix, *, leaps: bool) -> MotionVerdict:
-        """One fix that the IMU's record reaches; see `ready`. leaps: judge anew from here on."""
+        """Add a fix that the IMU's record reaches; see `ready`. leaps: start again from
+        this fix.
+        """
         here = np.array(self._place.ned(fix)[:2])
         still_s = self._still.add(fix.time_ns, here)
         moved = self._track.at(fix.time_ns)
@@ -91,7 +93,7 @@ class MotionCheck:
         return MotionVerdict(settled, share, deviation_m, still_s)
 
     def ready(self, fix: VisionFix) -> bool:
-        """Whether the IMU's record reaches the fix, or the fix is too late to wait for it."""
+        """Whether the IMU's record reaches the fix, or has been waited for long enough."""
         return self._track.newest_ns >= fix.time_ns
 
     def _start(self, time_ns: int, here: Array, sigma: float) -> None:
@@ -141,7 +143,7 @@ class MotionCheck:
 
 
 class StillPosition:
-    """How long the position, averaged over seconds, has stayed within a distance."""
+    """Measures how long the position, averaged over seconds, has stayed within a distance."""
 
     def __init__(self, within_m: float) -> None:
         self._within_m = within_m

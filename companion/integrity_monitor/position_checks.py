@@ -1,4 +1,4 @@
-"""Where vision says the aircraft is, against the barometer and GNSS."""
+"""Compare vision's position with barometer and GNSS."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cove
 
 
 class LocalPlace:
-    """A flat frame about the first fix."""
+    """Local north, east, down frame at the first fix."""
 
     def __init__(self) -> None:
         self._anchor: tuple[float, float] | None = None
@@ -42,8 +42,8 @@ class LocalPlace:
 
 
 class HeightCheck:
-    """Vision's height against the barometer's, both since they were first seen together in this
-    flight: weather and temperature change between two.
+    """Compares vision's height with the barometer's. Both are relative to their first common value
+    in this flight, because pressure and temperature change between flights.
     """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
@@ -54,7 +54,7 @@ class HeightCheck:
         self._differences: deque[float] = deque(maxlen=_MEDIAN_OF)
 
     def add(self, fix: VisionFix, state: VehicleState) -> CheckResult:
-        """One fix, and the state at about its time."""
+        """Add a fix and the state at about its time."""
         if not state.armed:
             self._zero = None
             self._differences.clear()
@@ -82,7 +82,7 @@ class HeightCheck:
 
 
 class GnssCheck:
-    """Compares GNSS with vision while GNSS is there, in every mode; neither counts as the truth."""
+    """Compares GNSS with vision while GNSS is there, in every mode. Either may be wrong."""
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
         self._cap_m = config.gnss_accuracy_cap_m
@@ -90,7 +90,7 @@ class GnssCheck:
     def read(
         self, fix: VisionFix, state: VehicleState, protection_m: float, now_ns: int
     ) -> CheckResult:
-        """The newest fix against the newest report."""
+        """Compare the newest fix with the newest GNSS report."""
         latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
         if latitude is None or longitude is None or not gnss_healthy(state, now_ns):
             return CheckResult(None)

@@ -1,4 +1,6 @@
-"""Protection levels: how wrong a fix may be at the stated risk, when more than noise is wrong."""
+"""Protection levels: bounds of the position error at a stated risk, with errors beyond the
+covariance.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ _UNKNOWN_MPS = (15.0, 3.0)  # horizontally and vertically, of a vehicle that doe
 
 @dataclass(frozen=True)
 class ProtectionLevel:
-    """Metres that the error exceeds with the configured risk at most."""
+    """Bounds that the error exceeds at most with the configured risk, metres."""
 
     horizontal_m: float
     vertical_m: float
@@ -27,8 +29,8 @@ def protection_level(
     known_m: float,
     height_m: float | None,
 ) -> ProtectionLevel:
-    """The level of a fix. known_m: what another watch found to be wrong, added as it is; height_m:
-    above the ground, None where it is not known.
+    """The protection levels of a fix. known_m: estimated errors, added linearly; height_m: above
+    the ground, None where unknown.
     """
     velocity = state.local_velocity_ned or fix.velocity_ned
     speeds = _UNKNOWN_MPS

@@ -1,4 +1,5 @@
-"""Steps of the position that nothing explains, and what they leave in doubt until it is settled.
+"""Detects unexplained steps of the position, and keeps the resulting uncertainty until it is
+resolved.
 
 A step lasts. Two honest fixes may be farther apart than four of their sigmas once in some thousand;
 the means of those before and after are not.
@@ -43,12 +44,12 @@ class PositionStep:
 
     @property
     def is_led(self) -> bool:
-        """Whether it came soon and near the prediction."""
+        """Whether the position came soon after the last one and near the prediction."""
         return self.after_s <= _SOON_S and math.hypot(*self.offset_m) <= self.allowed_m
 
     @property
     def is_suspect(self) -> bool:
-        """Whether it exceeds what noise and elapsed time explain, and `STEP_M`."""
+        """Whether the step exceeds what noise and elapsed time explain, and `STEP_M`."""
         return math.hypot(*self.offset_m) > max(self.allowed_m, STEP_M)
 
 
@@ -63,7 +64,7 @@ class _Off:
 
 
 class StepDetector:
-    """Takes the step of every position that passes, and finds those that last."""
+    """Detects steps of accepted positions that last."""
 
     def __init__(self) -> None:
         self._north = self._east = 0.0
@@ -73,14 +74,14 @@ class StepDetector:
 
     @property
     def suspected_m(self) -> float:
-        """By how much the newest position may have stepped, while it is not yet known to last."""
+        """Size of the newest step while it is not yet known whether it lasts."""
         if self._suspect is None:
             return 0.0
         before, newest = _mean(self._before), self._after[-1]
         return math.hypot(newest.north - before.north, newest.east - before.east)
 
     def add(self, step: PositionStep) -> PositionStep | None:
-        """Another position; a step, once it has lasted."""
+        """Add a position; returns a step once it has lasted."""
         self._north += step.offset_m[0]
         self._east += step.offset_m[1]
         here = _Off(step.time_ns, self._north, self._east, step.sigma_m)
@@ -98,7 +99,7 @@ class StepDetector:
         return self._decided(self._suspect) if len(self._after) >= _FIXES else None
 
     def forget(self) -> None:
-        """What comes next follows nothing that came before."""
+        """Reset: the next position has no predecessor."""
         self._before.clear()
         self._after.clear()
         self._suspect = None
@@ -118,7 +119,7 @@ class StepDetector:
 
 
 def _drift(some: Sequence[_Off]) -> float:
-    """By how much they go on to step, m/s: what leads to them is off by so much."""
+    """Expected growth of steps, m/s, from the error of the prediction."""
     first, last = some[0], some[-1]
     span_s = (last.time_ns - first.time_ns) * 1e-9
     return math.hypot(last.north - first.north, last.east - first.east) / span_s if span_s else 0.0
@@ -136,31 +137,35 @@ def _mean(some: Sequence[_Off]) -> _Off:
 
 
 class StepUncertainty:
-    """The sum of the steps, along and across the way: a step back takes a doubt away again."""
+    """Sum of the steps along and across the direction of flight. A step back reduces it."""
 
     def __init__(self, most_m: float) -> None:
-        """most_m: what is larger is a jump, and held."""
+        """most_m: larger steps are jumps, which are held."""
         self._most_m = most_m
         self._finder = StepDetector()
         self._along_m = self._across_m = self._speed = 0.0
 
     @property
     def delay_s(self) -> float:
-        """By how much the stamps are late if that is what the steps along the way mean."""
+        """Delay of the timestamps, if it is the cause of the steps along the direction
+        of flight.
+        """
         return abs(self._along_m) / self._speed if self._speed else 0.0
 
     @property
     def metres(self) -> float:
-        """By how much the position may be wrong, by steps that lasted."""
+        """Position uncertainty from steps that lasted."""
         return min(math.hypot(self._along_m, self._across_m), self._most_m)
 
     @property
     def possible_m(self) -> float:
-        """The same with what may be a step, until it is known whether it lasts."""
+        """The same, with steps that may not last."""
         return min(self.metres + self._finder.suspected_m, self._most_m)
 
     def add(self, step: PositionStep) -> PositionStep | None:
-        """How the newest position that passed lies to the one before; the step that has lasted."""
+        """Add the offset of the newest accepted position from its prediction, and the step that has
+        lasted.
+        """
         found = self._finder.add(step)
         if found is not None:
             self._add_up(found)
@@ -179,16 +184,18 @@ class StepUncertainty:
             self._leave(self._along_m, self._across_m + math.hypot(north, east))
 
     def stamps_are_right(self) -> None:
-        """Known since the last step: it was no delay, so what lies along the way is none."""
+        """The timestamps are confirmed since the last step, so the steps along the direction of
+        flight were no delay.
+        """
         self._leave(0.0, self._across_m)
 
     def is_found_again(self) -> None:
-        """The place was searched and confirmed: what lies across the way is settled."""
+        """The position was searched and confirmed, which resolves the steps across."""
         self._finder.forget()
         self._leave(self._along_m, 0.0)
 
     def begins_anew(self) -> None:
-        """Another flight: what was in doubt before does not matter."""
+        """Reset for a new flight."""
         self._finder.forget()
         self._leave(0.0, 0.0)
 

@@ -18,8 +18,8 @@ _HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
 
 
 class TiltCheck:
-    """Takes every fix. What the gimbal is off by for good is not learned: a wrong tilt that came
-    slowly and with the first fix (at 1.5 degrees in 2 s, `begins-denied`) would be learned with it.
+    """Takes every fix. A constant bias of the gimbal is not estimated here: a wrong tilt that came
+    slowly and with the first fix (1.5 degrees in 2 s, `begins-denied`) would become part of it.
     """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
@@ -38,19 +38,19 @@ class TiltCheck:
 
     @property
     def off_deg(self) -> float:
-        """By how much the newest fix is tilted."""
+        """Tilt difference of the newest fix."""
         return math.degrees(self._off_rad)
 
     def metres(self, height_m: float | None) -> float:
-        """By how much its position may be wrong: the tilt times the height above the ground, as far
-        as gimbal and autopilot do not explain it.
+        """Position error from the tilt: tilt times height above the ground, minus what gimbal and
+        autopilot explain.
         """
         believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
         shift_m = self._most_m if height_m is None else height_m * self._off_rad
         return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
 
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
-        """Another fix, and the autopilot's attitude at its time, None where it is unknown."""
+        """Add a fix with the autopilot's attitude at its time, None where unknown."""
         if attitude is None or fix.quaternion is None:
             since = self._judged_ns
             self.is_known = since is not None and abs(fix.time_ns - since) <= _HOLDS_NS
@@ -62,6 +62,6 @@ class TiltCheck:
 
 
 def _level(ned_from_body: quat.Quaternion) -> tuple[float, float]:
-    """Where the vertical lies in body axes, forward and right: no heading is in it."""
+    """Direction of the vertical in body axes, forward and right; independent of heading."""
     forward, right, _ = quat.rotate(quat.conjugate(ned_from_body), (0.0, 0.0, 1.0))
     return forward, right

@@ -38,7 +38,8 @@ _MEMORY_STEP_NS = 180_000_000
 
 @dataclass(frozen=True)
 class FrameVerdict:
-    """What the pictures say. still_s: how long the picture has not moved; identical_s: to the bit.
+    """Result of the video checks. still_s: how long the image has not moved; identical_s: how long
+    the frames have been bit-identical.
 
     repeat_lag_s: the pictures are those of so long ago; 0 where they are new. contrast: standard
     deviation of the thumbnail, gray levels of 255; detail: the same of a block of 4 by 4 of its
@@ -54,7 +55,7 @@ class FrameVerdict:
 
 @dataclass(frozen=True)
 class ImageShift:
-    """How far a picture moved, as a share of its width, and what the fit's sigma is."""
+    """Shift between two images, as a share of the width, and its sigma."""
 
     share: float
     sigma: float
@@ -78,7 +79,7 @@ def _look(time_ns: int, image: Image) -> _SeenFrame:
 
 
 class FrozenVideoDetector:
-    """Takes every picture, or as many as there is time for; one thread."""
+    """Detects frozen video. Takes every frame, or as many as possible; one thread."""
 
     def __init__(self, config: VideoCheckConfig) -> None:
         self._config = config
@@ -89,7 +90,7 @@ class FrozenVideoDetector:
         self._loop = RepeatedVideoDetector(config)
 
     def add(self, time_ns: int, image: Image) -> FrameVerdict:
-        """One picture (H, W, 3) uint8 RGB at its exposure time; what is known with it."""
+        """Add a frame (H, W, 3) uint8 RGB at its exposure time; returns the result."""
         seen = _look(time_ns, image)
         last, self._newest = self._newest, seen
         if last is None or last.crc != seen.crc:
@@ -106,7 +107,9 @@ class FrozenVideoDetector:
         )
 
     def _keep_reference(self, seen: _SeenFrame) -> None:
-        """The picture that all since resemble. The median spares it an encoder's key frames."""
+        """Select the reference frame that all later frames resemble. The median excludes an
+        encoder's key frames.
+        """
         if self._reference is None:
             self._reference = seen
             return
@@ -118,7 +121,9 @@ class FrozenVideoDetector:
 
 
 class RepeatedVideoDetector:
-    """Finds pictures that come again, at one lag that holds, along a path on which they differ."""
+    """Detects frames that repeat earlier ones at a constant lag, along a path of
+    different frames.
+    """
 
     def __init__(self, config: VideoCheckConfig) -> None:
         self._config = config
@@ -127,7 +132,7 @@ class RepeatedVideoDetector:
         self._matches: deque[tuple[int, int]] = deque()  # time and lag
 
     def add(self, seen: _SeenFrame) -> float:
-        """Seconds to the pictures that come again; 0 while they are new."""
+        """Lag in seconds of repeated frames; 0 for new frames."""
         before = [old for old in self._memory if seen.time_ns - old.time_ns >= self._hold_ns]
         for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: unlikeness(old, seen)):
             if resemblance(old, seen) < self._config.still_share:
@@ -138,7 +143,7 @@ class RepeatedVideoDetector:
         return self._lag_s(seen.time_ns)
 
     def _lag_s(self, now_ns: int) -> float:
-        """The newest match's lag, if matches of that lag fill the time and the picture moved."""
+        """The newest lag, if matches of this lag cover the time and the image moved."""
         if not self._matches:
             return 0.0
         lag_ns = self._matches[-1][1]
@@ -160,7 +165,7 @@ class RepeatedVideoDetector:
 
 
 def resemblance(a: _SeenFrame, b: _SeenFrame) -> float:
-    """How far the picture moved from a to b, as a share of its width; 1 where nobody can say."""
+    """Shift of the image from a to b, as a share of its width; 1 if it cannot be measured."""
     if a.crc == b.crc:
         return 0.0
     low, high = sorted((a.contrast, b.contrast))
@@ -182,7 +187,7 @@ def detail(small: Thumbnail) -> float:
 
 
 def thumbnail(image: Image) -> Thumbnail:
-    """Luminance (48, 64) of a picture (H, W, 3), gray levels of 255 about their mean."""
+    """Luminance (48, 64) of a frame (H, W, 3), gray levels of 255, minus their mean."""
     small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
     gray = small @ np.array([0.299, 0.587, 0.114], np.float32)
     return np.asarray(gray - gray.mean(), np.float32)

@@ -1,1 +1,1 @@
-"""Where each picture was taken and what it shows, in the video itself: MISB ST 0601 in MPEG-TS."""
+"""Camera pose and targets as metadata in the video: MISB ST 0601 in MPEG-TS."""

@@ -1,4 +1,4 @@
-"""The camera's video sent on as it came, with ST 0601 metadata in step with its pictures.
+"""Forwards the camera's video unchanged, with ST 0601 metadata of its frames.
 
 A packet is held until its picture's pose is known, at most `hold_ms` after it came: a picture that
 was not localized, or too late, goes on without metadata.

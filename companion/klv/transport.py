@@ -1,4 +1,4 @@
-"""A video's own packets with metadata beside them, as MPEG-TS: nothing is encoded again.
+"""Writes a video's packets with metadata as MPEG-TS, without encoding them again.
 
 The muxer is FFmpeg's (PyAV); the metadata is a KLV stream (stream type 0x06, registration "KLVA")
 whose packets carry the presentation time of their picture.

@@ -1,1 +1,1 @@
-"""What the flight shows to the console, over a local socket; and what the console may ask."""
+"""Data for the console over a local socket, and the orders that the console may send."""

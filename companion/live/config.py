@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class ConsoleConfig(BaseModel):
-    """Where the operator's page is served, and what it may do."""
+    """Address of the operator's page, and its rights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -1,4 +1,4 @@
-"""How busy and how warm this computer is."""
+"""Load and temperature of this computer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the console asks the flight to do: checked again here, since a page may be anybody's."""
+"""The console's orders to the flight, checked again here because a page may be anyone's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _OLDEST_S, _AHEAD_S = 10.0, 1.0  # of a picture that is pointed into
 
 
 class OrderError(CompanionError):
-    """An order that is not carried out, and why."""
+    """Why an order is not carried out."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Orders:
         self._taken: deque[float] = deque(maxlen=_MOST)
 
     def take(self, order: dict[str, Any]) -> str:
-        """Do it; returns what was done. `OrderError` says why not."""
+        """Carry out an order; returns what was done. Raises `OrderError` with the reason."""
         if not self._control:
             raise OrderError("the console only reads: console.control is false")
         now = self._clock()

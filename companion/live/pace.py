@@ -1,4 +1,4 @@
-"""How often something may go out, of what comes at times of its own."""
+"""Limits the rate of events that arrive at irregular times."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 @dataclass
 class RateLimiter:
-    """A mean rate: the next is due a period after the last was due, not after it went. Pictures of
-    10 Hz at a pace of 6 Hz else went every 200 ms, 5 a second.
+    """Limits the mean rate: the next event is due a period after the last was due, not after it was
+    sent. Otherwise 10 Hz frames limited to 6 Hz would be sent every 200 ms, at 5 Hz.
     """
 
     period_s: float
     due_s: float = 0.0
 
     def is_due(self, now_s: float) -> bool:
-        """Whether one may go."""
+        """Whether an event may be sent."""
         return now_s >= self.due_s
 
     def went(self, now_s: float) -> None:
-        """One went; what was missed before is not made up for."""
+        """An event was sent; missed ones are not made up for."""
         self.due_s = max(self.due_s + self.period_s, now_s)

@@ -1,4 +1,4 @@
-"""What the console is shown: one state document, and pictures with the poses that belong to them.
+"""Data for the console: one state document, and frames with their poses.
 
 The flight's threads only leave references here; all formatting is the console link's thread's.
 """
@@ -59,7 +59,7 @@ class Shot:
 
 
 class Shown:
-    """Keeps the newest of everything. about: what never changes in a flight (mode, limits, map)."""
+    """Keeps the newest data. about: constants of a flight (mode, limits, map)."""
 
     def __init__(
         self, frame: LocalFrame, geoid_m: float, instruments: Instruments, about: dict[str, Any]
@@ -120,7 +120,9 @@ class Shown:
         return {"kind": "hello", **self._about, "monotonic_ns": time.monotonic_ns()}
 
     def state(self, told: int) -> tuple[dict[str, Any], int]:
-        """The state document, and up to which event it tells; events up to `told` are left out."""
+        """The state document, and the number of its newest event; events up to `told`
+        are left out.
+        """
         with self._lock:
             events = [e for e in self._events if e[0] > told]
             targets = list(self._targets.values())

@@ -1,1 +1,1 @@
-"""After the flight: replay and pictures."""
+"""Analysis after the flight: replay and plots."""

@@ -1,4 +1,4 @@
-"""What the autopilot of a recorded flight had said by a time."""
+"""The autopilot's data of a recorded flight, as known at a time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
 class RecordedAutopilot(VehicleTracker):
-    """What the vehicle had said by a time, from the recorded messages."""
+    """The vehicle's state at a time, from the recorded messages."""
 
     def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
         c = bridge.camera
@@ -31,7 +31,7 @@ class RecordedAutopilot(VehicleTracker):
         self._next = next(self._messages, None)
 
     def advance(self, time_ns: int) -> None:
-        """Take in everything that had arrived by `time_ns`, CLOCK_MONOTONIC."""
+        """Process all messages that had arrived by `time_ns`, CLOCK_MONOTONIC."""
         self._now_ns = time_ns
         while self._next is not None and self._next[0] <= time_ns:
             received_ns, message = self._next

@@ -1,4 +1,4 @@
-"""Whether a map is the one that a record was flown over: it may have been built again since."""
+"""Checks whether a map is the one of a record; it may have been built again since."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Before the flight: what vision will be worth along a mission, leg by leg."""
+"""Forecast of vision along a mission, leg by leg."""

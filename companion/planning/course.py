@@ -1,4 +1,4 @@
-"""The line that is flown: straight, a spline as ArduPilot flies it, or a circle."""
+"""The flown line: straight, a spline as ArduPilot flies it, or a circle."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What would do instead, where a leg will not: other heights, gimbal angles and headings, by the
-same forecast.
+"""Alternatives for failing legs, by the same forecast: other heights, gimbal angles and
+headings.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _LEGS = 12  # the longest of those that will not do
 
 @dataclass(frozen=True)
 class LegAlternative:
-    """Fly so much higher, with the gimbal at this pitch, the camera turned from the way by so much
-    (all as in `PathSample`). words: for the pilot.
+    """Fly higher by this value, with the gimbal at this pitch and the camera turned from the course
+    by this angle (as in `PathSample`). words: for the pilot.
     """
 
     rise_m: float
@@ -36,8 +36,8 @@ class LegAlternative:
 
 @dataclass(frozen=True)
 class Instead:
-    """The best change for a leg. risk: the largest of its samples with it, 0 to 1; holds: whether
-    they all hold then.
+    """The best alternative for a leg. risk: the largest of its samples, 0 to 1; holds: whether all
+    its samples hold.
     """
 
     leg: str
@@ -50,8 +50,8 @@ class Instead:
 def instead(
     surveyor: Surveyor, verdicts: Sequence[LegVerdict], fixed: bool, progress: Progress | None
 ) -> tuple[Instead, ...]:
-    """For each of the longest legs that will not do, the change with the least risk, if any lowers
-    it. fixed: whether the camera cannot be turned but with the vehicle.
+    """For each of the longest failing legs the alternative with the least risk, if one lowers it.
+    fixed: whether the camera turns only with the vehicle.
     """
     bad = sorted(
         (v for v in verdicts if not v.holds), key=lambda v: -(1 - v.share) * v.leg.length_m

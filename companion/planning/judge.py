@@ -1,4 +1,4 @@
-"""What a forecast means for a flight: verdicts of samples and legs, and what must be bridged."""
+"""Results of a forecast: verdicts of samples and legs, and the stretches that need odometry."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LIKENESS = 0.7  # of another place's match, beyond which it may be taken for th
 
 
 class Reason(Enum):
-    """Why a place will not do."""
+    """Why vision fails at a position."""
 
     NONE = "holds"
     NO_MAP = "no map in view"
@@ -34,8 +34,8 @@ class Reason(Enum):
 
 @dataclass(frozen=True)
 class MissionLimits:
-    """sigma_m: of the position, one axis, that the mission can live with; risk: share of pictures
-    that may be lost or wrong.
+    """sigma_m: largest acceptable position sigma, one axis; risk: largest acceptable share of
+    frames that are lost or wrong.
     """
 
     sigma_m: float = 1.0
@@ -90,9 +90,9 @@ class LegVerdict:
 
 @dataclass(frozen=True)
 class VisionGap:
-    """A way on which vision is not to be had. begin_m, end_m: of the mission's way; drift_m: sigma
-    of the position (horizontal, one axis) after it if odometry carries it; can_bridge: whether
-    that stays below the odometry's end.
+    """A stretch without vision. begin_m, end_m: along the mission; drift_m: position sigma
+    (horizontal, one axis) after it with odometry; can_bridge: whether that stays below odometry's
+    limit.
     """
 
     begin_m: float
@@ -135,8 +135,8 @@ def stretches(
     *,
     terrain: bool = False,
 ) -> tuple[VisionGap, ...]:
-    """What must be bridged, in the order of the way; neighbouring samples are one stretch.
-    speed_m_s: where the leg has none; terrain: its heights are known outside the map.
+    """The stretches that need odometry, in order; neighbouring samples are one stretch. speed_m_s:
+    used if the leg has none; terrain: heights are known outside the map.
     """
     found: list[tuple[float, float, float, bool]] = []
     for verdict in verdicts:

@@ -1,4 +1,4 @@
-"""A mission flown on the desk: all that is known of it before the flight."""
+"""Forecast of a whole mission."""
 
 from __future__ import annotations
 
@@ -28,9 +28,8 @@ _MOST_SAMPLES = 400  # of a mission; longer ones are sampled more thinly
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked. mission_file: for the report; spacing_m: between samples; speed_m_s,
-    pitch_deg: where the mission does not say; seek: whether changes are looked for where legs will
-    not do.
+    """The request. mission_file: for the report; spacing_m: between samples; speed_m_s, pitch_deg:
+    used if the mission has none; seek: whether alternatives are searched for failing legs.
     """
 
     mission_file: Path
@@ -44,9 +43,9 @@ class Question:
 
 @dataclass(frozen=True)
 class MissionForecast:
-    """The answer. length_m: of all that is flown; verdicts: of each leg once, however often it is
-    flown; not_judged: what of the mission is not in it, by its MAVLink names; notes: what the
-    forecast does not know of this mission, as sentences.
+    """The result. length_m: of all legs; verdicts: of each leg once, however often it is flown;
+    not_judged: commands of the mission that are not in it, by MAVLink name; notes: limits of the
+    forecast for this mission, as sentences.
     """
 
     question: Question
@@ -83,7 +82,7 @@ def make_plan(
     question: Question,
     progress: Progress | None = None,
 ) -> MissionForecast:
-    """Forecast every leg, say what must be bridged, and look for what would do instead."""
+    """Forecast every leg, find the stretches that need odometry, and search alternatives."""
     aim = aim_of(deployment, question.pitch_deg)
     ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)

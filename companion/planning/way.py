@@ -1,4 +1,4 @@
-"""From a mission's places to the camera's poses along it, in the map's frame."""
+"""Compute the camera's poses along a mission, in the map's frame."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _FARTHEST_KM = 500.0  # from the map: beyond it a digit is wrong
 
 @dataclass(frozen=True)
 class Aim:
-    """How the camera looks from the vehicle. mount: its place; pitch_deg: of the gimbal where the
-    mission does not say; fixed: screwed to the airframe, which flies level here.
+    """Direction of the camera. mount: its mounting; pitch_deg: of the gimbal if the mission has
+    none; fixed: mounted on the airframe, which is level here.
     """
 
     mount: Mount

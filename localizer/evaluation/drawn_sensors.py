@@ -55,7 +55,7 @@ class DrawnSensors:
         )
 
     def auxiliary(self, sequence: Sequence) -> AuxiliarySensors:
-        """As a localizer asks for them, by the frames' exposure times."""
+        """The drawn data in the form that a localizer needs, by the frames' exposure times."""
         index = {time_ns: k for k, time_ns in enumerate(sequence.times_ns)}
 
         def rotation_at(time_ns: int) -> Array | None:

@@ -20,7 +20,7 @@ _LEAST_SIGMA = np.array([1.0, 1.0, 1.0, *np.radians([1.0, 1.0, 1.0])])
 
 @dataclass(frozen=True)
 class KnownOfPlace:
-    """What other sensors say of a lost camera: errors are drawn about the truth, seeded.
+    """Drawn data of other sensors for a lost camera: true values with seeded errors.
 
     prior: a position 100 to 500 m off is known; else none. heading: known to 15 degrees; else not
     at all. tilt_sigma_deg, height_sigma_m: of the autopilot's roll and pitch, and of the barometer.
@@ -33,7 +33,7 @@ class KnownOfPlace:
     seed: int = 0
 
     def query(self, frame: Frame, truth: Pose, index: int) -> PlaceQuery:
-        """The search that a frame begins."""
+        """The search query of a frame."""
         rng = np.random.default_rng((self.seed, index))
         tilt = np.array([*rng.normal(0.0, np.radians(self.tilt_sigma_deg), 2), 0.0])
         limit = np.radians(_HEADING_OFF_DEG) if self.heading else np.pi

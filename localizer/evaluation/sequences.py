@@ -85,8 +85,8 @@ class EvaluatedFrame:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """How far a prior is from the truth: up to so many metres and degrees, seeded. reported: puts
-    into it what other sensors report at a frame (`DrawnSensors.in_prior`).
+    """Error of a prior: up to so many metres and degrees, seeded. reported: adds the other sensors'
+    data of a frame (`DrawnSensors.in_prior`).
     """
 
     translation_m: float = 10.0

@@ -221,7 +221,7 @@ class OnnxExtractor:
 
 
 def model_key(extractor: FeatureExtractor) -> str:
-    """What tells its features from any other's: two models may bear one name."""
+    """Key of a model's features; two models may have the same name."""
     if isinstance(extractor, OnnxExtractor):
         return f"{extractor.name} {extractor.info.sha256}"
     return extractor.name

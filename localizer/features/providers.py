@@ -85,7 +85,7 @@ def _started(
     names: list[str],
     check: Callable[[ort.InferenceSession], None],
 ) -> ort.InferenceSession:
-    """A session on the first of the providers; what it cannot compute goes to those after it."""
+    """A session on the first provider; later providers run what it cannot compute."""
     providers = [_configured(n, expected) for n in names]
     session = ort.InferenceSession(str(model), options, providers=providers, enable_fallback=False)
     if names[0] != session.get_providers()[0]:

@@ -1,1 +1,1 @@
-"""What registration could give at a place where nobody has flown yet: forecasts from the map."""
+"""Forecast of the registration at a position, from the map."""

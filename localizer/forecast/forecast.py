@@ -1,4 +1,4 @@
-"""The forecast at one pose: another day's pictures of it, drawn and registered as in flight."""
+"""Forecast at one pose: frames of another day are drawn and registered as in flight."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ tracker's after a short gap."""
 
 @dataclass(frozen=True)
 class ViewForecast:
-    """What registration would give at a pose under one condition.
+    """Forecast of the registration at a pose under one condition.
 
     figures: of the draws; sigma_m: position error to be expected of what is accepted, one axis;
     risk: probability that a picture is refused or more than 1 m off; ground_m: median distance to
@@ -48,7 +48,7 @@ class ViewForecast:
 
 
 class Forecaster:
-    """Forecasts for one camera over one map. It belongs to one thread.
+    """Forecasts for one camera over one map; use it on one thread.
 
     camera: of the stream, distorted or not; draws: pictures of each condition.
     """
@@ -133,7 +133,7 @@ class Forecaster:
         )
 
     def is_accepted(self, found: Registration, prior: PosePrior) -> bool:
-        """As in flight."""
+        """Whether a registration is accepted, as in flight."""
         gate = mahalanobis_squared(prior, found.world_from_camera, found.covariance)
         return is_acceptable(self._config.integrity, found, gate)
 

@@ -1,4 +1,4 @@
-"""From what a simulated registration says to what a flight would: fitted on worlds, not derived.
+"""Convert simulated registrations to a forecast of a flight, by a model fitted on generated worlds.
 
 `SIGMA` and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its worlds for
 tuning: 276 legs over seven, and 60 legs over three of them. Its held-out worlds had no part in it.
@@ -48,8 +48,8 @@ def predictors(figures: Figures) -> Array:
 
 
 def expected_sigma_m(figures: Figures, constants: tuple[float, float] = SIGMA) -> float:
-    """Position error to be expected of what is accepted, one axis, m: of the pictures' equations,
-    and of a ground that is not quite what the map has.
+    """Expected position error of accepted registrations, one axis, m, from the images' equations
+    and from errors of the map.
     """
     factor, map_m = constants
     return float(np.hypot(factor * figures.sigma_m, map_m))

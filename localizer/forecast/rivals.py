@@ -1,4 +1,4 @@
-"""Whether another place looks like this one: the best match at displaced poses."""
+"""Similarity of other positions: the best match at displaced poses."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _ANCHORS = 250
 
 @dataclass(frozen=True)
 class AmbiguousPosition:
-    """The likest other place. share: its match over the true one's, 0 (chance) to 1 (the same);
-    distance_m: how far off it is, 0 without one.
+    """The most similar other position. share: its match divided by the true one's, 0 (chance) to 1
+    (equal); distance_m: its distance, 0 without one.
     """
 
     share: float

@@ -1,4 +1,4 @@
-"""What a camera may see of a mapped place on another day: a rendered view, changed.
+"""Simulates a camera's view of a mapped place on another day: a rendered view, changed.
 
 Geometry stays: light, weather and sensor are `localizer.synth.appearance`'s, the fine texture that
 two visits do not share is `localizer.synth.visits.texture`'s, as in training and in generated

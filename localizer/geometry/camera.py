@@ -69,8 +69,8 @@ class Camera:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], where: str = "camera") -> Camera:
-        """From width, height, fx, fy, cx, cy and optional ``distortion``, ``distortion_model`` and
-        ``readout_ms``, as other programs call them, too (`localizer.geometry.camera_file`).
+        """Camera of width, height, fx, fy, cx, cy and optional ``distortion``, ``distortion_model``
+        and ``readout_ms``, or of other programs' keys (`localizer.geometry.camera_file`).
 
         `CameraError` for a lens that is not read, and for one that cannot be.
         """
@@ -84,7 +84,9 @@ class Camera:
 
     @classmethod
     def from_json(cls, path: Path | str) -> Camera:
-        """From a ``camera.json`` file, or another program's (`camera_file.read_numbers`)."""
+        """Camera of a ``camera.json`` file, or of another program's file
+        (`camera_file.read_numbers`).
+        """
         return cls.from_dict(read_numbers(Path(path)), str(path))
 
     def to_dict(self) -> dict[str, Any]:
@@ -223,14 +225,14 @@ class Camera:
 
 
 def lens_fault(camera: Camera) -> str:
-    """Why no lens is so, "" where one may be (`lens.fault`)."""
+    """Why the lens is impossible, "" if it is possible (`lens.fault`)."""
     size = camera.width, camera.height
     return lens.fault(size, camera.rays, camera.project) if camera.is_distorted else ""
 
 
 def followed(pinhole: Camera, camera: Camera) -> Camera:
-    """The pinhole, of its own size, that sees what a (distorted) camera sees now: `pinhole` itself
-    while the camera is the one that it was made for, at whatever size.
+    """The pinhole, at its own size, with the view of a (distorted) camera; `pinhole` itself while
+    the camera is the one that it was made for, at any size.
     """
     own = camera.without_distortion().resized(pinhole.width, pinhole.height)
     return pinhole if own.is_like(pinhole) else own

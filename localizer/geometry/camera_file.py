@@ -63,7 +63,7 @@ _READ = (
 
 
 def read_numbers(path: Path) -> dict[str, Any]:
-    """What a file says of one camera, for `camera_numbers`: JSON, YAML (ROS ``camera_info``,
+    """Numbers of one camera in a file, for `camera_numbers`: JSON, YAML (ROS ``camera_info``,
     Kalibr's camchain, OpenCV's FileStorage) or COLMAP's ``cameras.txt``.
     """
     try:
@@ -87,7 +87,7 @@ def read_numbers(path: Path) -> dict[str, Any]:
 
 
 def camera_numbers(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of `Camera`; ValueError or TypeError for what is none."""
+    """The arguments of `Camera`; ValueError or TypeError for invalid data."""
     flat = _flat(data)
     forms = _forms(flat)
     for name in ("camera_matrix", "K", "k", "intrinsics"):
@@ -107,7 +107,7 @@ def camera_numbers(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
-    """One camera's numbers under this project's keys, whoever wrote them."""
+    """One camera's numbers under this project's keys, from any program."""
     inner = [v for v in data.values() if isinstance(v, Mapping)]
     if len(inner) == len(data) == 1:  # Kalibr's cam0, OpenSfM's name of a camera
         data = inner[0]

@@ -107,8 +107,8 @@ def _fisheye_angle(k: tuple[float, ...], radius: Array) -> Array:
 
 
 def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Project) -> str:
-    """Why no camera has such a lens; "" where one may. size: of the picture, px; rays, project: the
-    camera's.
+    """Why such a lens is impossible; "" if it is possible. size: of the image, px; rays, project:
+    the camera's.
 
     Every pixel of a grid up to the picture's edges must have a ray that projects back onto it, and
     a straight line between two corners must not bow by more than a lens makes it.

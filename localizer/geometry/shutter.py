@@ -39,9 +39,8 @@ class Sweep:
         return 0.5 * angle * max(camera.fx, camera.fy) > _LEAST_PX
 
     def seen(self, points: Array, world_from_camera: Pose, camera: Camera) -> Array:
-        """World points (N, 3), each moved to where a camera that stands still at
-        `world_from_camera`, the pose in the middle of the readout, sees it in the pixel in which
-        the moving camera does.
+        """World points (N, 3), moved so that a camera at rest at `world_from_camera`, the pose in
+        the middle of the readout, sees each in the pixel in which the moving camera does.
 
         To second order in the turn: 6 mm at 120 m and 60 degrees a second.
         """

@@ -106,7 +106,7 @@ def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
 
 
 def covariance_row(pose: StampedPose) -> tuple[str, ...] | None:
-    """What stands in `COVARIANCE_COLUMNS` for a pose; None if its covariance is not known."""
+    """The values of `COVARIANCE_COLUMNS` for a pose; None if its covariance is unknown."""
     if pose.covariance is None:
         return None
     time_ns = "" if pose.time_ns is None else str(pose.time_ns)

@@ -1,4 +1,4 @@
-"""Whether a place that was found by searching holds: evidence that does not come from the search.
+"""Tests a found position with evidence that does not come from the search.
 
 A wrong place that looks right looks right again in the next frame of the same view: three
 acceptances in a row are one piece of evidence. Independent of the search are the way that the
@@ -27,7 +27,7 @@ _TURN_RAD = np.radians(15.0)  # a view that turned by this shows other ground
 
 
 class Consistency(Enum):
-    """What the evidence says of a found place so far."""
+    """Result of the evidence for a found position so far."""
 
     PENDING = "pending"
     CONFIRMED = "confirmed"

@@ -49,24 +49,26 @@ def height_likelihood(
         known, wanted = constraint_rows(constraint, pose)
     unit = 1.0 / np.sqrt(np.maximum((rows**2).sum(axis=0), 1e-300))
     rows, known = rows * unit, known * unit
-    result = np.empty(len(CANDIDATES_M))
-    for k, sigma_m in enumerate(CANDIDATES_M):
-        variance = _NOISE_PX[:, None] ** 2 + sigma_m**2 * np.maximum(values, 0.0)
-        result[k] = max(_marginal(y, rows, known, wanted, 1.0 / v) for v in variance)
+    raised = CANDIDATES_M[:, None, None] ** 2 * np.maximum(values, 0.0)
+    variance = _NOISE_PX[:, None] ** 2 + raised
+    result = _marginal(y, rows, known, wanted, 1.0 / variance).max(axis=1)
     relative: Array = result - result.max()
     return relative
 
 
-def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array) -> float:
-    """Log likelihood of ``y = rows d + noise`` and ``wanted = known d + noise``, over all d."""
-    normal = rows.T @ (weight[:, None] * rows) + known.T @ known
-    right = rows.T @ (weight * y) + known.T @ wanted
+def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array) -> Array:
+    """Log likelihood (...) of ``y = rows d + noise`` and ``wanted = known d + noise``, over all d.
+
+    weight: (..., n) of y; -inf where the rows do not determine d.
+    """
+    normal = rows.T @ (weight[..., None] * rows) + known.T @ known
+    right = (weight * y) @ rows + known.T @ wanted
     sign, logdet = np.linalg.slogdet(normal)
-    if sign <= 0:
-        return -np.inf
-    explained = right @ np.linalg.solve(normal, right)
-    left = y @ (weight * y) + wanted @ wanted - explained
-    return float(0.5 * np.log(weight).sum() - 0.5 * logdet - 0.5 * left)
+    sound = np.where((sign > 0)[..., None, None], normal, np.eye(6))
+    explained = (right * np.linalg.solve(sound, right[..., None])[..., 0]).sum(axis=-1)
+    left = weight @ y**2 + wanted @ wanted - explained
+    likelihood = 0.5 * np.log(weight).sum(axis=-1) - 0.5 * logdet - 0.5 * left
+    return np.where(sign > 0, likelihood, -np.inf)
 
 
 @dataclass(frozen=True)

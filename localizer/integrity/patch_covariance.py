@@ -1,4 +1,5 @@
-"""Covariance of a registered pose from what the patches of its image say (registration.md, 8).
+"""Covariance of a registered pose from the displacements of its image's patches (registration.md,
+8).
 
 At the registered pose each patch of the image has a shift under which it matches the map best. If
 the map were right everywhere, these shifts would be noise of a fraction of a pixel. Where it is of

@@ -1,4 +1,4 @@
-"""What kind of map a tile cache is: what its heights hold, how fine its imagery is, and its date.
+"""Kind of a tile cache: what its heights contain, detail of the imagery, and its date.
 
 `map build` measures it (`localizer.map.inspection.kind`) and keeps it in the manifest.
 """
@@ -33,7 +33,7 @@ HEIGHTS_HOLD = {
 
 @dataclass(frozen=True)
 class MapKind:
-    """What a map can and cannot show, as an error budget needs it.
+    """Properties of a map that determine the accuracy.
 
     heights: "surface" (buildings and trees stand in them), "terrain" (bare ground, or a surface so
     coarse that no building stands in it) or "flat" (one plane).
@@ -61,11 +61,11 @@ class MapKind:
 
     @property
     def has_buildings(self) -> bool:
-        """Whether buildings and trees stand in the heights."""
+        """Whether the heights contain buildings and trees."""
         return self.heights == "surface"
 
     def line(self) -> str:
-        """One line: heights, resolution of the imagery, date and sensor."""
+        """One line: kind of heights, resolution of the imagery, date and sensor."""
         parts = [
             HEIGHTS_HOLD[self.heights],
             f"imagery resolves {self.effective_resolution_m:.2f} m",
@@ -74,7 +74,7 @@ class MapKind:
         return "; ".join(parts)
 
     def advice(self, half_view_deg: float, height_m: float = USUAL_HEIGHT_M) -> str:
-        """What to expect and to do, in words; empty where the heights hold the buildings."""
+        """Expected error and advice, in words; empty if the heights contain buildings."""
         if self.has_buildings:
             return ""
         expected = self.expected_error_m(height_m, half_view_deg, _GOOD_ATTITUDE_DEG)
@@ -84,7 +84,7 @@ class MapKind:
         )
 
     def imagery_age(self, today: date, max_days: int) -> tuple[str, bool]:
-        """How old the imagery is, in words, and whether that is known and within a limit.
+        """Age of the imagery in words, and whether it is known and within a limit.
 
         A year or a month stands for its first day, so that the age is the oldest possible one.
         """

@@ -1,4 +1,4 @@
-"""What an importer hands to the builder: a tree of nodes whose tiles load by themselves."""
+"""Interface between importers and builder: a tree of nodes whose tiles are loaded on demand."""
 
 from __future__ import annotations
 

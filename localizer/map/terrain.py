@@ -1,4 +1,4 @@
-"""A terrain model beside the map: how high the ground is where the map has nothing.
+"""Terrain model: ground heights where the map has no surface.
 
 Any GeoTIFF of heights will do (Copernicus' 30 m, a surveyed one; `companion map fetch` brings
 some). Its datum plays no part: the odometry takes it for the shape of the ground and not for its
@@ -151,7 +151,7 @@ def _sides(raster: DatasetReader, u: Array, v: Array) -> tuple[tuple[Array, int]
 
 
 def _require_ground(path: Path, heights: Float32, cell_m: float) -> None:
-    """The odometry would believe any number: missing ones that are not marked, noise."""
+    """Reject heights that are no ground, such as unmarked missing values or noise."""
     known = heights[np.isfinite(heights)]
     low, high = float(known.min()), float(known.max())
     if low < LOWEST_M or high > HIGHEST_M:

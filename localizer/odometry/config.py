@@ -1,4 +1,4 @@
-"""The odometry's constants: when a keyframe is left, what is believed, how errors grow."""
+"""Constants of the odometry: change of the keyframe, limits of results, growth of errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from localizer.sensors.error_model import SENSORS
 
 @dataclass(frozen=True)
 class GrowthModel:
-    """How the error grows along the way, beside each registration's own covariance.
+    """Growth of the error with distance, beyond each registration's covariance.
 
     Fitted by ``python -m benchmarks.odometry`` (odometry.md). A walk is a sigma per square
     root of a metre flown, from keyframe to keyframe; scale is an error that stays.

@@ -1,4 +1,4 @@
-"""What goes into the odometry with a frame, and what comes out."""
+"""Input and output of the odometry for a frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class OdometryStatus(Enum):
 
 @dataclass(frozen=True)
 class OdometryFrame:
-    """A picture's part in the odometry.
+    """Data of one frame for the odometry.
 
     features: of the undistorted picture, in host memory, as for the map registration. time_ns: the
     exposure's. usability: `usability.examine`'s verdict on the picture, None if nobody looked.

@@ -1,4 +1,4 @@
-"""The ground as the odometry knows it where the map has no geometry: a height at every place."""
+"""Ground heights for the odometry where the map has no geometry."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class GroundUncertainty:
 
 
 class TerrainModel(Protocol):
-    """A terrain model: a height grid, a plane, or a rangefinder's account of the ground."""
+    """Heights of the ground: a grid, a plane, or rangefinder readings."""
 
     def height(self, east: Array, north: Array) -> Array:
         """World z (...) in metres at world places (...)."""
@@ -61,7 +61,7 @@ class FlatGround:
 
 @dataclass(frozen=True)
 class RaisedGround:
-    """Another ground, raised by so much: its shape counts and not its datum."""
+    """Ground raised by a constant: its shape is used, not its datum."""
 
     ground: TerrainModel
     by_m: float
@@ -78,7 +78,7 @@ class RaisedGround:
 
 
 class RangefinderGround:
-    """The ground as a rangefinder met it on the way: a plane at the height of what lay lowest.
+    """Ground by a rangefinder: a plane at the height of the lowest recent surface.
 
     One beam meets roofs and crowns, too, and a picture's depth from a roof would be short by it; so
     of the last readings those count that are as low as what counts as ground elsewhere.
@@ -88,13 +88,13 @@ class RangefinderGround:
         self._met: deque[tuple[int, float]] = deque()
 
     def add(self, time_ns: int, height_m: float) -> None:
-        """World z of what lay below at a time."""
+        """Add the world z of the surface below at a time."""
         self._met.append((time_ns, height_m))
         while self._met[0][0] < time_ns - _SOUNDED_NS:
             self._met.popleft()
 
     def at(self, time_ns: int) -> FlatGround | None:
-        """The plane by the readings up to a time; None where they are few."""
+        """The plane from readings up to a time; None with too few."""
         heights = [height for t, height in self._met if 0 <= time_ns - t <= _SOUNDED_NS]
         if len(heights) < _LEAST_READINGS:
             return None

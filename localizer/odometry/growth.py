@@ -1,4 +1,6 @@
-"""How the odometry's error grows: keyframe by keyframe, with the way, and while nothing is seen."""
+"""Growth of the odometry's error: with keyframes, with distance, and during frames
+without texture.
+"""
 
 from __future__ import annotations
 

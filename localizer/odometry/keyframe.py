@@ -1,4 +1,4 @@
-"""Keyframes: the features of a flown picture on surfaces whose shape is known from elsewhere."""
+"""Keyframes: features of an earlier frame on surfaces of known shape."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class DepthSource(Enum):
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A picture that later ones are registered against.
+    """A frame that later frames are registered against.
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
     pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
@@ -73,7 +73,7 @@ def keyframe_anchors(
     seed: int = 0,
     sweep: Sweep | None = None,
 ) -> tuple[Anchors, DepthSource]:
-    """Anchors of a flown picture, at most about `count`.
+    """Anchors of an earlier frame, at most about `count`.
 
     surface: points (N, 3) on the map's surfaces, off their edges, as seen from about here: the
     anchors of the map view that was rendered for this frame. Nothing is rendered again, and their

@@ -63,7 +63,8 @@ def align(
     backend: Backend, first: ParallaxView, second: ParallaxView, points: Array, prior: Array,
     noise: float,
 ) -> ParallaxAlignment | None:  # fmt: skip
-    """Both pictures' poses on surface points (N, 3) of the map; None where it cannot be told.
+    """Estimate both frames' poses on surface points (N, 3) of the map; None if they cannot be
+    determined.
 
     second: registered against the first, so that the two are one rigid body but for what the shape
     changes. prior: (6, 6) covariance of the first's pose. noise: sigma of a sample of the cost, as

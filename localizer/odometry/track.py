@@ -1,4 +1,4 @@
-"""The thread of poses that the odometry follows: predicted, judged, carried on by one frame."""
+"""The pose that the odometry propagates: predicted, tested, and updated by each frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SEARCH_M, _SEARCH_RAD = 1.0, float(np.radians(2.0))  # sigmas of a search witho
 
 @dataclass(frozen=True)
 class OdometryStart:
-    """Where and when the pose was last known otherwise, and what a first keyframe is made of."""
+    """Last pose from another source, and data for the first keyframe."""
 
     frame: OdometryFrame
     pose: Pose

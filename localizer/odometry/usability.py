@@ -21,7 +21,7 @@ _BLOCK = 10  # px of that size
 
 
 class ImageFault(Enum):
-    """What is wrong with a picture."""
+    """Why a frame is not usable."""
 
     BLACK = "the picture is black"
     SATURATED = "the picture is saturated"
@@ -51,7 +51,7 @@ class UsabilityConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Usability:
-    """The verdict on one picture, with what it rests on.
+    """Result of the check of one frame, with its measurements.
 
     fault: None if it can be used. black, saturated, structured: shares of the area.
     sharpness: contrast between neighbours over contrast between blocks, 0 for a flat picture.

@@ -102,8 +102,9 @@ def _stratified(cell: NDArray[np.int64], count: int, rng: np.random.Generator) -
     first = np.r_[0, np.flatnonzero(np.diff(cells)) + 1] if len(cells) else np.zeros(0, np.int64)
     lengths = np.diff(np.r_[first, len(cells)])
     rank = np.arange(len(cells)) - np.repeat(first, lengths)
-    chosen: NDArray[np.int64] = order[np.argsort(rank + place[order], kind="stable")[:count]]
-    return chosen
+    if len(order) <= count:
+        return order
+    return order[np.argpartition(rank + place[order], count)[:count]]
 
 
 def morton_code(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""What every registration backend is given and gives back (registration.md, section 3).
+"""Input and output of the registration backends (registration.md, section 3).
 
 A pose inside the optimizer is `camera_from_local`: a rotation and a translation that map local
 points to the camera. The local frame has world axes and its origin at the anchors' weighted

@@ -1,4 +1,4 @@
-"""Which backend registers: the GPU where there is one that works, else the CPU."""
+"""Selects the registration backend: a working GPU, else the CPU."""
 
 from __future__ import annotations
 

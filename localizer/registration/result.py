@@ -1,4 +1,4 @@
-"""What a registration gives back, and how it follows from the poses that were found."""
+"""The result of a registration, computed from the found poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the optimizer asks about its hypotheses between the refinements (registration.md, 7).
+"""Selection among the hypotheses between the refinements (registration.md, 7).
 
 Which are distinct, how probable, how good against chance, and how large their residuals are.
 """

@@ -1,4 +1,4 @@
-"""Settings of the search for a place."""
+"""Settings of relocalization."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class RelocalizationConfig(BaseModel):
-    """What the search costs, and what it takes to believe its answer."""
+    """Effort of the search, and limits for its result."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -39,7 +39,7 @@ def compared(
 
 @dataclass
 class Confirmation:
-    """The candidates of one query while they are judged. Used once.
+    """The candidates of one query during confirmation. Use it once.
 
     sight: the frame as the tracker sees it; small: at the size of the screening. places: of the
     candidates screened so far; judged: of those registered, by rank; surrounded, finished: ranks of

@@ -1,4 +1,4 @@
-"""The map's features seen from above: computed once, kept beside the tiles.
+"""The map's features seen from above, computed once and stored beside the tiles.
 
 Squares of the map are drawn from above, the network's features of each are projected onto the
 map's own principal components, weighted by confidence, and stored as bytes. One file per scale in
@@ -361,7 +361,7 @@ def _read(path: Path, gsd_m: float) -> OverviewLevel | None:
 
 
 def _write(path: Path, level: OverviewLevel) -> None:
-    """Whole or not at all: the hash, then the arrays, under another name until they are written."""
+    """Write atomically: hash and arrays to a temporary name, then rename."""
     content = safetensors.numpy.save(
         {
             "features": np.ascontiguousarray(level.features),

@@ -1,5 +1,5 @@
-"""One frame against the whole map: search, then confirmation. Plain calls, no threads of its own
-beyond `RelocalizationConfig.threads`, so that the caller decides when and how urgently it runs.
+"""Finds one frame on the whole map: search, then confirmation. It starts no threads beyond
+`RelocalizationConfig.threads`; the caller decides when it runs.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class Relocalizer:
 
 
 class OpenRelocalizer:
-    """A relocalizer with a renderer, network and optimizer of its own; close it when done."""
+    """A relocalizer with its own renderer, network and optimizer; close it when done."""
 
     def __init__(self, relocalizer: Relocalizer, streamer: TileStreamer, renderer: MapRenderer):
         self.relocalizer = relocalizer

@@ -1,4 +1,4 @@
-"""The exhaustive search: every heading, every height above ground, every place of the region."""
+"""Exhaustive search over headings, heights above ground, and positions of the region."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes into a search for a place and what comes out."""
+"""Input and output of a search."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SearchRegion:
 
 @dataclass(frozen=True)
 class PlaceQuery:
-    """One frame and what other sensors say of its camera.
+    """One frame with the other sensors' data of its camera.
 
     rotation: (3, 3) world_from_camera by autopilot and gimbal, of which roll and pitch are known to
     tilt_sigma_rad, and the heading to heading_sigma_rad, or not at all where that is None.
@@ -63,7 +63,7 @@ class PlaceQuery:
 
 @dataclass(frozen=True)
 class PlaceCandidate:
-    """A place that looks like the frame from above. score: normalised correlation, -1 to 1."""
+    """A position whose ground looks like the frame. score: normalised correlation, -1 to 1."""
 
     world_from_camera: Pose
     score: float
@@ -71,7 +71,7 @@ class PlaceCandidate:
 
 @dataclass(frozen=True)
 class Relocalization:
-    """A place that was found and confirmed by registration.
+    """A position that was found and confirmed by registration.
 
     covariance: (6, 6) as `PosePrior`'s. quality, overlap: of the registration; score: correlation
     of the candidate it came from, runner_up: of the best candidate elsewhere; rank: of the

@@ -1,4 +1,4 @@
-"""Which of the registered candidates is the place, if one is."""
+"""Decides which registered candidate is the position, if any."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def answer(
     judged: list[VerifiedCandidate],
     stages: dict[str, float],
 ) -> Relocalization | None:
-    """The best of the judged candidates (at least one, best first), unless the evidence for another
-    is comparable.
+    """The best of the registered candidates (at least one, best first), unless another has
+    comparable evidence.
     """
     best = judged[0]
     if not best.credible:

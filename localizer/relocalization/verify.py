@@ -1,4 +1,6 @@
-"""Whether a candidate is the place: rendered there, registered, and held against the sensors."""
+"""Verifies a candidate: renders the map there, registers the frame, and compares with
+the sensors.
+"""
 
 from __future__ import annotations
 

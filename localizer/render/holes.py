@@ -1,4 +1,4 @@
-"""What stands in a rendered view where the map has nothing."""
+"""Fills holes of the map in a rendered view."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Choosing a renderer backend, and giving OpenGL the thread that it belongs to."""
+"""Selects a renderer, and runs OpenGL on one thread."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def make_renderer(
 
 
 class _OwnedRenderer:
-    """A renderer that lives on a thread of its own; callers wait for that thread."""
+    """A renderer on its own thread; callers wait for that thread."""
 
     def __init__(self, renderer: MapRenderer, owner: ThreadPoolExecutor) -> None:
         self.name = renderer.name

@@ -1,1 +1,1 @@
-"""What the sensors beside the image err by."""
+"""Errors of the sensors other than the camera's image."""

@@ -1,4 +1,4 @@
-"""What every sensor beside the image errs by: one value for each quantity, with its source.
+"""Errors of every sensor other than the image: one value for each quantity, with its source.
 
 Receiver and gyros are in `mavlink_bridge/vehicle/sensor_errors.py`: the localizer hears neither.
 

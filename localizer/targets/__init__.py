@@ -1,1 +1,1 @@
-"""Pixels to places on Earth, and a target over time."""
+"""Coordinates of pixels, and targets over time."""

@@ -1,4 +1,4 @@
-"""What all targets of a flight err by alike: the map's place, the pose's, the boresight's.
+"""Errors that all targets of a flight share: of the map, the pose, and the boresight.
 
 A state that no sighting measures (Schmidt's consider state): it is carried beside every target and
 never shrinks, so that a hundred fixes of one place do not claim what the map cannot keep.

@@ -1,4 +1,4 @@
-"""What stands before ground that is known: where a look covers it, told by likelihood.
+"""Detects an object before known ground by a likelihood test.
 
 A car's outline on a zebra crossing is the crossing's as much as its own, and correlation follows
 the stripes. With the ground known, each place of the look is asked: is the picture there the look,

@@ -1,4 +1,4 @@
-"""What may be told of a target at all: on the map, at the depth that is seen, and not by a leap.
+"""Limits for reported targets: on the map, at the measured depth, and without jumps.
 
 A map with a hole under a car lets the car's rays meet what lies behind, hundreds of metres on. Each
 such place lies under its pixel and has a small covariance of its own; that it is wrong shows in
@@ -64,8 +64,8 @@ class _Leap:
 
 
 class LastPlace:
-    """Where a target was last told. Not thread-safe. confirm_ns: for so long its first sightings
-    must agree; a hole in the depth of the first pictures is gone by then.
+    """Last reported position of a target. Not thread-safe. confirm_ns: time over which its first
+    sightings must agree; a hole in the depth of the first frames is gone by then.
     """
 
     def __init__(self, confirm_ns: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Pixels to places: rays from the estimated pose, with covariance and every surface in reach.
+"""Locate pixels: rays from the estimated pose, with covariance and every surface in reach.
 
 Paper, Sec. 3.3.2 (end): a query pixel is mapped to the map by a ray from the estimated pose. At a
 roof's edge the errors of pose and pixel decide which surface that ray meets. So a bundle of rays is

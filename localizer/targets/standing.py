@@ -1,4 +1,5 @@
-"""Whether what stands at a place still looks as it did: its middle, and not the ground about it.
+"""Detects whether a standing target still looks as before: its middle, without the ground around
+it.
 
 A template of a parked car beside a zebra crossing is the crossing's more than the car's: it is
 found again with the car gone. So the middle alone is compared, with how it looked a second ago: the

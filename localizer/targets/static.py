@@ -1,4 +1,5 @@
-"""Where a target that stands still is: places that do not stay under its pixel die.
+"""Estimates the position of a standing target: hypotheses that do not stay under its pixel are
+dropped.
 
 Every surface that a sighting's bundle of rays meets begins a hypothesis, a point on that surface's
 plane. As the aircraft moves, all rays so far pull at each of them (parallax), and each must have
@@ -119,7 +120,7 @@ class _Hypothesis:
 
 
 class StaticTarget:
-    """Every place where a standing target may be; not thread-safe. map_sigma_m: of the surface."""
+    """All hypotheses of a standing target; not thread-safe. map_sigma_m: of the surface."""
 
     def __init__(self, map_sigma_m: float) -> None:
         self._map_sigma_m = map_sigma_m

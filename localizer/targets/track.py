@@ -1,4 +1,4 @@
-"""One target's life: standing or moving, seen, held by geometry, hidden; never told elsewhere.
+"""Track of one target: standing or moving, seen, held by geometry or hidden.
 
 A sighting feeds both what it would be if it stood still (`StaticTarget`) and if it moved
 (`TargetFilter`). It stands still until its rays deny that, and again after it has stood a while:

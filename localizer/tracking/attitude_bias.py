@@ -55,7 +55,7 @@ class AttitudePrior:
 
 @dataclass(frozen=True)
 class AttitudeBias:
-    """What the other sensors' roll and pitch are off by, as far as it is known.
+    """Estimated bias of the other sensors' roll and pitch.
 
     mean: (2,) rad about the two axes: true = turned by it from reported; covariance: (2, 2);
     spread: variance of what is no constant (rad²), a mean over `count` measurements; place: (2,)

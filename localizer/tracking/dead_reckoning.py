@@ -1,4 +1,4 @@
-"""Carrying the pose on from picture to picture while the map does not match.
+"""Propagates the pose from frame to frame while the map does not match.
 
 Snow, a building site, the map's edge: the picture is good and the map says nothing. The odometry
 keeps every accepted frame as a possible beginning, which costs nothing, and steps on from it when
@@ -46,7 +46,7 @@ def fallen_m(place: Array) -> float:
 
 
 class PropagationResult(Enum):
-    """What the odometry makes of a frame that the map rejected."""
+    """Result of the odometry for a frame that the map rejected."""
 
     NONE = "nothing to carry on from"
     CARRIED = "carried on"

@@ -1,4 +1,4 @@
-"""The dual-thread engine (paper, Sec. 3.2): rendering runs beside localization.
+"""The dual-thread engine (paper, Sec. 3.2): rendering runs parallel to localization.
 
 The localization thread takes the newest frame, registers it against the newest reference and
 publishes the estimate; meanwhile the next frame's features are extracted on a thread of their own.
@@ -158,7 +158,7 @@ class DualThreadEngine:
                 self._book.report(error)
 
     def _search_once(self) -> None:
-        """Search for the newest frame's place, as long as nobody knows it."""
+        """Search the newest frame's position while it is unknown."""
         frame = self._sought.take(_IDLE_S)
         if frame is None or self._searcher is None or self._knows_place():
             return
@@ -172,7 +172,9 @@ class DualThreadEngine:
         self._found = found
 
     def _needs_no_search(self) -> bool:
-        """Asked by a search all the time, which so tells that it goes on, however large the map."""
+        """Stop condition, which a running search calls continuously; the calls also show that it
+        does not hang.
+        """
         self._search_alive_ns = self._clock()
         return self._knows_place()
 
@@ -181,7 +183,9 @@ class DualThreadEngine:
         self._book.set_searching(begun_ns is not None)
 
     def _search_hangs(self) -> bool:
-        """Whether the search has stopped answering; whoever would wait for it reports that."""
+        """Whether the search has stopped calling its stop condition; callers report it instead of
+        waiting.
+        """
         alive_ns = self._search_alive_ns
         hangs = alive_ns is not None and self._clock() - alive_ns > _SEARCH_HANGS_NS
         self._book.set_search_hangs(hangs)
@@ -223,7 +227,9 @@ class DualThreadEngine:
             self._registers = registered
 
     def _localize(self, prepared: PrefetchedFrame) -> bool:
-        """Register a frame and publish the estimate; False where there is nothing to do it with."""
+        """Register a frame and publish the estimate; False if there is nothing to
+        register against.
+        """
         frame = prepared.frame
         self._seek(frame)
         if self._is_left_to_search() or not self._has_prior(frame.exposure_time_ns):

@@ -1,4 +1,4 @@
-"""What an engine's threads have done, and which error stands."""
+"""Counters of an engine's threads, and the current error."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class EngineHealth:
 
 
 class HealthBook:
-    """Where an engine's threads enter what they did; every method may be called by any of them."""
+    """Collects the threads' counters; every method may be called by any of them."""
 
     def __init__(self, renderer: str, features: str) -> None:
         self._health = EngineHealth(renderer=renderer, features=features)

@@ -31,7 +31,7 @@ class Mailbox(Generic[T]):
             return self._item is not None
 
     def put(self, item: T) -> bool:
-        """Place an item, over an older one that nobody took; never waits. False if closed."""
+        """Put an item, replacing an older one; never waits. False if closed."""
         with self._changed:
             if self._closed:
                 return False

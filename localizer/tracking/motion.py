@@ -176,7 +176,7 @@ def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | N
 
 @dataclass(frozen=True)
 class AuxiliarySensors:
-    """What other sensors (autopilot and gimbal) say of the camera; None where they do not know.
+    """Data of other sensors (autopilot and gimbal) about the camera; None where unknown.
 
     rotation_at: (3, 3) world_from_camera at a time in ns. displacement_between: the way (3,)
     between two times in world axes (m) with its sigma (m). height_at: the camera's height above
@@ -191,7 +191,7 @@ class AuxiliarySensors:
 
 
 class MeasuredMotion:
-    """The motion model, turned by another sensor's account of the camera's rotation."""
+    """The motion model with the camera's rotation from another sensor."""
 
     def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
         self._config, self._rotation_at = config, rotation_at

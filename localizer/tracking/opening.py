@@ -1,4 +1,4 @@
-"""From a map, a camera and a configuration to a localizer: the parts, opened and warmed up."""
+"""Opens a localizer for a map, a camera and a configuration: builds and warms up its parts."""
 
 from __future__ import annotations
 

@@ -242,7 +242,7 @@ class Localizer:
 
     @property
     def optimizer_name(self) -> str:
-        """What registers now, for reports: the CPU takes over where a GPU fails."""
+        """Name of the active backend, for reports; if a GPU fails, the CPU takes over."""
         return self._optimizer.backend.name
 
     @property
@@ -252,7 +252,7 @@ class Localizer:
 
     @property
     def attitude_bias(self) -> AttitudeBias | None:
-        """What the other sensors' roll and pitch are off by; None where they are not used."""
+        """Estimated bias of the other sensors' roll and pitch; None if they are not used."""
         return self._fusion.attitude_bias.bias
 
     @property
@@ -374,7 +374,7 @@ class Localizer:
         self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
-        """Features of the frame (does not need the reference, so it may run beside it)."""
+        """Features of the frame. They do not need the reference, so this may run in parallel."""
         undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom

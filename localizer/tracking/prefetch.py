@@ -50,7 +50,7 @@ class ProcessingTimes:
 
 
 class FeaturePrefetcher:
-    """Hands frames over, the newest first; those in front that are displaced are counted.
+    """Passes on the newest frame with its features; replaced frames are counted.
 
     extract: a frame's features. may: whether features may be extracted ahead now; where not, the
     newest frame is handed over without, once the taker waits for it.

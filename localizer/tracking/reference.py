@@ -1,4 +1,4 @@
-"""How long a reference view serves: as long as the camera sees nearly what it shows."""
+"""How long a reference view is used: while the camera's view is nearly the same."""
 
 from __future__ import annotations
 

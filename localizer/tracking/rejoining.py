@@ -28,7 +28,8 @@ _DRIFT_SIGMA_M = 0.2  # of the odometry over such a way
 
 @dataclass(frozen=True)
 class Rejoining:
-    """A run of the map's answers beside a carried pose: immutable, `with_answer` gives the next.
+    """A series of registrations compared with the propagated pose: immutable, `with_answer` gives
+    the next.
 
     begun: the run's first answer; carried: the odometry's position (3,) then.
     """

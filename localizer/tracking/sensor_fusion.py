@@ -37,8 +37,8 @@ CONTRADICTS = 4.0
 
 @dataclass(frozen=True)
 class FusedRegistration:
-    """A registration with what other sensors know. registration: its pose and covariance after the
-    update; contradicted: whether a sensor is so far off that it was left out.
+    """A registration fused with other sensors. registration: its pose and covariance after the
+    update; contradicted: whether a sensor differs so much that it was ignored.
     """
 
     registration: Registration
@@ -66,7 +66,7 @@ def with_map_error(result: Registration, height_sigma_m: float) -> Registration:
 def fused_registration(
     result: Registration, constraints: Iterable[PoseConstraint]
 ) -> FusedRegistration:
-    """The registration with what other sensors know of its pose, each taken in by itself."""
+    """Fuse the registration with the other sensors, one after another."""
     if result.status is not RegistrationStatus.OK:
         return FusedRegistration(result)
     pose, covariance, contradicted = result.world_from_camera, result.covariance, False
@@ -81,7 +81,7 @@ def fused_registration(
 
 
 class SensorFusion:
-    """Belongs to the localization thread.
+    """Use it on the localization thread.
 
     attitude, height_sigma_m: how well roll and pitch, and the height, are known; None: not used.
     map_kind: None where it is not known.

@@ -57,7 +57,7 @@ class TrackStatus:
         return TrackStatus(last_fix_ns=self.last_fix_ns)
 
     def proposed(self, independent: bool) -> TrackStatus:
-        """The same state, with a new place on trial. independent: see `TentativeTrack`."""
+        """The same status with a new tentative track. independent: see `TentativeTrack`."""
         return replace(
             self, accepted_in_row=0, tentative=True, independent=independent, tentative_track=None
         )

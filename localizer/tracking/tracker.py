@@ -1,4 +1,4 @@
-"""State shared by both threads: motion, track status, and the judgement of registrations."""
+"""State shared by both threads: motion, track status, and the test of registrations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from localizer.types import (
 
 @dataclass(frozen=True)
 class TrackerState:
-    """What the two halves share; replaced as a whole, never changed."""
+    """Shared state of both threads; immutable, replaced as one object."""
 
     motion: MotionState | None = None
     track_status: TrackStatus = field(default_factory=TrackStatus)
@@ -38,7 +38,7 @@ class TrackerState:
 
 @dataclass(frozen=True)
 class _Pose:
-    """What is given out of a frame: the map's answer, or the odometry's."""
+    """The published pose of a frame, from the map or from the odometry."""
 
     world_from_camera: Pose
     covariance: Array
@@ -48,7 +48,7 @@ class _Pose:
 
 
 class Tracker:
-    """Judges registrations, follows the motion, and propagates the pose without the map.
+    """Tests registrations, filters the motion, and propagates the pose without the map.
 
     `judge` belongs to the localization thread; the rest may be called from any. bridging: None
     where features are not in host memory.
@@ -75,13 +75,13 @@ class Tracker:
             return self._state
 
     def set_prior(self, prior: PosePrior) -> None:
-        """Begin (again) from a pose known from outside."""
+        """Start (again) from an external pose."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
             self._state = TrackerState(state, self._state.track_status.begun())
 
     def propose(self, prior: PosePrior) -> None:
-        """Put a place on trial; the state stays what it is."""
+        """Start a tentative track; the state does not change."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
             self._state = TrackerState(state, self._state.track_status.proposed(prior.independent))
@@ -108,7 +108,7 @@ class Tracker:
         anchors: Anchors | None,
         fused: FusedRegistration | None,
     ) -> PoseEstimate:
-        """Judge a registration and update motion and standing.
+        """Test a registration, and update motion and track status.
 
         seen, ahead: the state and its motion at the frame that the registration began from.
         anchors, fused: None where there is no reference view to register against.

@@ -1,1 +1,3 @@
-"""Alerts to the operator: identifiers with values. Text is made where they leave the process."""
+"""Alerts to the operator: identifiers with values. They become text where they leave
+the process.
+"""

@@ -39,7 +39,7 @@ class OutputAction(enum.IntEnum):
 
 
 class Inhibits(enum.Flag):
-    """What does not begin, or is not reported, while an alert is active."""
+    """What does not start, or is not reported, while an alert is active."""
 
     NOTHING = 0
     INJECTION = enum.auto()
@@ -89,7 +89,7 @@ class AlertSpec:
 
     @property
     def template(self) -> str:
-        """The text with what the action adds."""
+        """The text, with the prefix of its action."""
         held = "output held: " if self.action is not OutputAction.NONE else self.lead
         return f"{PREFIX}{held}{self.text}"
 
@@ -102,7 +102,9 @@ class AlertSpec:
 def event(
     of: AlertId, severity: Severity, text: str, kinds: dict[str, Kind], *rows: str, lead: str = ""
 ) -> AlertSpec:
-    """What happens once and does not end. rows: raised, meaning, operator."""
+    """Catalogue row of an alert that happens once and has no end. rows: raised,
+    meaning, operator.
+    """
     raised, meaning, operator = rows
     return condition(of, severity, text, kinds, raised, "", meaning, operator, lead=lead)
 
@@ -110,8 +112,8 @@ def event(
 def condition(
     of: AlertId, severity: Severity, text: str, kinds: dict[str, Kind], *rows: str, lead: str = ""
 ) -> AlertSpec:
-    """What lasts until it is cleared. rows: raised, cleared, meaning, operator, and cleared_text
-    where one is sent.
+    """Catalogue row of an alert that lasts until it is cleared. rows: raised, cleared, meaning,
+    operator, and cleared_text if one is sent.
     """
     raised, cleared, meaning, operator, *end = rows
     return AlertSpec(
@@ -130,5 +132,5 @@ class Alert:
 
     @property
     def key(self) -> AlertKey:
-        """Equal for alerts that differ in numbers only."""
+        """Equal for alerts that differ only in numbers."""
         return self.id, self.active, tuple(v for v in self.values if isinstance(v, str))

@@ -1,4 +1,4 @@
-"""The catalogue: one row for each alert, from which every text and table is made."""
+"""The catalogue: one row for each alert. All texts and tables are made from it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
 def spec_of(alert: Alert | AlertId) -> AlertSpec:
-    """Its row."""
+    """The catalogue row of an alert."""
     return CATALOGUE[alert.id if isinstance(alert, Alert) else alert]
 
 
 def alert(of: AlertId, **values: Value) -> Alert:
-    """An active alert with its values by name; ValueError for others than the catalogue names."""
+    """An active alert with values by name; ValueError for names that differ from the catalogue."""
     names = CATALOGUE[of].values
     if set(values) != set(names):
         raise ValueError(f"{of}: its values are {', '.join(names) or 'none'}, not {values}")
@@ -29,14 +29,14 @@ def alert(of: AlertId, **values: Value) -> Alert:
 
 
 def cleared(of: AlertId) -> Alert:
-    """The same alert when it has ended; ValueError for one whose end is not reported."""
+    """The ended alert; ValueError if its end is not reported."""
     if not CATALOGUE[of].reports_end:
         raise ValueError(f"{of}: its end has no text")
     return Alert(of, active=False)
 
 
 def severity(of: Alert) -> Severity:
-    """Of its text: what has ended is a notice."""
+    """Severity of the text; the end of an alert is a notice."""
     return spec_of(of).severity if of.active else Severity.NOTICE
 
 
@@ -51,13 +51,13 @@ def reason(of: Alert) -> str:
 
 
 def named(of: Alert) -> dict[str, Value | str]:
-    """Its values by name; another alert as its title."""
+    """The alert's values by name; another alert as its title."""
     shown = (CATALOGUE[v].title if isinstance(v, AlertId) else v for v in of.values)
     return dict(zip(spec_of(of).values, shown, strict=True)) if of.active else {}
 
 
 def text(of: Alert) -> str:
-    """The STATUSTEXT."""
+    """The STATUSTEXT of an alert."""
     spec = spec_of(of)
     if of.active:
         return spec.template.format(**named(of))

@@ -6,7 +6,7 @@ import enum
 
 
 class AlertId(str, enum.Enum):
-    """See `mavlink_bridge.alerts.catalogue` for what each one means."""
+    """Identifiers of alerts, explained in `mavlink_bridge.alerts.catalogue`."""
 
     # integrity monitor
     VIDEO_FROZEN = "video_frozen"

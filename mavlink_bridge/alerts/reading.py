@@ -1,4 +1,4 @@
-"""From a STATUSTEXT back to its alert, for programs on the ground that have only the text.
+"""Find the alert of a STATUSTEXT, for ground programs that have only the text.
 
 For recordings (`.tlog`), the simulator's ground station and records of version 0.1. No component of
 the flight process uses it: they have the alerts themselves.

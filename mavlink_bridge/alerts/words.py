@@ -1,4 +1,4 @@
-"""Values of alerts that are no measured numbers: each is one of a closed list."""
+"""Alert values that are no numbers: each is one of a closed list."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ Name = NewType("Name", str)
 
 
 class Word(str, enum.Enum):
-    """Shown as its value."""
+    """A value of a closed list, shown as its text."""
 
     def __str__(self) -> str:
         return str(self.value)
 
 
 class Output(Word):
-    """Whether positions are sent at that moment."""
+    """Whether positions are being sent."""
 
     INJECTING = "injecting"
     NOTHING = "nothing is injected"
 
 
 class SenderRefusal(Word):
-    """Why a system may give no orders: `bridge.ground_systems`, or signing."""
+    """Why commands of a system are refused: `bridge.ground_systems`, or signing."""
 
     NOT_ALLOWED = "not allowed"
     NOT_SIGNED = "not signed"
@@ -57,7 +57,7 @@ class CommandAnswer(Word):
 
     @classmethod
     def of(cls, result: int) -> CommandAnswer:
-        """Of a MAV_RESULT."""
+        """The answer of a MAV_RESULT."""
         known = mavlink.enums["MAV_RESULT"].get(result)
         name = "" if known is None else known.name.removeprefix("MAV_RESULT_")
         return cls.__members__.get(name, cls.UNKNOWN)
@@ -78,7 +78,7 @@ class RcChannel(int):
 
 
 class GnssProblem(Word):
-    """Why the EKF is to leave GNSS for vision."""
+    """Why the EKF should change from GNSS to vision."""
 
     LOST = "GNSS lost"
     GLITCH = "GNSS glitch"
@@ -86,7 +86,7 @@ class GnssProblem(Word):
 
 
 class ReturnCause(Word):
-    """Why the EKF is to return from vision to GNSS."""
+    """Why the EKF should return from vision to GNSS."""
 
     GNSS_GOOD = "GNSS good again"
     VISION_LOST = "vision lost, GNSS good"
@@ -117,7 +117,7 @@ class GnssDisagreement(Word):
 
 
 class CalibrationError(Word):
-    """In which sense the calibration is off, or about which axis."""
+    """Direction or axis of a calibration error."""
 
     LONG = "long"
     SHORT = "short"
@@ -142,7 +142,7 @@ class Direction(Word):
 
 
 class MapOffsetUse(Word):
-    """What is done with an offset of the map."""
+    """Whether an offset of the map is applied."""
 
     REPORTED = ""
     APPLIED = ", applied"
@@ -156,7 +156,7 @@ class ProcessFault(Word):
 
 
 class ClickRefusal(Word):
-    """Why a click begins no target."""
+    """Why no target is made of a click."""
 
     UNKNOWN = "position not known"
     UNCONFIRMED = "position not confirmed yet"

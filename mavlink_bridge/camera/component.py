@@ -1,4 +1,4 @@
-"""The camera component at work on one link: answers its commands, streams its status.
+"""The camera component on one link: answers commands and sends its status.
 
 Commands must be addressed to the camera component itself; ArduPilot does not pass tracking commands
 that are addressed to the autopilot.
@@ -57,13 +57,13 @@ _PER_TICK = 4  # targets: more in one go would fill a slow port, and positions w
 
 
 class _ClickRate:
-    """Of clicks: more in a while would end targets before they are found."""
+    """Limits the rate of clicks, because too many would end targets before they are located."""
 
     def __init__(self) -> None:
         self._times_ns: deque[int] = deque(maxlen=_MOST_CLICKS)
 
     def is_exceeded(self, time_ns: int) -> bool:
-        """Whether one more is too many; else it counts."""
+        """Whether one more click is too many; otherwise it is counted."""
         times = self._times_ns
         if len(times) == _MOST_CLICKS and time_ns - times[0] < _CLICKS_NS:
             return True
@@ -107,7 +107,7 @@ class CameraComponent:
 
     @property
     def targets(self) -> int:
-        """How many targets are reported on."""
+        """Number of reported targets."""
         return len(self._targets)
 
     def report(self, target: TargetReport) -> None:
@@ -115,7 +115,7 @@ class CameraComponent:
         self._targets[target.target_id] = target
 
     def forget(self, target_id: int) -> None:
-        """Report on that target no more."""
+        """Stop reporting that target."""
         self._targets.pop(target_id, None)
         for kind in ("image", "geo", "adsb"):
             self._sent_ns.pop((kind, target_id), None)
@@ -154,7 +154,7 @@ class CameraComponent:
             self._view = None
 
     def _capture(self, marks: Marks, now_ns: int, uptime_ms: int, send: Send) -> None:
-        """A mark on the map for each target once it is confirmed."""
+        """Send a marker for the map for each target when it is confirmed."""
         mark = marks.due(self._targets, now_ns)
         if mark is not None:
             utc_us = self._utc.utc_ns(mark.report.time_ns) // 1000
@@ -162,7 +162,8 @@ class CameraComponent:
             send(message, self._component)
 
     def _told(self) -> list[int]:
-        """Whom the camera protocol tells of: it knows one target, and no number of it.
+        """The target that the camera protocol reports; the protocol has room for one, without a
+        number.
 
         The one that the operator clicked last; without a click those that a detector sees take
         turns.
@@ -171,7 +172,7 @@ class CameraComponent:
         return [max(clicked)] if clicked else list(self._targets)
 
     def _due(self, kind: str, numbers: list[int], period_ns: int, now_ns: int) -> list[int]:
-        """Those whose message of that kind is due, the longest waiting first; noted as sent."""
+        """Targets whose message of that kind is due, the longest waiting first; noted as sent."""
         sent = {number: self._sent_ns.get((kind, number), 0) for number in numbers}
         waited = sorted(sent, key=lambda number: sent[number])
         due = [number for number in waited if now_ns - sent[number] >= period_ns][:_PER_TICK]
@@ -179,7 +180,7 @@ class CameraComponent:
         return due
 
     def command(self, message: Any, time_ns: int, uptime_ms: int, send: Send) -> bool:
-        """Answer a COMMAND_LONG to the camera; False when it is not for it."""
+        """Answer a COMMAND_LONG to the camera; False if it is for another component."""
         if message.target_component != self._component:
             return False
         result, number = self._execute(message, time_ns, uptime_ms, send), 0
@@ -222,7 +223,7 @@ class CameraComponent:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _is_repeated(self, message: Any, request: TrackRequest) -> bool:
-        """Whether a station that heard no answer asks again for what was begun already."""
+        """Whether a station without an answer repeats a request that was already accepted."""
         if self._last_click is None or not getattr(message, "confirmation", 0):
             return False
         system, command, last = self._last_click

@@ -1,4 +1,5 @@
-"""Cursor-on-Target: targets, the aircraft, its camera's wedge and video, for ATAK and WinTAK.
+"""Cursor-on-Target: targets, the aircraft, its camera's field of view and video, for ATAK and
+WinTAK.
 
 MITRE's "Cursor-on-Target Event Data Model" 2.0; `<sensor>` and `<__video>` as ATAK-CIV reads them.
 """
@@ -30,7 +31,7 @@ _STEEP_RAD = math.radians(-60.0)  # below it the picture's upper edge tells the 
 
 
 class CursorOnTarget:
-    """Sends targets, and the aircraft, to `cot_endpoint` over a socket of its own.
+    """Sends targets, and the aircraft, to `cot_endpoint` over its own socket.
 
     Any thread may call it.
     """
@@ -45,11 +46,11 @@ class CursorOnTarget:
         self._next_ns = 0
 
     def send(self, target: TargetReport) -> None:
-        """One event; what the network refuses is lost."""
+        """Send one event; events that the network refuses are lost."""
         self._write(cursor_on_target(target, self._config, self._utc))
 
     def look(self, view: CameraView) -> None:
-        """The aircraft and its camera, once a second where `cot_aircraft` has them."""
+        """Send aircraft and camera, once a second if `cot_aircraft` is set."""
         if not self._config.cot_aircraft:
             return
         with self._lock:
@@ -92,7 +93,7 @@ def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc
 def aircraft_on_map(
     view: CameraView, config: TargetsConfig, camera: CameraConfig, utc: SteadyUtc
 ) -> bytes:
-    """The aircraft's event: where it is, the wedge that its camera sees, and where the video is.
+    """The aircraft's event: position, field of view of the camera, and address of the video.
 
     The wedge's range is the way over the ground to the picture's centre, so that it ends there on
     the map; a camera that looks into the sky has none.

@@ -1,4 +1,4 @@
-"""Look-at: the gimbal turned to a place or a target by the autopilot, which holds it there.
+"""Look-at: commands the autopilot to point the gimbal at a position or a target.
 
 MAV_CMD_DO_SET_ROI_LOCATION (195) of the gimbal protocol v2, sent on to the autopilot as its gimbal
 manager; https://mavlink.io/en/services/gimbal_v2.html. ArduCopter turns the whole aircraft where
@@ -40,7 +40,7 @@ _PATIENCE_NS = 3_000_000_000  # for the autopilot's answer
 
 @dataclass(frozen=True)
 class _Place:
-    """degrees, metres above what the frame says."""
+    """degrees, metres above the frame's reference."""
 
     latitude_deg: float
     longitude_deg: float
@@ -49,8 +49,8 @@ class _Place:
 
 
 class LookAt:
-    """What the gimbal is to look at. Safe to use from any thread; `due` and `answered` are called
-    in the flight controller's.
+    """Target of the gimbal. Safe to use from any thread; `due` and `answered` are called in the
+    flight controller's.
 
     report: tells the operator.
     """
@@ -72,7 +72,7 @@ class LookAt:
         self._lock = threading.Lock()
 
     def report(self, target: TargetReport) -> None:
-        """Where a target is now."""
+        """Update the position of a target."""
         with self._lock:
             self._targets[target.target_id] = target
             if self._number and target.target_id == self._number:
@@ -88,7 +88,9 @@ class LookAt:
         self._report(alert(AlertId.LOOK_AT_ENDED, number=number))
 
     def command(self, message: Any) -> int:
-        """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is reported, too."""
+        """Process a COMMAND_LONG or COMMAND_INT of `LOOKS`; returns its MAV_RESULT. Refusals are
+        reported.
+        """
         refused = self._obey(message)
         if refused is None:
             return int(mavlink.MAV_RESULT_ACCEPTED)
@@ -96,7 +98,7 @@ class LookAt:
         return int(mavlink.MAV_RESULT_DENIED)
 
     def due(self, now_ns: int) -> tuple[int, int, int, int, float] | None:
-        """The COMMAND_INT that the autopilot is to get now: command, frame, x, y, z."""
+        """The COMMAND_INT to send to the autopilot now: command, frame, x, y, z."""
         with self._lock:
             if self._asked_ns is not None and now_ns - self._asked_ns > _PATIENCE_NS:
                 self._asked_ns = None
@@ -114,8 +116,8 @@ class LookAt:
             return (LOOK_AT_PLACE, wanted.frame, x, y, wanted.altitude_m)
 
     def answered(self, result: int) -> None:
-        """The autopilot's answer to a look-at. A refusal is reported and not tried again. An answer
-        without a question is ignored.
+        """Process the autopilot's answer to a look-at. A refusal is reported and the command is not
+        repeated. Unexpected answers are ignored.
         """
         with self._lock:
             if self._asked_ns is None:
@@ -127,7 +129,7 @@ class LookAt:
         self._report(alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.of(result)))
 
     def _obey(self, message: Any) -> Alert | None:
-        """Why not; None if it is done."""
+        """Why the command is refused; None if it was carried out."""
         if not self._allowed:
             return alert(AlertId.LOOK_AT_REFUSED, why=LookAtRefusal.OFF)
         if not self._has_gimbal:
@@ -169,7 +171,7 @@ class LookAt:
 
 
 def _place(message: Any) -> _Place | None:
-    """Of a MAV_CMD_DO_SET_ROI_LOCATION; None where it names none."""
+    """Position of a MAV_CMD_DO_SET_ROI_LOCATION; None if it has none."""
     if message.get_type() == "COMMAND_INT":
         latitude, longitude, altitude = message.x * 1e-7, message.y * 1e-7, message.z
         frame = int(message.frame)

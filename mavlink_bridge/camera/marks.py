@@ -1,4 +1,4 @@
-"""Marks on the ground station's map: each target once, as it is confirmed."""
+"""Markers on the ground station's map: one for each target when it is confirmed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MOST = 256  # remembered of targets that are gone, so that none that comes back
 
 @dataclass
 class TargetMark:
-    """A confirmed target's place as it is told. left: how often still."""
+    """Position of a confirmed target. left: number of times it is still to be sent."""
 
     report: TargetReport
     index: int
@@ -23,8 +23,8 @@ class TargetMark:
 
 
 class Marks:
-    """Which mark is due. Those of targets that are gone are forgotten beyond the newest 256, since
-    a detector names things again as long as it flies.
+    """Selects the next marker to send. Of ended targets only the newest 256 are remembered, because
+    a detector names targets without end.
     """
 
     def __init__(self, sigma_m: float) -> None:
@@ -36,7 +36,9 @@ class Marks:
         return len(self._marks)
 
     def due(self, targets: Mapping[int, TargetReport], now_ns: int) -> TargetMark | None:
-        """The one to send now, noted as sent; one at a time: a slow port carries positions."""
+        """The marker to send now, noted as sent; one at a time, because a slow port must carry
+        positions.
+        """
         for number, report in targets.items():
             if number not in self._marks and is_confirmed(report, self._sigma_m):
                 self._marks[number] = TargetMark(report, self._next)

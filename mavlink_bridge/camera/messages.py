@@ -1,4 +1,4 @@
-"""The camera itself in MAVLink camera protocol v2: what it is, where it looks, what it is asked.
+"""Messages of the camera in MAVLink camera protocol v2: description, view, requests.
 
 https://mavlink.io/en/services/camera.html
 """
@@ -117,7 +117,7 @@ def camera_fov_status(
 
 
 def track_request(message: Any, time_ns: int) -> TrackRequest | None:
-    """The operator's wish of a COMMAND_LONG or COMMAND_INT to the camera; None if it is none."""
+    """The track request of a COMMAND_LONG or COMMAND_INT to the camera; None if it is none."""
     if message.command == mavlink.MAV_CMD_CAMERA_TRACK_POINT:
         coordinates = (message.param1, message.param2)
         if not all(0.0 <= c <= 1.0 for c in coordinates):

@@ -1,4 +1,4 @@
-"""A target in MAVLink: its coordinates, its place in the picture, and its mark on the map.
+"""Messages about a target: its coordinates, its position in the image, and its marker on the map.
 
 CAMERA_TRACKING_GEO_STATUS is the standard for a target's coordinates;
 CAMERA_TRACKING_IMAGE_STATUS is what QGroundControl and Mission Planner draw; ADSB_VEHICLE is what
@@ -26,7 +26,7 @@ _ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's numbe
 
 
 def tracking_image_status(report: TargetReport | None) -> Any:
-    """CAMERA_TRACKING_IMAGE_STATUS (275): where the target is in the picture; None: idle."""
+    """CAMERA_TRACKING_IMAGE_STATUS (275): position of the target in the image; None: idle."""
     if report is None or (report.pixel is None and report.rectangle is None):
         active, mode = mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE, 0
         point, rectangle = (NAN, NAN), (NAN,) * 4
@@ -108,14 +108,14 @@ def image_captured(
 
 
 def is_confirmed(report: TargetReport, sigma_m: float) -> bool:
-    """Whether it is seen, known to `sigma_m`, and hardly on another surface."""
+    """Whether the target is seen, known to `sigma_m`, and probably on this surface."""
     accuracy = report.h_accuracy_m
     is_known = accuracy is not None and accuracy <= sigma_m
     return is_known and not report.coasting and report.elsewhere < _ELSEWHERE
 
 
 def _status(report: TargetReport) -> int:
-    """CAMERA_TRACKING_STATUS_FLAGS of a target that is alive."""
+    """CAMERA_TRACKING_STATUS_FLAGS of an active target."""
     active = int(mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE)
     return active | (mavlink.CAMERA_TRACKING_STATUS_FLAGS_COASTING if report.coasting else 0)
 

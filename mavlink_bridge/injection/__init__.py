@@ -1,1 +1,1 @@
-"""From vision fixes to what a flight controller fuses, and what became of them."""
+"""Convert vision fixes to messages for the flight controller, and check their effect."""

@@ -1,4 +1,4 @@
-"""Was it used? What was sent, held against what the EKF reports, and the reason why not."""
+"""Checks whether the EKF follows the sent positions, and why not."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_REPEATS = 5
 
 @dataclass(frozen=True)
 class LoopVerdict:
-    """Whether the EKF follows what is sent. reason: None while all is well.
+    """Whether the EKF follows the sent positions. reason: why not, else None.
 
     difference_m: median horizontal distance between sent and estimated position.
     """
@@ -43,7 +43,7 @@ class LoopVerdict:
 
 
 class ClosedLoopCheck:
-    """Remembers what was sent and judges; one thread."""
+    """Compares sent positions with the EKF's; one thread."""
 
     def __init__(self, message: InjectionMessage) -> None:
         self._message = message
@@ -65,7 +65,7 @@ class ClosedLoopCheck:
         sigma_m: float,
         reset_counter: int = 0,
     ) -> None:
-        """A position went out: valid at stamp_ns, NE metres from the EKF origin."""
+        """A position was sent: valid at stamp_ns, NE metres from the EKF origin."""
         if self._reset_counter not in (None, reset_counter):
             self._jump_ns = now_ns + _TAKES_NS
             self._announced_ns = now_ns
@@ -100,7 +100,7 @@ class ClosedLoopCheck:
         return LoopVerdict(reason is None, reason, difference)
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of everything that is remembered."""
+        """Lengths of the queues."""
         return {
             "sent": len(self._sent),
             "pending": len(self._pending),
@@ -128,7 +128,9 @@ class ClosedLoopCheck:
         return self._repeats <= _MOST_REPEATS
 
     def _compare(self, now_ns: int, local_at: Callable[[int], tuple[float, ...] | None]) -> None:
-        """Hold each sent position against the EKF's at the same time, once that has come."""
+        """Compare each sent position with the EKF's at the same time, when that has
+        been received.
+        """
         while self._pending and now_ns - self._pending[0][0] > _COMPARE_AFTER_NS:
             stamp_ns, north, east, sigma = self._pending.popleft()
             local = local_at(stamp_ns)

@@ -1,4 +1,4 @@
-"""From an estimate to the configured message of five, or to the reason why there can be none."""
+"""Encode an estimate as the configured one of five messages, or return why it cannot be sent."""
 
 from __future__ import annotations
 
@@ -44,8 +44,7 @@ _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 @dataclass(frozen=True)
 class EncodedEstimate:
-    """What is about to be sent. position: as propagated; quaternion: body to NED, None where it is
-    not known.
+    """An estimate to send. position: as propagated; quaternion: body to NED, None where unknown.
 
     fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
     another time: its velocity is no new measurement. protection_m: horizontal and vertical level.
@@ -62,7 +61,7 @@ class EncodedEstimate:
 
     @property
     def levels_m(self) -> tuple[float, float]:
-        """Horizontal and vertical protection level; from the covariance where nobody gave one."""
+        """Horizontal and vertical protection level; from the covariance if none is given."""
         if self.protection_m is not None:
             return self.protection_m
         p = self.position
@@ -70,12 +69,14 @@ class EncodedEstimate:
 
 
 def claimed_dilution(level_m: float) -> float:
-    """The dilution of precision that a receiver with such a protection level would report."""
+    """Dilution of precision of a GNSS receiver with this protection level."""
     return min(max(level_m / _METRES_PER_DOP, _LEAST_DOP), _MOST_DOP)
 
 
 def claimed_satellites(level_m: float, alert_limit_m: float) -> int:
-    """12 of a sure position down to 6 at the alert limit; 5, too few to arm, beyond it."""
+    """Number of satellites: 12 for a good position, falling to 6 at the alert limit; 5, too few to
+    arm, above.
+    """
     if level_m > alert_limit_m:
         return _ENOUGH_SATELLITES - 1
     spare = _BEST_SATELLITES - _ENOUGH_SATELLITES
@@ -156,9 +157,8 @@ def odometry(
 def vision_position_delta(
     before: tuple[VisionFix, Attitude], now: tuple[VisionFix, Attitude]
 ) -> Any | None:
-    """VISION_POSITION_DELTA (11011): how the vehicle moved and turned between two fixes, in body
-    axes at the second; None where its velocity is less certain than ArduPilot can be told: clipped,
-    the claim would be wrong.
+    """VISION_POSITION_DELTA (11011): motion and rotation between two fixes, in body axes at the
+    second; None if the velocity is less certain than the message can state.
 
     ArduPilot dates it VISO_DELAY_MS before its arrival.
     """
@@ -272,7 +272,7 @@ def external_position_estimate(
 
 @dataclass(frozen=True)
 class HeldOutput:
-    """Why nothing is sent although it is time. counter: the name it is counted under."""
+    """Why nothing is sent although it is due. counter: name of the counter."""
 
     reason: Alert
     counter: str
@@ -280,7 +280,7 @@ class HeldOutput:
 
 @dataclass(frozen=True)
 class EncodedMessage:
-    """One message to send, and the estimate it was made from."""
+    """A message to send, and its estimate."""
 
     message: Any
     estimate: EncodedEstimate
@@ -288,7 +288,7 @@ class EncodedMessage:
 
 @dataclass(frozen=True)
 class InjectionContext:
-    """What the injector must know about the vehicle. now: the origin and profile of this moment."""
+    """Vehicle data for the injector. now: the origin and profile at this time."""
 
     origin: Origin | None
     profile: FirmwareProfile
@@ -297,7 +297,7 @@ class InjectionContext:
 
 
 def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat.Quaternion | None:
-    """Vision attitude at time_ns: the fix's, turned as the autopilot turned since."""
+    """Vision's attitude at time_ns: that of the fix, rotated as the autopilot rotated since."""
     if time_ns == fix.time_ns or fix.quaternion is None:
         return fix.quaternion
     then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)
@@ -308,7 +308,7 @@ def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat
 
 
 class MessageMaker:
-    """Makes one message at a time of estimates; one thread."""
+    """Encodes estimates one after another; one thread."""
 
     def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
         self._config = config
@@ -354,7 +354,7 @@ class MessageMaker:
         now_ns: int,
         system_id: int,
     ) -> Any:
-        """The message where it has a latitude and a longitude; None for local ones."""
+        """The configured message if it has latitude and longitude; None for local ones."""
         if kind == "gps_input":
             week_ms = self._utc.gps_week_ms(e.position.time_ns)
             return gps_input(e, altitude_amsl_m, week_ms, self._config)
@@ -372,7 +372,7 @@ class MessageMaker:
         formula: CovarianceFormula,
         context: InjectionContext,
     ) -> EncodedMessage | HeldOutput:
-        """Velocity is rotated by the message's quaternion, so there must be one."""
+        """ODOMETRY. The velocity is in the frame of its quaternion, so the attitude is needed."""
         q = e.quaternion
         if q is None:
             now = context.attitude_at(e.position.time_ns)

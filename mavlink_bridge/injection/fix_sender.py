@@ -1,4 +1,4 @@
-"""Turns fixes from any thread into positions on the link, or reports why none is sent."""
+"""Sends fixes of any thread as positions on the link, or reports why none is sent."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _AIDING = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_GPS_GLITCHING
 
 
 class PositionCommand:
-    """Whether the autopilot fuses MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
+    """Tracks whether the autopilot accepts MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
 
     It says so by accepting the command while GNSS aids its EKF. ArduPilot 4.7 refuses it then and
     accepts it after the loss of GNSS, as a reset: streamed so, the vehicle landed after 8 s all the
@@ -49,7 +49,7 @@ class PositionCommand:
         self._held_ns = self._held_since_ns = 0  # fixes that were not sent
 
     def take(self, result: int, now_ns: int) -> None:
-        """The MAV_RESULT of one that was sent."""
+        """Note the MAV_RESULT of a sent command."""
         self.answer = CommandAnswer.of(result)
         is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
         if self._fuses is None:
@@ -58,11 +58,11 @@ class PositionCommand:
             self._accepted_ns = now_ns
 
     def flows(self, now_ns: int) -> bool:
-        """Whether commands are accepted: each fix is sent."""
+        """Whether the command is accepted, so that each fix is sent."""
         return bool(self._fuses) and now_ns - self._accepted_ns < _ANSWERED_NS
 
     def asks(self, state: VehicleState, now_ns: int) -> bool:
-        """Whether to send a fix although they are not, to hear what the autopilot says now."""
+        """Whether to send a fix as a test although the command was not accepted."""
         if now_ns - self._held_ns > _ASK_NS:
             self._held_since_ns = now_ns
         self._held_ns = now_ns
@@ -79,7 +79,7 @@ class PositionCommand:
         return True
 
     def is_held(self, now_ns: int) -> bool:
-        """Whether fixes were not sent for so long that an answer would have come."""
+        """Whether no fix was sent for longer than an answer takes."""
         is_recent = now_ns - self._held_ns < _ASK_NS
         return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
 
@@ -117,28 +117,30 @@ class FixSender:
         self._sent_ns: int | None = None  # to the flight controller
 
     def put(self, fix: VisionFix) -> None:
-        """Append a fix; the oldest is dropped where too many wait. Never blocks."""
+        """Queue a fix; the oldest is dropped if the queue is full. Never blocks."""
         self.dropped += len(self._fixes) == _QUEUE
         self._fixes.append(fix)
 
     def take(self, now_ns: int) -> None:
-        """The fixes that came since the last call, oldest first."""
+        """The fixes since the last call, oldest first."""
         while self._fixes:
             self.injector.submit(self._fixes.popleft(), now_ns)
 
     def acknowledged(self, link: Link, ack: Any, now_ns: int) -> None:
-        """A COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE; a ground station sends that command, too."""
+        """Process a COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE. A ground station may also send that
+        command.
+        """
         ours = ack.target_system in (0, link.system_id)
         if self._command is not None and ours and ack.target_component in (0, self._component):
             self._command.take(ack.result, now_ns)
 
     def rebooted(self) -> None:
-        """The autopilot starts over."""
+        """Reset after a reboot of the autopilot."""
         self.injector.guard.reset()
         self._command = None if self._command is None else PositionCommand()
 
     def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
-        """Send what is due if the mode allows it, else report why not. mode: not ``off``."""
+        """Send what is due if the mode allows it, otherwise report why not. mode: not ``off``."""
         profile = select_profile(state.autopilot, state.version)
         context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)
         injection = self.injector.step(now_ns, context)
@@ -164,14 +166,14 @@ class FixSender:
             self._teller.tell_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
-        """Whether positions came lately (and were sent, in mode ``inject``), and the yaw guard does
-        not block.
+        """Whether positions were received lately (and sent, in mode ``inject``), and the yaw guard
+        does not block.
         """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
     def reaches_ekf(self, now_ns: int) -> bool:
         """Whether positions were sent to the flight controller lately: not in shadow mode, while
-        output is held, or while the port takes none.
+        output is held, or while the port is full.
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
 
@@ -181,13 +183,13 @@ class FixSender:
 
     @property
     def refusal(self) -> Alert | None:
-        """Why due positions are not sent, once that has lasted and was reported; else None."""
+        """Why due positions are not sent, if this has lasted and was reported; else None."""
         reported = self._teller.reported("inject")
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of everything that waits here."""
+        """Lengths of the queues."""
         return {"fixes": len(self._fixes), "due": self.injector.waiting}
 
     def _deliver(

@@ -1,4 +1,6 @@
-"""Warnings about late, unchecked or undated fixes and about firmware, each reported once."""
+"""Warnings about late or unchecked fixes, a wrong clock and unknown firmware, each
+reported once.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ _IN_TIME_S = 15.0  # until lateness is over; a computer at its limit is late and
 
 
 class FixWarnings:
-    """Looks at the injector and the computer's clock; one thread."""
+    """Checks the injector and the computer's clock; one thread."""
 
     def __init__(self, shared: Shared, injector: Injector, teller: StatusNotifier) -> None:
         self._config = shared.config.injection
@@ -27,7 +29,7 @@ class FixWarnings:
         self._teller = teller
 
     def firmware(self, state: VehicleState, profile: FirmwareProfile) -> None:
-        """A firmware that is unknown, or does not take the configured message."""
+        """Report firmware that is unknown or does not support the configured message."""
         if not state.connected or state.version is None:
             return
         problem = None
@@ -39,7 +41,7 @@ class FixWarnings:
         self._teller.tell("profile", problem)
 
     def fixes(self, profile: FirmwareProfile, now_ns: int) -> None:
-        """Fixes that are late, that nothing checks, or that cannot be stamped."""
+        """Report fixes that are late, not checked, or without a valid time."""
         tell = self._teller.tell
         late = self._latency(profile)
         relief = alert(AlertId.FIXES_IN_TIME)

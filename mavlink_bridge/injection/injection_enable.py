@@ -1,4 +1,4 @@
-"""Mode ``rc``: an RC channel or a command decides between shadow and inject."""
+"""Mode ``rc``: an RC channel or a command selects shadow or inject."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COMMANDS = {
 
 
 class InjectionEnable:
-    """The last order decides: the RC channel when it is moved, or a command.
+    """The newest order is valid: a move of the RC channel, or a command.
 
     If the RC receiver goes silent, injection continues: without a position, ArduPilot would land
     instead of returning. Any thread may call.
@@ -70,7 +70,7 @@ class InjectionEnable:
         self._changed(self._at_start)
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """The end; of an orderly one nothing is remembered."""
+        """Stop; a clean shutdown keeps nothing for a restart."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
@@ -80,7 +80,7 @@ class InjectionEnable:
         return self._open
 
     def channels(self, pulses_us: Sequence[int]) -> None:
-        """RC_CHANNELS came: a channel that crossed its threshold decides."""
+        """Process RC_CHANNELS: a channel that crosses its threshold enables or disables."""
         number = self._config.channel
         pulse = pulses_us[number - 1] if len(pulses_us) >= number else 0
         if not _PULSE_US[0] <= pulse <= _PULSE_US[1]:
@@ -95,7 +95,7 @@ class InjectionEnable:
             self._set(bool(self._high), RcChannel(number))
 
     def command(self, command: int, wanted: float) -> int:
-        """A command to the localizer's component; the MAV_RESULT to acknowledge it with.
+        """Process a command to the localizer's component; returns the MAV_RESULT.
 
         wanted: its param1, 1 opens and 0 closes.
         """

@@ -1,4 +1,4 @@
-"""From vision fixes to the messages that a flight controller fuses.
+"""Converts vision fixes to messages that a flight controller fuses.
 
 Timing. A fix is sent when its age reaches `delay_ms`, the value that ArduPilot is told
 (VISO_DELAY_MS, GPSn_DELAY_MS), so the least latency it sees is exactly that; a late fix goes out at
@@ -43,18 +43,18 @@ _AGES = 50
 
 
 class Latency:
-    """Ages of the last 50 fixes, from exposure to when they came, milliseconds."""
+    """Ages of the last 50 fixes at their arrival, from exposure, milliseconds."""
 
     def __init__(self) -> None:
         self._ages_ms: deque[float] = deque(maxlen=_AGES)
 
     def take(self, age_ms: float) -> None:
-        """Of one fix."""
+        """Add the age of a fix."""
         self._ages_ms.append(age_ms)
 
     @property
     def is_known(self) -> bool:
-        """Whether enough fixes came to judge by."""
+        """Whether there are enough fixes."""
         return len(self._ages_ms) == _AGES
 
     @property
@@ -64,12 +64,12 @@ class Latency:
 
     @property
     def least_ms(self) -> float | None:
-        """Of the youngest; None before the first fix."""
+        """Age of the youngest; None before the first fix."""
         return min(self._ages_ms, default=None)
 
 
 class _FixRate:
-    """How often fixes come of age, and whether the next one should have."""
+    """Interval at which fixes reach the age `delay_ms`, and whether the next one is overdue."""
 
     def __init__(self, overdue_intervals: float) -> None:
         self._overdue_intervals = overdue_intervals
@@ -77,19 +77,19 @@ class _FixRate:
         self._taken_ns = 0
 
     def note(self, time_ns: int, last_ns: int | None, now_ns: int) -> None:
-        """A fix of time_ns was taken now, after one of last_ns."""
+        """A fix of time_ns was used now, after one of last_ns."""
         self._taken_ns = now_ns
         if last_ns is not None and time_ns - last_ns < _STALE_NS:
             self._intervals_ns.append(time_ns - last_ns)
 
     @property
     def next_ns(self) -> int | None:
-        """When the next fix comes of age if it comes as usual; None while that is not known."""
+        """When the next fix reaches its age, at the usual interval; None while unknown."""
         usual = self._usual_ns()
         return None if usual is None else self._taken_ns + round(usual)
 
     def overdue(self, now_ns: int) -> bool:
-        """Whether the next fix should have come by now, judged by the usual interval."""
+        """Whether the next fix is late, by the usual interval."""
         usual = self._usual_ns()
         return usual is not None and now_ns - self._taken_ns > self._overdue_intervals * usual
 
@@ -100,14 +100,14 @@ class _FixRate:
 
 
 class WithheldMotion:
-    """How the vehicle moves while its position is withheld, from fix to fix."""
+    """Motion of the vehicle from fix to fix while its position is withheld."""
 
     def __init__(self) -> None:
         self._before: VisionFix | None = None
         self._message: Any | None = None
 
     def note(self, fix: VisionFix, now_ns: int, context: InjectionContext) -> None:
-        """A fix came of age whose position is withheld."""
+        """A fix with a withheld position reached its age."""
         before, self._before = self._before, fix
         late = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
         if before is None or late or not context.profile.position_delta:
@@ -123,7 +123,7 @@ class WithheldMotion:
 
 
 class Injector:
-    """Turns fixes into a steady stream of injections. One thread calls `submit` and `step`."""
+    """Sends fixes at a steady rate. One thread calls `submit` and `step`."""
 
     def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
         self._config = config
@@ -159,16 +159,18 @@ class Injector:
 
     @property
     def waiting(self) -> int:
-        """How many fixes are not of age yet."""
+        """Number of fixes that have not reached their age."""
         return len(self._waiting)
 
     @property
     def refused_yaw_rad(self) -> float | None:
-        """The yaw difference for which the guard blocks injection; None while it does not."""
+        """Yaw difference for which the guard blocks injection; None while it does not."""
         return self.yaw_difference_rad if self.guard.blocked else None
 
     def submit(self, fix: VisionFix, now_ns: int) -> None:
-        """Queue a fix; one that is late by seconds, from the future or out of order is dropped."""
+        """Queue a fix. Fixes that are late by seconds, from the future or out of order
+        are dropped.
+        """
         unusable = self._unusable(fix, now_ns)
         if unusable is not None:
             self.counters[unusable] += 1
@@ -181,7 +183,7 @@ class Injector:
         self._waiting.append(fix)
 
     def _unusable(self, fix: VisionFix, now_ns: int) -> str | None:
-        """Why a fix is dropped at once (the name it is counted under), or None."""
+        """Why a fix is dropped at once (name of its counter), or None."""
         if fix.time_ns <= self._newest_ns:
             return "fixes_out_of_order"
         if fix.time_ns > now_ns + _FUTURE_SLACK_NS:
@@ -189,16 +191,16 @@ class Injector:
         return "fixes_stale" if now_ns - fix.time_ns > _STALE_NS else None
 
     def announce_jump(self) -> None:
-        """Raise the reset counter with the next message, whichever fix it is made of."""
+        """Increment the reset counter with the next message."""
         self._announced += 1
 
     def skip(self) -> None:
-        """Nothing can be sent now: forget what waits."""
+        """Nothing can be sent now: clear the queue."""
         self._waiting.clear()
         self._fresh = None
 
     def step(self, now_ns: int, context: InjectionContext) -> EncodedMessage | None:
-        """What to send now, if anything."""
+        """The message to send now, or the reason why none is."""
         self._take_due(now_ns, context)
         outcome = self._next(now_ns, context)
         if outcome is None:
@@ -253,9 +255,9 @@ class Injector:
         return self._last_slot_ns + self._least_gap_ns
 
     def _fill_due_ns(self) -> int:
-        """A propagated message goes so early that the next fix need not wait for it, or not at all:
-        a fix that comes later than the delay is fused where the EKF is by then, as far beside its
-        own place as the aircraft flew meanwhile. It waits for a late fix for half a period, once.
+        """When the next propagated message is due. It goes so early that the next fix need not wait
+        for it, or not at all: a fix that is sent late is fused at the EKF's position of that time,
+        which is wrong by the distance flown. For a late fix it waits half a period, once.
         """
         due = self._waiting[0].time_ns + self._delay_ns if self._waiting else self._pace.next_ns
         if due is None or due <= self._last_slot_ns:

@@ -25,7 +25,7 @@ _GO_NS = 600_000_000_000
 
 
 class ShadowInterlock:
-    """Judges with each step of the injection; one thread.
+    """Decides at each step of the injection; one thread.
 
     force: `bridge.injection.force`. score: the shadow's verdict now. compared_ns: when a fix was
     last compared with GNSS, 0 never. memory: of what spoke against the map, over a restart.
@@ -58,13 +58,13 @@ class ShadowInterlock:
             self._teller.report(self._against)
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """The end; of an orderly one nothing is remembered."""
+        """Stop; a clean shutdown keeps nothing for a restart."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
-        """The mode that is allowed. by_pilot: the pilot enabled it in mode ``rc``, which is obeyed
-        and reported if the shadow check has not passed.
+        """The mode that is allowed. by_pilot: the pilot enabled injection in mode ``rc``; this is
+        followed, and reported if the shadow check has not passed.
         """
         self._judge(state, now_ns)
         if wanted != "inject":
@@ -78,15 +78,15 @@ class ShadowInterlock:
         return "inject" if self._open else "shadow"
 
     def _remember(self) -> None:
-        """Not while it injects: injection that has begun is not revoked, neither by a restart nor
-        by a receiver that is spoofed meanwhile.
+        """Keep the failure for a restart, unless injection runs: injection that has started is not
+        stopped by a restart or a spoofed receiver.
         """
         if self._memory is not None:
             self._memory.note(not self._open and self._against is not None)
 
     @property
     def reason(self) -> Alert | None:
-        """Why nothing is injected in mode ``inject``; None when that is not the reason."""
+        """Why nothing is injected in mode ``inject``; None if the interlock is not the reason."""
         if self._open:
             return None
         if self.inhibited_by:
@@ -95,7 +95,7 @@ class ShadowInterlock:
         return self._reason
 
     def may_switch(self, now_ns: int) -> bool:
-        """Whether the EKF may switch to vision: verified lately, or there was no GNSS to do so."""
+        """Whether the EKF may switch to vision: it was verified lately, or there never was GNSS."""
         if self._force:
             return True
         if self.inhibited_by:
@@ -110,7 +110,7 @@ class ShadowInterlock:
         return before_last_ns <= _BEFORE_LAST_NS and now_ns - self._go_ns <= _GO_NS
 
     def _may_begin(self, now_ns: int, *, by_pilot: bool) -> bool:
-        """Whether injection may begin; reports why it begins unverified. Never revoked."""
+        """Whether injection may start; reports a start without verification. Never revoked."""
         since_ns = self._without_since_ns
         without = since_ns is not None and now_ns - since_ns >= _WITHOUT_GNSS_NS
         if self._recent_go(now_ns) and not self.inhibited_by:
@@ -126,7 +126,7 @@ class ShadowInterlock:
         return True
 
     def _judge(self, state: VehicleState, now_ns: int) -> None:
-        """Take in GNSS, and the score once a second."""
+        """Update with GNSS, and with the score once a second."""
         if gnss_healthy(state, now_ns) or not state.connected:
             self._without_since_ns = None
         elif self._without_since_ns is None:

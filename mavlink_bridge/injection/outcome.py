@@ -22,7 +22,7 @@ _RECEIVER_LATE_NS = 200_000_000  # from what it measured to the arrival of its r
 
 
 class InjectionOutcome:
-    """Keeps recent positions, made and sent, for both checks; one thread.
+    """Keeps recent positions, computed and sent, for both checks; one thread.
 
     verdict: the last one; None while nothing is sent or it is too early. ekf_ok_inhibited_by:
     alerts for which "the EKF follows" is not reported. compared_ns: exposure of the last fix that
@@ -49,7 +49,7 @@ class InjectionOutcome:
             self._to_compare.append(estimate.position)
 
     def sent(self, estimate: EncodedEstimate, now_ns: int) -> None:
-        """An estimate went to the flight controller."""
+        """An estimate was sent to the flight controller."""
         origin, position = self._origin.origin, estimate.position
         if origin is None:
             return
@@ -69,8 +69,8 @@ class InjectionOutcome:
         )
 
     def compare(self, state: VehicleState, now_ns: int, *, on_gnss: bool | None) -> None:
-        """Score against the EKF's position at the same time, while GNSS made that; against the
-        receiver's own where it is not known what made the EKF's (None).
+        """Compare fixes with the EKF's position at the same time while the EKF uses GNSS; with the
+        receiver's position if the EKF's source is unknown (None).
         """
         while self._to_compare and now_ns - self._to_compare[0].time_ns > _REFERENCE_WAIT_NS:
             fix = self._to_compare.popleft()
@@ -94,15 +94,15 @@ class InjectionOutcome:
         return True
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of everything that waits here."""
+        """Lengths of the queues."""
         return {"to compare": len(self._to_compare), **self._loop.waiting()}
 
 
 def _by_receiver(
     state: VehicleState, fix: PropagatedFix, altitude_m: float
 ) -> tuple[float, float, float] | None:
-    """The receiver's place, brought to a fix's time by its velocity, as latitude, longitude and the
-    altitude AMSL that is given; None where it says none.
+    """The receiver's position, extrapolated to a fix's time by its velocity: latitude, longitude
+    and the given altitude AMSL; None if it has none.
     """
     if state.gps_latitude_deg is None or state.gps_longitude_deg is None:
         return None

@@ -1,4 +1,4 @@
-"""Fixes carried forward in time: a constant-velocity Kalman filter over the fixes alone.
+"""Propagates fixes in time with a constant-velocity Kalman filter of the fixes.
 
 The autopilot's own velocity is not used: what is injected must not contain what the injection
 itself produced, or the EKF would be told its own opinion.
@@ -51,7 +51,7 @@ class PropagatedFix:
 
 
 def grown_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, float] | None:
-    """The fix's protection levels, grown as its sigmas grew on the way to another time."""
+    """The fix's protection levels, increased as its sigmas are by propagation."""
     if fix.protection_m is None:
         return None
     begun = (fix.horizontal_sigma_m, fix.vertical_sigma_m)
@@ -64,7 +64,7 @@ def grown_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, flo
 
 
 class FixPropagator:
-    """Estimates velocity from fixes and carries the newest fix to a wanted time.
+    """Estimates velocity from fixes and propagates the newest fix to a wanted time.
 
     The propagated position starts at the newest fix itself, not at the filter's smoothed state, and
     its covariance is that fix's plus what the unknown velocity and acceleration add: smoothing here
@@ -84,7 +84,7 @@ class FixPropagator:
         return self._fix
 
     def update(self, fix: VisionFix) -> None:
-        """Take in a fix newer than all before."""
+        """Add a fix that is newer than all before."""
         R = fix.position_covariance_ned + self._floor
         last, self._fix = self._fix, fix
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
@@ -104,7 +104,7 @@ class FixPropagator:
             self._filter.update(z, R=R)
 
     def at(self, time_ns: int) -> PropagatedFix | None:
-        """The newest fix carried to `time_ns`; None before the first."""
+        """The newest fix propagated to `time_ns`; None before the first."""
         fix, kalman = self._fix, self._filter
         if fix is None or kalman is None:
             return None

@@ -1,4 +1,4 @@
-"""What is remembered over a restart: a small file, and when it is too old to count.
+"""State that a restarted process reads from a small file, and the age limit of that state.
 
 A companion that is killed under denial and comes back with its gate closed would leave the vehicle
 without a position: LAND. One that had seen its map 20 m beside GNSS and comes back once that is
@@ -27,8 +27,8 @@ _STOP_S = 2.0
 
 
 class RestartMemory:
-    """What holds now, for a process that takes over from one that was killed. Reads once; writes in
-    a thread of its own, so that a disk that does not respond stalls nobody.
+    """A state for the process that replaces one that was killed. Reads once; writes in its own
+    thread, so that a disk that hangs stalls no other thread.
 
     about: what it holds of, empty where that is always the same; what was kept of another counts
     for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the
@@ -54,9 +54,7 @@ class RestartMemory:
         self._thread.start()
 
     def recall(self) -> tuple[dict[str, Any], float] | None:
-        """What was kept, and how long ago that was last true, s; None if nothing was, or nothing
-        that may be trusted.
-        """
+        """The stored state and its age, s; None if there is none or it cannot be trusted."""
         self._in_use = True
         try:
             status = os.lstat(self._path)
@@ -77,19 +75,19 @@ class RestartMemory:
         return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
 
     def keep(self, told: dict[str, Any]) -> None:
-        """This is true from now on."""
+        """Store this state from now on."""
         self._in_use = True
         self._told = told
         self._wake.set()
 
     def drop(self) -> None:
-        """Nothing is from now on."""
+        """Store no state from now on."""
         self._told = None
         self._wake.set()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """End the thread. An orderly end is the pilot's: nothing is remembered of it. After another
-        one the next process takes over, as after a kill; who says so first is believed.
+        """End the thread. After a clean shutdown the state is removed, otherwise it is kept for the
+        next process. The first call counts.
 
         A standby that never flew leaves the file alone: it is of the process that flies.
         """
@@ -129,21 +127,21 @@ class RestartMemory:
                 return
 
     def _write(self, told: dict[str, Any]) -> None:
-        """Whole or not at all."""
+        """Replace the file atomically."""
         stamps = {"utc_s": self._wall_s(), "boot": self._boot, "clock_s": self._clock_s()}
         about = {"about": self.about} if self.about else {}
         replace_file(self._path, json.dumps(told | about | stamps), durable=True)
 
 
 class InjectionEnableMemory:
-    """Of the gate that is open; see `RestartMemory`."""
+    """Remembers that injection is enabled; see `RestartMemory`."""
 
     def __init__(self, memory: RestartMemory) -> None:
         self._memory = memory
 
     def recall(self) -> tuple[bool, float] | None:
-        """Whether the gate was opened by a channel (else by a command), and how long ago that was
-        last true, s; None if it was closed, or nothing is known that may be trusted.
+        """Whether a channel (else a command) enabled injection, and the state's age, s; None if it
+        was disabled or the file cannot be trusted.
         """
         found = self._memory.recall()
         if found is None or found[0].get("open") is not True:
@@ -151,27 +149,27 @@ class InjectionEnableMemory:
         return found[0].get("by_channel") is True, found[1]
 
     def opened(self, *, by_channel: bool) -> None:
-        """The gate is open from now on."""
+        """Injection is enabled from now on."""
         self._memory.keep({"open": True, "by_channel": by_channel})
 
     def closed(self) -> None:
-        """The gate is closed from now on."""
+        """Injection is disabled from now on."""
         self._memory.drop()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """The end; see `RestartMemory.stop`."""
+        """Stop; see `RestartMemory.stop`."""
         self._memory.stop(clean_shutdown=clean_shutdown)
 
 
 class ShadowFailureMemory:
-    """Of a shadow score that spoke against the map; see `RestartMemory`."""
+    """Remembers a failed shadow check; see `RestartMemory`."""
 
     def __init__(self, memory: RestartMemory) -> None:
         self._memory = memory
         self._kept = False
 
     def recall(self) -> bool:
-        """Whether it spoke against the map in the process before."""
+        """Whether the shadow check had failed in the previous process."""
         found = self._memory.recall()
         told = None if found is None else found[0].get("against")
         of_0_1 = isinstance(told, str) and bool(told) and told.isprintable()  # the reason
@@ -180,7 +178,7 @@ class ShadowFailureMemory:
         return against
 
     def note(self, against: bool) -> None:
-        """Whether it speaks against the map now."""
+        """Whether the shadow check has failed."""
         if against == self._kept:
             return
         self._kept = against
@@ -190,5 +188,5 @@ class ShadowFailureMemory:
             self._memory.drop()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """The end; see `RestartMemory.stop`."""
+        """Stop; see `RestartMemory.stop`."""
         self._memory.stop(clean_shutdown=clean_shutdown)

@@ -81,7 +81,9 @@ class ShadowScorer:
         self._samples: deque[tuple[int, float, float, float, float]] = deque(maxlen=_LENGTH)
 
     def compare(self, fix: PropagatedFix, reference: tuple[float, ...]) -> None:
-        """A fix, and the autopilot's (latitude, longitude, altitude AMSL) at the same time."""
+        """Compare a fix with the autopilot's (latitude, longitude, altitude AMSL) at
+        the same time.
+        """
         difference = np.array(
             north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
         )
@@ -93,7 +95,7 @@ class ShadowScorer:
             self._samples.append((fix.time_ns, north, east, distance, up))
 
     def score(self, now_ns: int, refused_yaw_rad: float | None) -> ShadowScore:
-        """The verdict on the last two minutes. refused_yaw_rad: `Injector.refused_yaw_rad`."""
+        """The result of the last two minutes. refused_yaw_rad: `Injector.refused_yaw_rad`."""
         with self._lock:
             samples = np.array([s for s in self._samples if now_ns - s[0] < _WINDOW_NS])
         if not len(samples):

@@ -1,4 +1,4 @@
-"""When to change the EKF's source set: away from bad GNSS soon, back late or never.
+"""Decides when to change the EKF's source set: soon away from bad GNSS, late back to GNSS.
 
 Measured: switched before GNSS goes the vehicle moves 1.2 m at most; a jammed receiver without a
 switch ends in LAND after 4.6 s with up to 87 m of error.
@@ -78,7 +78,7 @@ def _apart_m(a: _Place, b: _Place) -> float:
 
 
 def _inconsistent_m(state: VehicleState, vision: PropagatedFix | None, sigmas: float) -> float:
-    """How far GNSS and vision are apart where that is more than both errors allow, else 0."""
+    """Difference of GNSS and vision if it exceeds both errors, else 0."""
     receiver = _receiver(state)
     if vision is None or receiver is None:
         return 0.0
@@ -99,8 +99,8 @@ def _ekf_is_with_vision(state: VehicleState, vision: PropagatedFix) -> bool:
 
 @dataclass(frozen=True)
 class GnssFault:
-    """What is wrong with GNSS. proven: more than vision speaks against it. metres: how far it is
-    from vision where that is the cause.
+    """What is wrong with GNSS. proven: evidence other than vision shows it. metres: difference from
+    vision if that is the cause.
     """
 
     cause: GnssProblem
@@ -109,7 +109,7 @@ class GnssFault:
 
     @property
     def is_of_receiver(self) -> bool:
-        """Whether GNSS alone shows it, without vision."""
+        """Whether GNSS alone shows the fault, without vision."""
         return not self.metres
 
 
@@ -148,19 +148,19 @@ class SourceSwitch:
         self._next_ns = 0
 
     def reset(self) -> None:
-        """The flight controller rebooted: it starts with its first set."""
+        """The flight controller rebooted: it uses its first set."""
         self.current, self._ordered = self._config.gnss_set, None
         self._bad_since_ns = self._sound_since_ns = None
         self._was_chosen = self._overruled = False
 
     def met_in_flight(self) -> None:
-        """The first heartbeat was of a vehicle in flight: its source set is unknown."""
+        """The first heartbeat was of an armed vehicle: its source set is unknown."""
         self.current = None
 
     def chosen(self, source_set: int) -> None:
-        """The autopilot says which set it uses from now on. Where that is no order of ours, it is
-        the pilot's choice, and not undone: a vision set stays, and so does the set of GNSS as long
-        as the fault lasts at which he chose it.
+        """The autopilot reports the set that it uses. If it is not our order, it is the pilot's
+        choice and stays: a vision set always, a GNSS set as long as the fault at which it was
+        chosen.
         """
         if source_set in (self.current, self._ordered):
             return
@@ -168,7 +168,7 @@ class SourceSwitch:
         self._overruled = self._bad_since_ns is not None
 
     def acknowledged(self, accepted: bool) -> bool:
-        """COMMAND_ACK; whether it answers an order."""
+        """Process a COMMAND_ACK; returns whether it answers an order."""
         if self._ordered is None:
             return False
         if accepted:
@@ -185,8 +185,8 @@ class SourceSwitch:
         good: bool,
         may_switch: bool,
     ) -> SwitchOrder | None:
-        """What to order now. good: fixes are being sent, and the yaw guard is content. may_switch:
-        the shadow score of this flight was a go.
+        """The order to send now. good: fixes are being sent and pass the yaw guard. may_switch: the
+        shadow check of this flight has passed.
         """
         self.refusal = None
         fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
@@ -260,7 +260,7 @@ class SourceSwitch:
 
 
 class SourceOrders:
-    """Carries out what `SourceSwitch` decides; one thread."""
+    """Sends the decisions of `SourceSwitch`; one thread."""
 
     def __init__(
         self,
@@ -280,14 +280,14 @@ class SourceOrders:
 
     @property
     def current(self) -> int | None:
-        """The source set that the flight controller uses, by its acknowledgements and its own
-        words; None where it is not known.
+        """The source set of the flight controller, by its acknowledgements and texts; None if
+        unknown.
         """
         return self._switch.current
 
     @property
     def on_gnss(self) -> bool:
-        """Whether the flight controller is known to use the set of GNSS."""
+        """Whether the flight controller is known to use the GNSS set."""
         return self.current == self._gnss_set
 
     @property
@@ -296,8 +296,8 @@ class SourceOrders:
         return self._switch.returning.refusal is not None
 
     def met(self, state: VehicleState) -> None:
-        """The first message of the vehicle. An ArduPilot in flight may be on any source set (this
-        process was restarted); on the ground it has started with its first.
+        """The first message of the vehicle. An armed ArduPilot may use any source set (this process
+        was restarted); a disarmed one uses its first.
         """
         if self._has_met:
             return
@@ -307,18 +307,18 @@ class SourceOrders:
             self._teller.report(alert(AlertId.SOURCE_SET_UNKNOWN))
 
     def on_text(self, text: str) -> None:
-        """A STATUSTEXT of the autopilot."""
+        """Process a STATUSTEXT of the autopilot."""
         told = _CHOSEN.match(text)
         if told is not None:
             self._switch.chosen(int(told[1]))
 
     def rebooted(self) -> None:
-        """The flight controller starts with its first set."""
+        """The flight controller uses its first set."""
         self._switch.reset()
         self._teller.forget("switch")
 
     def acknowledged(self, accepted: bool) -> None:
-        """COMMAND_ACK of an order."""
+        """Process a COMMAND_ACK of an order."""
         if self._switch.acknowledged(accepted) and not accepted:
             self._teller.report(alert(AlertId.SOURCE_SET_REFUSED))
 
@@ -332,7 +332,7 @@ class SourceOrders:
         may_switch: bool,
         now_ns: int,
     ) -> None:
-        """Order a change if it is time for one. good: positions are sent and trusted."""
+        """Order a change if it is due. good: positions are sent and reliable."""
         order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
         self._tell_refused(now_ns)
         refusal = self._switch.refusal

@@ -1,4 +1,4 @@
-"""Cross-check of the vision yaw against the autopilot's, because ArduPilot makes none.
+"""Checks vision's yaw against the autopilot's, because ArduPilot does not.
 
 Measured: a vision frame rotated by 5 deg costs 25 m with no warning, and a 30 deg wrong yaw is
 accepted with EK3_SRC1_YAW = 6. Measured as well: the EKF's own yaw steps by up to 8 deg when it is
@@ -29,8 +29,8 @@ _BLIND_AFTER = 20  # fixes in a row
 
 @dataclass(frozen=True)
 class YawVerdict:
-    """What the guard says of one fix. accept: send it; difference_rad: vision minus autopilot, None
-    where one of the two is not known.
+    """Result of the check of one fix. accept: send it; difference_rad: vision minus autopilot, None
+    if one of them is unknown.
     """
 
     accept: bool
@@ -38,7 +38,7 @@ class YawVerdict:
 
 
 class YawGuard:
-    """Refuses fixes whose yaw turned, and blocks injection when most of the last ones did.
+    """Rejects fixes whose yaw changed wrongly, and blocks injection if most of the last ones did.
 
     Blocking takes the majority of `minimum_samples` fixes, for noise lets some of a turned frame
     pass; releasing takes as many good ones in a row, held to a tighter limit.
@@ -60,13 +60,13 @@ class YawGuard:
         return self._unchecked_in_a_row >= _BLIND_AFTER
 
     def reset(self) -> None:
-        """The autopilot started over: its yaw did, too."""
+        """The autopilot rebooted, and its yaw with it."""
         self._accepted.clear()
         self._last.clear()
         self.blocked = False
 
     def check(self, fix: VisionFix, autopilot: Attitude | None) -> YawVerdict:
-        """Judge one fix; without a yaw on either side it follows the standing verdict."""
+        """Check one fix; if a yaw is unknown, the last result is used."""
         if not self._config.enabled:
             return YawVerdict(True, None)
         time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad
@@ -89,7 +89,7 @@ class YawGuard:
         return YawVerdict(accept, difference)
 
     def _note(self, good: bool) -> None:
-        """Block or release by the last verdicts."""
+        """Block or release by the last results."""
         last = self._last
         last.append(good)
         if self.blocked:

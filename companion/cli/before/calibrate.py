@@ -1,4 +1,4 @@
-"""``companion calibrate``: what the deployment says of camera and mounting, measured."""
+"""``companion calibrate``: measure camera and mounting of a deployment."""
 
 from __future__ import annotations
 

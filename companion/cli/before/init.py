@@ -1,4 +1,4 @@
-"""``companion init``: a deployment file from what vehicle, stream and map say."""
+"""``companion init``: make a deployment file from vehicle, stream and map."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def init_command(
 
 
 def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
-    """What the operator answers; ConfigError where there is nobody to ask."""
+    """The operator's answer; ConfigError without a terminal."""
     try:
         answer: _Answer = typer.prompt(what, default=default)
     except typer.Abort as error:
@@ -109,7 +109,7 @@ def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
 
 
 def _asked_map() -> Path | None:
-    """None where there is no map yet, and where there is nobody to ask."""
+    """The operator's answer; None if there is no map yet, or no terminal."""
     try:
         answer = typer.prompt("map: folder of the tile cache (Enter: none yet)", default="",
                               show_default=False)  # fmt: skip
@@ -122,8 +122,8 @@ def _asked_map() -> Path | None:
 
 
 def _map_settings(cache: Path | None, notes: list[str]) -> dict[str, Any]:
-    """Path and hash of the map; without one its place in the file, and a note of what is missing.
-    MapCacheError where something else is in its place.
+    """Path and hash of the map; without a map its later path, and a note that it is missing.
+    MapCacheError if something else is there.
     """
     place = cache or _NO_MAP
     if cache is not None and cache.exists():

@@ -1,4 +1,4 @@
-"""``companion map check``: whether a map will do, in words and pictures."""
+"""``companion map check``: whether a map is suitable, in words and images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``companion map fetch``: a map of a place from the services that states offer."""
+"""``companion map fetch``: make a map of an area from public services."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def sources_command(
 
 
 def _print_source(console: Console, source: CatalogueSource) -> None:
-    """Name first and whole, to be copied; what a terminal's width breaks goes on under itself."""
+    """Print the name first and uncut, so that it can be copied; long lines continue below."""
     head = f"{source.name}  ({source.country}, {source.role}, {source.resolution_m:g} m)"
     console.print(head, style="bold", markup=False, highlight=False, soft_wrap=True)
     for what, text in (
@@ -229,7 +229,7 @@ def _planned(
 
 
 def _print_estimate(console: Console, parts: list[_Part]) -> float:
-    """A line a source, and what it lacks; returns the megabytes of all."""
+    """Print a line for each source, with what it lacks; returns the megabytes of all."""
     from localizer.map.fetch.fetch import estimate
 
     total = 0.0
@@ -277,7 +277,7 @@ def _told_count(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _raised(console: Console, part: _Part, footprints: Footprints) -> _Part:
-    """The terrain with buildings, and a source that says whose they are."""
+    """The terrain with buildings, and the source with its attribution."""
     from localizer.map.footprints.raise_buildings import raise_buildings
 
     out = part.out.with_name("raised.tif")

@@ -1,4 +1,4 @@
-"""``companion plan``: where along a mission vision will do, before it is flown."""
+"""``companion plan``: forecast where along a mission vision works."""
 
 from __future__ import annotations
 

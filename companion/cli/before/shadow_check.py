@@ -1,4 +1,4 @@
-"""``companion shadow-check``: what the monitor would have done on a past flight."""
+"""``companion shadow-check``: run bridge and integrity monitor on a recorded flight."""
 
 from __future__ import annotations
 

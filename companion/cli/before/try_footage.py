@@ -1,4 +1,4 @@
-"""``companion try``: will vision work at this place? Answered from footage, without hardware."""
+"""``companion try``: find out from footage whether vision works in an area."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From imported tiles to a cache: the tree of what is there, its index and its manifest."""
+"""Assemble imported tiles to a cache: tree, index and manifest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Doubts about imported content as a whole: does its ground face up, and lie where it should?"""
+"""Plausibility of imported content: whether its ground faces up and is where the source states."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _MOST_OUTSIDE = 0.5  # of the content's extent on the ground
 def require_upright(
     leaves: Iterable[StoredTile], up_axis: str | None, source: str, rules: ImportRules
 ) -> list[str]:
-    """Warnings where most of the finest tiles' surface does not face up; `MapSourceError` unless
-    that is trusted. up_axis: by which the source was read, None where it has none.
+    """Warnings if most of the finest tiles' surface does not face up; `MapSourceError` unless that
+    is trusted. up_axis: the one that was used, None if the source has none.
     """
     if up_axis is None:  # heights, which can only face up
         return []
@@ -42,8 +42,8 @@ def require_in_volumes(
     source: str,
     rules: ImportRules,
 ) -> list[str]:
-    """Warnings where content reaches out of the volumes that its tileset states; `MapSourceError`
-    where most of it lies beside them. nodes: ECEF corners (8, 3) of each volume, and its tiles.
+    """Warnings if content is outside the bounding volumes of its tileset; `MapSourceError` if most
+    of it is. nodes: ECEF corners (8, 3) of each volume, and its tiles.
     """
     area = inside = worst = 0.0
     count = beyond = 0

@@ -1,4 +1,4 @@
-"""What a source's heights are above, and how high the geoid is there: stated, given, computed."""
+"""Vertical datum of a source and geoid separation: stated, given or computed."""
 
 from __future__ import annotations
 

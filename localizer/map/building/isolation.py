@@ -1,4 +1,4 @@
-"""A call in a process of its own: its crashes, hangs and hunger for memory are named errors."""
+"""Calls a function in its own process: crashes, hangs and memory exhaustion become named errors."""
 
 from __future__ import annotations
 
@@ -92,12 +92,12 @@ def confine(rules: ImportRules) -> None:
 
 
 def out_of_memory(rules: ImportRules) -> str:
-    """What a `MemoryError` means here."""
+    """The error for a `MemoryError`."""
     return f"does not fit into memory ({rules.memory_mb} MiB; --limit memory_mb=NUMBER)"
 
 
 def _end_with_parent() -> None:
-    """A worker waits for tasks for ever; nobody sends any once the parent was killed."""
+    """End a worker whose parent was killed; otherwise it would wait for tasks forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         multiprocessing.connection.wait([parent.sentinel])

@@ -1,4 +1,4 @@
-"""What a build of a cache may be told, beyond its source and its place."""
+"""Options of a cache build."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class SourceOptions:
 def find_source(
     sources: Sequence[Path], georeference: Georeference | Path | None
 ) -> tuple[tuple[Path, ...], Georeference | Path | None]:
-    """What to import: the sources as given, or what a folder holds, with its georeference."""
+    """The sources to import: as given, or the content of a folder, with its georeference."""
     for path in sources:
         if not path.exists():
             raise MapSourceError(f"{path}: no such file or folder")

@@ -52,7 +52,7 @@ class StoredTile:
 
 @dataclass(frozen=True)
 class TileRecord:
-    """What became of one source tile: the files made of it, or why there are none."""
+    """Result of one source tile: the files made of it, or why there are none."""
 
     tiles: tuple[StoredTile, ...]
     error: str | None = None

@@ -26,7 +26,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ImportJob:
-    """What a worker needs besides the tile. frame: the cache's world; lift_m: added to heights."""
+    """Data of a worker besides the tile. frame: the cache's world; lift_m: added to heights."""
 
     staged: Staging
     frame: LocalFrame
@@ -44,8 +44,8 @@ class ImportJob:
         return self.staged.store(key, meshes)
 
     def run_in_time(self, key: int, tile: TileSource) -> TileRecord:
-        """`run` in a process of a pool, which dies when the time is up: a decoder that does not
-        come back cannot be stopped otherwise.
+        """Call `run` in a process of a pool, which is killed at the time limit: a hanging decoder
+        cannot be stopped otherwise.
         """
         signal.setitimer(signal.ITIMER_REAL, self.rules.seconds)
         try:
@@ -70,7 +70,7 @@ class ImportJob:
 
 @dataclass(frozen=True)
 class ImportWorkers:
-    """Who imports. count: of processes; apart: in processes of their own, even one; scheduler:
+    """Processes of an import. count: number; apart: use separate processes even for one; scheduler:
     address of a Dask scheduler instead.
     """
 
@@ -178,7 +178,7 @@ def _run_pool(
 
 
 def _run_alone(job: ImportJob, key: int, tile: TileSource) -> TileRecord:
-    """A tile that was in flight when a worker died: does it kill this one too?"""
+    """Import again a tile that was in flight when a worker died, to see whether it is the cause."""
     try:
         return call_apart(job.run, key, tile, rules=job.rules, what="its decoder")
     except MapSourceError as error:

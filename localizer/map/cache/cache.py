@@ -38,7 +38,7 @@ REPLACE, ADD = 0, 1
 
 
 class Manifest(BaseModel):
-    """What a cache says about itself.
+    """Description of a cache.
 
     gsd_m: texel size of the finest tiles; levels: depth of the tile tree; extent: outline of the
     map as (latitude_deg, longitude_deg) corners; skipped: source tiles that could not be imported,
@@ -278,7 +278,7 @@ def _decode_image(data: NDArray[np.uint8]) -> Image:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """What the cache folder `path` says about itself; `MapCacheError` as `TileCache.open`."""
+    """The manifest of the cache folder `path`; `MapCacheError` as `TileCache.open`."""
     where = path / MANIFEST_NAME
     if path.is_file():
         raise MapCacheError(

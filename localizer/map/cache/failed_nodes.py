@@ -23,7 +23,9 @@ class _Failure:
 
 
 class FailedNodes:
-    """Who asks holds the streamer's lock. clock: seconds. attempts: that failed, of all nodes."""
+    """Nodes that could not be read. Callers hold the streamer's lock. clock: seconds. attempts:
+    number of failures.
+    """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock

@@ -1,4 +1,4 @@
-"""Who streams a cache holds its folder, so that no build puts another map in its place meanwhile.
+"""A program that streams a cache locks its folder, so that no build replaces it meanwhile.
 
 A lock of the kernel on the folder: it ends with the process, however that ends, and a cache that
 may only be read can be held. Where a file system knows no such locks, nobody is kept from anything.
@@ -16,7 +16,9 @@ from localizer.errors import MapCacheError
 
 
 class CacheLock:
-    """Nobody replaces the cache at `path` until `close`; any number of readers hold it."""
+    """Lock that prevents a replacement of the cache at `path` until `close`; any number of readers
+    may hold it.
+    """
 
     def __init__(self, path: Path) -> None:
         self._folder: int | None = _opened(path)
@@ -35,7 +37,7 @@ class CacheLock:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[None]:
-    """The cache at `path`, if there is one, is nobody's: MapCacheError while someone holds it."""
+    """Lock for the replacement of the cache at `path`; MapCacheError while a reader holds it."""
     if not path.exists():
         yield
         return

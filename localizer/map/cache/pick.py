@@ -1,4 +1,4 @@
-"""From a pixel to the map's surface: by the rendered depth, or exactly by its triangles."""
+"""Find the surface point of a pixel: by the rendered depth, or exactly by the triangles."""
 
 from __future__ import annotations
 

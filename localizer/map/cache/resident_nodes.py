@@ -12,7 +12,7 @@ from localizer.map.cache.tile import TileMesh
 
 
 class ResidentNodes:
-    """Who asks holds the streamer's lock.
+    """Nodes in memory. Callers hold the streamer's lock.
 
     sizes: bytes of each node (N,), in memory or not; resident: which are (N,); bytes: of those.
     evicted: what left and is not yet freed; evictions: how many nodes ever did.
@@ -31,8 +31,8 @@ class ResidentNodes:
         return self._meshes[node]
 
     def add(self, node: int, meshes: list[TileMesh], *, keep: Collection[int], beside: int) -> None:
-        """Bring a node in, for which others leave if need be, but not those to `keep`: a view must
-        be able to complete. beside: bytes that are in memory elsewhere.
+        """Add a node and evict others if necessary, but not those to `keep`, so that a view can
+        complete. beside: further bytes in memory.
         """
         size = int(self.sizes[node])
         self._make_room(beside + size, keep)
@@ -41,7 +41,7 @@ class ResidentNodes:
         self.bytes += size
 
     def take_evicted(self) -> list[list[TileMesh]]:
-        """What left, to be freed where it costs nobody time."""
+        """The evicted nodes, to be freed where it delays nothing."""
         taken, self.evicted = self.evicted, []
         return taken
 

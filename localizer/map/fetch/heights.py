@@ -1,4 +1,4 @@
-"""What a service's numbers are in metres, by what its file says of them."""
+"""Convert a service's heights to metres, by the unit, scale and datum in its file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HTTP as a guest behaves: a rate, few connections, patience when told to wait, and limits."""
+"""HTTP client with a rate limit, few connections, waits on request, and size limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose terms forbid what a map here needs: to be kept, cut, and shown without their program."""
+"""Services whose terms forbid to keep, cut or show their data without their program."""
 
 from __future__ import annotations
 

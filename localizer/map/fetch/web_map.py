@@ -1,4 +1,4 @@
-"""WMS and WCS: a picture or heights of a rectangle, asked for block by block."""
+"""WMS and WCS: imagery or heights of a rectangle, requested block by block."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""XML of a server, without what XML can do besides."""
+"""Parse a server's XML without entities and external references."""
 
 from __future__ import annotations
 

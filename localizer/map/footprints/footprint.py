@@ -1,4 +1,4 @@
-"""What a footprint is, and the files that hold them."""
+"""Building footprints, and the reader of their files."""
 
 from __future__ import annotations
 

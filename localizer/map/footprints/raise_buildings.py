@@ -1,4 +1,4 @@
-"""A terrain and footprints become a surface: flat roofs, and walls that stand upright.
+"""Raise building footprints on a terrain: flat roofs and vertical walls.
 
 Roof: the lowest ground under the building and its height. A height field's walls lean over one
 cell, so cells of more than half a metre are divided.
@@ -37,7 +37,7 @@ _GML = (".gml", ".xml", ".citygml")
 
 @dataclass(frozen=True)
 class RaiseResult:
-    """What was done. missed: buildings beside the terrain; small: of less than a cell."""
+    """Counts. missed: buildings outside the terrain; small: smaller than a cell."""
 
     raised: int
     missed: int

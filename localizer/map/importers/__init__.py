@@ -1,1 +1,1 @@
-"""What a map may be made from: each reader turns its source into meshes with ECEF positions."""
+"""Map importers: each reader converts its source to meshes with ECEF positions."""

@@ -1,4 +1,4 @@
-"""A folder as a source: what lies in it, and whether that says by itself how to import it."""
+"""A folder as a source: finds its content and whether it can be imported in one way only."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FoundSource:
 
 
 def source_in(folder: Path, georeference_given: bool) -> FoundSource:
-    """What a folder's content is as a source, where there is no doubt about it.
+    """The source in a folder, if there is only one way to read it.
 
     A tileset, an OpenDroneMap result, or one mesh with its georeference, or two rasters.
     `MapSourceError` lists what was found and what to pass where it is none of these or several.

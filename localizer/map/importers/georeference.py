@@ -1,4 +1,4 @@
-"""Where a mesh without coordinates of its own stands on Earth."""
+"""Position on Earth of a mesh without coordinates."""
 
 from __future__ import annotations
 

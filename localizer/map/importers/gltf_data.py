@@ -1,4 +1,4 @@
-"""What a glTF's JSON points to: accessors, buffer views, pictures, each checked as it is read."""
+"""Binary data of a glTF: accessors, buffer views, images, each checked when it is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a CRS and a raster's tags say of heights: their unit, and what they are above."""
+"""Unit and vertical datum of heights, from a CRS and a raster's tags."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ _FAR_DEG = 10.0  # beyond the neighbouring zones that projects on a border are d
 
 @dataclass(frozen=True)
 class StatedHeights:
-    """What a source says of its heights. unit_m: metres per unit, None where it is not told;
-    datum: None where it is not told; crs: name of the vertical CRS, empty without one.
+    """Heights as the source states them. unit_m: metres per unit, None if unknown; datum: None if
+    unknown; crs: name of the vertical CRS, empty without one.
     """
 
     unit_m: float | None

@@ -1,4 +1,4 @@
-"""Grids of heights to meshes: what the raster importer and made-up coarse levels share."""
+"""Meshes from height grids, for the raster importer and for generated coarse levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a material shows, as the common viewers draw it: its colour, its picture, and its holes."""
+"""Appearance of a material as common viewers draw it: colour, texture, and holes."""
 
 from __future__ import annotations
 

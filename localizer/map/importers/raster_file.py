@@ -1,4 +1,4 @@
-"""One GeoTIFF as it is on disk: opened without GDAL's other formats, and what it says of itself."""
+"""One GeoTIFF on disk, opened without GDAL's other formats, and its metadata."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _GDAL_OPTIONS = {
 
 @contextmanager
 def offline() -> Iterator[None]:
-    """Around every use of GDAL: it does not go to the network, and tells what heights are above."""
+    """Context for every use of GDAL, without network access."""
     with rasterio.Env(**_GDAL_OPTIONS):
         yield
 
@@ -264,7 +264,7 @@ def height_band(
     nodata: float | None,
     rules: ImportRules,
 ) -> tuple[HeightBand, list[str]]:
-    """How the DSM's numbers become metres; a unit that nothing tells is an error."""
+    """Conversion of the DSM's numbers to metres; an unknown unit is an error."""
     unit, warnings = stated.unit_m, []
     if height_unit is not None:
         given = unit_of(height_unit)

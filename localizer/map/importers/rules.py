@@ -1,4 +1,4 @@
-"""What an import may take, and the doubts that stop it unless somebody says that they are meant."""
+"""Limits of an import, and implausible input that stops it unless the user trusts it."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Looking at a tile cache: figures, integrity, pictures."""
+"""Inspection of a tile cache: figures, integrity, images."""

@@ -1,4 +1,4 @@
-"""Whether a map's picture lies where its surface lies: by the edges that both have."""
+"""Offset of a map's imagery from its surface, by the edges of both."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _LEAST_PEAK = 4.0  # of the best shift's correlation over the others', in their 
 
 @dataclass(frozen=True)
 class ImageryOffset:
-    """east_m, north_m: by how much the picture lies beside the surface; peak: how clear that is, in
-    standard deviations; edges: cells of the surface with a step. known: whether it can be said.
+    """east_m, north_m: offset of the imagery from the surface; peak: its significance, in standard
+    deviations; edges: cells of the surface with a step. known: whether it is significant.
     """
 
     east_m: float
@@ -43,7 +43,7 @@ class ImageryOffset:
 
 
 def alignment_of(mosaic: Mosaic) -> ImageryOffset:
-    """The shift of the picture at which its edges lie best on the surface's steps.
+    """The offset at which the imagery's edges match the surface's steps best.
 
     Good to about a metre: walls that lean in the picture draw it to one side. Without colours
     nothing can be said.

@@ -1,4 +1,4 @@
-"""Whether a map will do for a flight: coverage, holes, texel size, seams, picture on surface."""
+"""Whether a map is suitable for a flight: coverage, holes, texel size, seams, imagery offset."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Grade(Enum):
 
 @dataclass(frozen=True)
 class MapFinding:
-    """One question about a map. name: what; found: with units; grade; words: what it means."""
+    """Result of one check. name: of the check; found: with units; grade; words: explanation."""
 
     name: str
     found: str
@@ -54,7 +54,7 @@ class MapFinding:
 
 @dataclass(frozen=True)
 class MapUse:
-    """What the map is for. height_m: above the ground; pixel_rad: angle of a working pixel;
+    """Use of the map. height_m: above the ground; pixel_rad: angle of a working pixel;
     half_view_deg: half of the camera's field of view.
     """
 
@@ -102,7 +102,7 @@ class Seam:
 
 
 def check_map(cache: TileCache, use: MapUse) -> MapCheck:
-    """All questions, with a picture of each."""
+    """Run all checks, with an image of each."""
     mosaic = mosaic_of(cache)
     gaps, holes = _holes(mosaic)
     blank = _blank(mosaic) | _without_texels(cache, mosaic, use)

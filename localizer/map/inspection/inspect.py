@@ -1,4 +1,4 @@
-"""Looking at a tile cache: its figures, its integrity, pictures of it, and back to GLB."""
+"""Figures, integrity and images of a tile cache, and export to GLB."""
 
 from __future__ import annotations
 

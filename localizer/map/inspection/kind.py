@@ -41,7 +41,7 @@ _PALETTE_M = 0.25  # a pixel, of maps without textures
 
 
 def map_kind(cache: TileCache) -> MapKind:
-    """What `map build` measured; measured now (seconds) where an older build did not."""
+    """The map's kind from the manifest; measured now (seconds) if an older build has none."""
     found = cache.manifest.kind
     return found or measure_kind(cache, imagery_date=cache.manifest.imagery_date)
 
@@ -53,7 +53,9 @@ def measure_kind(
     imagery_date: str | None = None,
     sensor: str | None = None,
 ) -> MapKind:
-    """Look at samples of the map from above. heights: as its owner says, instead of measured."""
+    """Measure the kind from vertical views of samples. heights: given by the user instead of
+    measured.
+    """
     with TileStreamer(cache) as streamer:
         renderer = NumbaRenderer(streamer, 1)
         try:

@@ -1,4 +1,4 @@
-"""A whole map from above, as one picture with its heights."""
+"""Image of a whole map from above, with its heights."""
 
 from __future__ import annotations
 
