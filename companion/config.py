@@ -267,7 +267,9 @@ class CompanionConfig(StrictModel):
 
 
 def load_config(path: Path) -> CompanionConfig:
-    """Read and check a configuration file; relative paths are relative to that file."""
+    """Read and check a configuration file; relative paths are relative to that file. `ConfigError`
+    if the file cannot be read or is not valid.
+    """
     config = parse_config(read_settings(path, ConfigError), str(path))
     try:
         return resolved(config, path.parent)
@@ -276,7 +278,9 @@ def load_config(path: Path) -> CompanionConfig:
 
 
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
-    """Check a configuration given as plain data; `where` names it in errors."""
+    """Check a configuration given as plain data; `where` names it in errors. `ConfigError` lists
+    all problems.
+    """
     try:
         config = validated(CompanionConfig, with_current_keys(CompanionConfig, data, where))
         config.camera.model.camera()

@@ -25,6 +25,7 @@ class DeviceArray:
         """From anything with ``__cuda_array_interface__`` (CuPy, PyTorch, numba).
 
         The producer must have finished: the registration's stream does not wait for others.
+        `DeviceArrayError` if it has strides.
         """
         interface = other.__cuda_array_interface__
         if interface.get("strides") is not None:
@@ -35,13 +36,17 @@ class DeviceArray:
         )  # fmt: skip
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """The same memory under another shape of the same size."""
+        """The same memory under another shape of the same size. `DeviceArrayError` if the sizes
+        differ.
+        """
         if int(np.prod(shape)) != int(np.prod(self.shape)):
             raise DeviceArrayError(f"a device array of shape {self.shape} cannot be {shape}")
         return DeviceArray(self.address, shape, self.dtype, self.owner)
 
     def checked_address(self, dtype: DTypeLike) -> int:
-        """The address, after checks of type and alignment that the kernels rely on."""
+        """The address, after checks of type and alignment that the kernels rely on.
+        `DeviceArrayError` if one of them differs.
+        """
         if self.dtype != np.dtype(dtype):
             raise DeviceArrayError(
                 f"device features are {self.dtype}, the kernels were asked for {np.dtype(dtype)}: "

@@ -55,10 +55,11 @@ def decode_rgb(
 
 
 def grey_levels(counts: NDArray[Any], grey_range: GreyRange | None) -> Image:
-    """(H, W) uint8 of a sensor's counts (H, W), linear between the two of `grey_range`.
+    """(H, W) uint8 of a sensor's counts (H, W) uint16, linear between the two counts of
+    `grey_range` (black, white); counts beyond them are black or white.
 
-    A thermal camera fills a few thousand of the 65536: by their upper bits alone its picture would
-    have some ten levels of grey. So `GreyRangeError` where the range is not said.
+    A thermal camera uses a few thousand of the 65,536 counts: the upper bits alone would give some
+    ten levels of grey. `GreyRangeError` if the range is None or the counts are not uint16.
     """
     if counts.dtype != np.uint16:
         raise GreyRangeError(f"grey of {counts.dtype} counts; 8 or 16 bits without sign are read")

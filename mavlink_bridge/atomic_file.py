@@ -17,6 +17,7 @@ def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = 
 
     The file beside it is always a new one: a link that somebody laid there is not followed.
     durable: it is on the disk before it is in its place, for what must outlive a loss of power.
+    mode: access rights of the new file.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.unlink(missing_ok=True)

@@ -116,7 +116,9 @@ def status_text(alert: Alert) -> Any:
 
 
 def named_values(figures: Mapping[str, float], uptime_ms: int) -> list[Any]:
-    """NAMED_VALUE_FLOAT (251) of each figure; a name holds 10 characters."""
+    """NAMED_VALUE_FLOAT (251) of each figure; a name holds 10 characters. ValueError for a longer
+    or empty name.
+    """
     too_long = [name for name in figures if not 0 < len(name) <= _NAME_LENGTH]
     if too_long:
         raise ValueError(f"NAMED_VALUE_FLOAT.name holds {_NAME_LENGTH} characters: {too_long}")

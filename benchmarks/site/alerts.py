@@ -20,11 +20,19 @@ hide: [toc]
 Made from the catalogue by `python -m benchmarks.site`; do not edit.
 
 An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `health.json` with its
-identifier. *Fix*: a position from vision. *Output held*: no position is sent. *Exclude and reset*:
-as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the switch
-to vision do not start; injection that is running continues. *Event*: it has no end. The end of an
-alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the text in
-brackets. The end of the rest shows by the next status, for example `localization tracking`.
+identifier. *Fix*: a position from vision; it is sent in mode inject, and in mode rc while injection
+is enabled. *Still sent* refers to these modes. *Output held*: no position is sent. *Exclude and
+reset*: as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the
+switch to vision do not start; injection that is running continues. The pilot (mode rc) and
+`bridge.injection.force` override it. *Event*: it has no end.
+
+A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
+the shadow check; it becomes a STATUSTEXT in mode inject only, if fixes come but injection has not
+started for 10 s.
+Alerts of localization are assessed once a second; the same one is sent at most every 10 s.
+
+The end of an alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the
+text in brackets. The end of the rest shows by the next status, for example `localization tracking`.
 """
 _TABLE = """
 ## {}

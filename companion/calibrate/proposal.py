@@ -172,7 +172,7 @@ def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
 
 def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -> Path:
     """Replace the deployment file if the result is valid. The old file is kept beside it; its name
-    is returned. Access rights stay the same.
+    is returned. Access rights stay the same. `ConfigError` if it is not valid or cannot be written.
     """
     document = with_current_keys(CompanionConfig, read_settings(path, ConfigError), str(path))
     _apply(document, wanted)

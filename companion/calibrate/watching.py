@@ -31,7 +31,7 @@ def watch_board(source: str, seconds: float, told: Told, keep: Path | None = Non
     """Watch for at most this time, to the end of a file or folder, or until all views are there.
 
     told: views, the newest picture's fate and what is missing, whenever that changes. keep: folder
-    for the pictures that were taken.
+    for the pictures that were taken. seconds: that time.
     """
     size = first_picture(source)
     views = BoardViews(size.width, size.height)

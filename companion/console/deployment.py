@@ -22,7 +22,9 @@ _MOST_BYTES = 64 << 10
 
 
 def shown(path: Path, editable: bool) -> dict[str, Any]:
-    """The file's text and the help; credentials only for someone who may change the file."""
+    """The file's text and the help; credentials only for someone who may change the file.
+    `ConfigError` if the file cannot be read. editable: they may.
+    """
     try:
         text = plain_text(path)
     except (OSError, ValueError) as error:
@@ -50,7 +52,9 @@ def check(path: Path, text: str) -> CompanionConfig:
 
 
 def replace(path: Path, text: str) -> Path:
-    """Write a valid text; returns the path of the old one."""
+    """Write a valid text; returns the path of the old one. `ConfigError` if the text is not valid
+    or cannot be written.
+    """
     check(path, text)
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     kept = path.with_name(f"{path.name}.{stamp}.old")

@@ -52,7 +52,9 @@ class MapReference:
 
     @property
     def frame(self) -> LocalFrame:
-        """The ENU frame: between formats in map metres and such in latitude and longitude."""
+        """The ENU frame: between formats in map metres and such in latitude and longitude.
+        `ConfigError` if neither map nor origin was given.
+        """
         if self.map_frame is None:
             raise ConfigError(
                 "these formats need the map's frame: give --map or --origin LAT,LON,HEIGHT"

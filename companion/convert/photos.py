@@ -59,7 +59,7 @@ def read_photos(
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[StampedPose, ...]:
     """The pose of each photo of a folder, by name, or of one photo. tell: takes what is odd about
-    the tags and does not make them wrong.
+    the tags and does not make them wrong. `PoseFileError` if there is no photo.
     """
     known = _known(path, heights)
     photos = [path]

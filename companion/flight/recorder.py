@@ -85,6 +85,7 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
     """Write ``record.json``: settings, the map's hash, versions, and the time on both clocks.
 
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
+    `ReportError` if it cannot be written, `DiskFaultError` if the disk is the cause.
     """
     monotonic_ns = time.monotonic_ns()
     document = {

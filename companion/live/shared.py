@@ -67,7 +67,7 @@ class Arrivals:
         return data
 
     def read(self, size: int) -> bytes:
-        """What lies in the memory."""
+        """What lies in the memory. `LinkError` if not all of it is there."""
         if self._file is None or not 0 <= size <= MOST_BODY:
             raise LinkError(f"a picture of {size} bytes without memory that holds it")
         data = os.pread(self._file, size, 0)

@@ -64,7 +64,9 @@ class ReplaySummary:
 def replay(
     record: FlightRecord, progress: Callable[[], None] = lambda: None
 ) -> list[ReplayedFrame]:
-    """Localize the recorded frames again, over the map and with the settings of the record."""
+    """Localize the recorded frames again, over the map and with the settings of the record.
+    `RecordError` if too few images can be read.
+    """
     config = record.config
     autopilot = RecordedAutopilot(config.bridge, record.log, record.tables.start_ns)
     stack = MapStack(config.map, config.localizer)

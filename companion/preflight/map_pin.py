@@ -14,7 +14,8 @@ def map_hash(cache: Path) -> str:
     """SHA-256 of the manifest, in hexadecimal.
 
     The manifest holds the index's hash and the index the tiles', so that it stands for all. The
-    manifest itself (origin, datum, geoid separation) is guarded by nothing else.
+    manifest itself (origin, datum, geoid separation) is guarded by nothing else. `ConfigError` if
+    it cannot be read.
     """
     path = cache / MANIFEST_NAME
     try:

@@ -67,7 +67,7 @@ def camera_of_file(path: Path) -> CameraGuess:
 
 def equivalent_camera(width: int, height: int, focal_35mm: float, *, small: bool) -> Camera:
     """The pinhole of a 35 mm equivalent focal length. small: a 4:3 sensor, of which an image that
-    is wider shows the whole width.
+    is wider shows the whole width. focal_35mm: that length, mm.
     """
     aspect = min(width / height, _NATIVE_ASPECT) if small else width / height
     diagonal = math.hypot(width, width / aspect)

@@ -41,8 +41,9 @@ class KlvTrack:
 
 
 def read_klv_packets(path: Path) -> list[tuple[int, bytes]]:
-    """Packets with their time from the first frame, ns, in the order of the file. Packets without
-    a time of their own take that of the video packet before them.
+    """Packets with their time from the first frame, ns, in the order of the file. Packets without a
+    time of their own take that of the video packet before them. `FootageError` if the file is not a
+    video or damaged.
     """
     packets: list[tuple[int | None, bytes]] = []
     first: int | None = None

@@ -50,7 +50,7 @@ def imu_message(us: int, force: tuple[float, ...], rates: tuple[float, ...]) -> 
 
 
 def pressure_message(ms: int, pascal: float) -> Any:
-    """SCALED_PRESSURE."""
+    """SCALED_PRESSURE. ms: time since boot; pascal: absolute pressure."""
     return mavlink.MAVLink_scaled_pressure_message(ms, pascal * 0.01, 0.0, 0)
 
 

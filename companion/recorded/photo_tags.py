@@ -235,7 +235,9 @@ def read_photo_tags(path: Path) -> PhotoTags:
 
 
 def read_xmp(path: Path) -> dict[str, str]:
-    """XMP tags by name, attributes and elements alike; empty where there are none."""
+    """XMP tags by name, attributes and elements alike; empty where there are none. `FootageError`
+    if the file cannot be read.
+    """
     sidecar = next((p for p in map(path.with_suffix, (".xmp", ".XMP")) if p.is_file()), None)
     try:
         if sidecar is not None:

@@ -42,7 +42,9 @@ def is_sequence(folder: Path) -> bool:
 
 
 def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
-    """A sequence of either layout; `name` chooses one of several in PiLoT's."""
+    """A sequence of either layout; `name` chooses one of several in PiLoT's. `SequenceError` if the
+    folder or an image is missing, or exposure times do not increase.
+    """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: no such folder")
     images, poses, camera = _layout(folder, name)

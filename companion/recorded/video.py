@@ -91,7 +91,9 @@ def _length_s(path: Path) -> float:
 def extract_frames(
     path: Path, folder: Path, times_ns: list[int], progress: Callable[[int, int], None]
 ) -> list[ExtractedFrame]:
-    """Write the frames nearest after each of the ascending times, at most `_LARGEST_PX` wide."""
+    """Write the frames nearest after each of the ascending times, at most `_LARGEST_PX` wide.
+    `FootageError` if no frame can be decoded.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     frames: list[ExtractedFrame] = []
     wanted = list(times_ns)

@@ -30,7 +30,9 @@ _TEXT = ("name", "state", "status", "problem")
 
 
 def evaluation_report(folder: Path, say: Say = silent) -> Report:
-    """The report of `companion eval --report folder`."""
+    """The report of `companion eval --report folder`. `RecordError` for another folder, or one
+    without frames.
+    """
     try:
         document = json.loads(plain_text(folder / "report.json"))
         frames = read_columns(folder / "frames.csv", _TEXT)

@@ -323,7 +323,7 @@ def _settings(report: Report) -> str:
 
 
 def data_uri(rgb: Image) -> str:
-    """A picture inside the page."""
+    """A picture inside the page. `ReportError` if it cannot be encoded."""
     done, jpeg = cv2.imencode(
         ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     )

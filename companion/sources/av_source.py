@@ -511,7 +511,9 @@ def live_input(
     settings: SourceSettings,
     on_stranger: Callable[[str], None] = lambda _: None,
 ) -> _Input:
-    """FFmpeg's options for a live location, chosen for low delay."""
+    """FFmpeg's options for a live location, chosen for low delay. `StreamOpenError` if the video
+    device does not exist.
+    """
     timeout_us = str(round(settings.stall_timeout_s * 1e6))
     common = {"probesize": "65536", "analyzeduration": "200000", "flags": "low_delay"}
     if location.startswith(("udp://", "rtp://")) or location.endswith(".sdp"):

@@ -31,7 +31,9 @@ TIMESTAMPS_NAME = "timestamps.txt"
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The folder's images by name, numbers in names counted as numbers (img2 before img10)."""
+    """The folder's images by name, numbers in names counted as numbers (img2 before img10).
+    `StreamOpenError` if the folder does not exist or holds none.
+    """
     if not folder.is_dir():
         raise StreamOpenError(f"{folder}: no such folder; give a folder of images")
     images = files_of(folder, IMAGE_SUFFIXES)
@@ -60,7 +62,10 @@ def read_image(path: Path, grey_range: GreyRange | None = None) -> Image:
 
 
 def read_timestamps(path: Path) -> dict[str, int]:
-    """Image name to exposure time in ns, from lines ``name time_ns`` (blank or comma between)."""
+    """Image name to exposure time in ns, from lines ``name time_ns`` (blank or comma between). "#"
+    begins a comment; of a repeated name the last line counts. `StreamDecodeError` if the file
+    cannot be read or a line is malformed.
+    """
     times: dict[str, int] = {}
     try:
         lines = plain_text(path).splitlines()
@@ -81,7 +86,9 @@ def read_timestamps(path: Path) -> dict[str, int]:
 
 
 def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | None:
-    """Exposure times, ns, of its images by ``timestamps.txt`` in it; None without that file."""
+    """Exposure times, ns, of its images by ``timestamps.txt`` in it; None without that file.
+    `StreamOpenError` if it lacks an image.
+    """
     file = folder / TIMESTAMPS_NAME
     if not file.exists():
         return None

@@ -104,7 +104,7 @@ def encode_detection(detection: Detection) -> bytes:
 
 
 def parse_host_port(text: str) -> tuple[str, int]:
-    """``host:port`` as a socket address."""
+    """``host:port`` as a socket address. `ConfigError` for another text."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
         raise ConfigError(f"expected host:port, got {text!r}")

@@ -40,7 +40,8 @@ def localization_metrics(
     """Metrics of per-frame errors (F,); NaN marks a frame without an estimate.
 
     Medians are over the localized frames; a recall counts a frame when both errors are within its
-    number of metres and degrees; a frame without an estimate counts as failed.
+    number of metres and degrees; a frame without an estimate counts as failed. seconds: wall time
+    of the run.
     """
     frames = len(translation_m)
     found = np.isfinite(translation_m) & np.isfinite(rotation_deg)

@@ -43,7 +43,7 @@ class Sequence:
     is_timed: bool = True
 
     def frame(self, index: int) -> Frame:
-        """Decode one frame."""
+        """Decode one frame. `SequenceError` if its size differs from the camera's."""
         rgb = read_rgb(self.images[index])
         if rgb.shape[:2] != (self.camera.height, self.camera.width):
             raise SequenceError(

@@ -82,7 +82,9 @@ class ModelInfo(BaseModel):
 
 
 def read_model_info(model: Path) -> ModelInfo:
-    """Metadata of `model`, with the graph's hash verified against it."""
+    """Metadata of `model`, with the graph's hash verified against it. `ModelError` if a file cannot
+    be read, the description is not valid, or the hash differs.
+    """
     path = model.with_suffix(".json")
     try:
         info = ModelInfo.model_validate_json(plain_text(path))

@@ -28,7 +28,9 @@ _LEAST_CELL_M = 0.02
 
 
 def another_visit(view: RenderedView, condition: str, rng: np.random.Generator) -> Image:
-    """One draw (H, W, 3) of what the camera of `view` sees under one of `FORECAST_CONDITIONS`."""
+    """One draw (H, W, 3) of what the camera of `view` sees under one of `FORECAST_CONDITIONS`.
+    ValueError for another condition.
+    """
     if condition not in FORECAST_CONDITIONS:
         raise ValueError(f"condition {condition!r} is not one of {', '.join(FORECAST_CONDITIONS)}")
     surface = view.depth[view.depth > 0]

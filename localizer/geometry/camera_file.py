@@ -64,7 +64,8 @@ _READ = (
 
 def read_numbers(path: Path) -> dict[str, Any]:
     """Numbers of one camera in a file, for `camera_numbers`: JSON, YAML (ROS ``camera_info``,
-    Kalibr's camchain, OpenCV's FileStorage) or COLMAP's ``cameras.txt``.
+    Kalibr's camchain, OpenCV's FileStorage) or COLMAP's ``cameras.txt``. `CameraError` if the file
+    is missing, cannot be read, or holds no such object.
     """
     try:
         text = plain_text(path)

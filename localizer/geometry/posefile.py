@@ -37,6 +37,8 @@ def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
     """All poses of a file, in order. Blank lines and lines that begin with # are skipped.
 
     A line is ``name lon lat alt roll pitch yaw``: degrees, metres above the ellipsoid.
+    `PoseFileError` if the file cannot be read, a line is malformed, a name is repeated, or there is
+    no pose.
     """
     try:
         lines = plain_text(Path(path)).splitlines()

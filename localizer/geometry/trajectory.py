@@ -39,7 +39,9 @@ class StampedPose:
 
 
 def write_tum(path: Path, poses: Iterable[StampedPose]) -> None:
-    """Write TUM lines: nanoseconds of time, 0.1 µm of position, 1e-9 of the quaternion."""
+    """Write TUM lines: nanoseconds of time, 0.1 µm of position, 1e-9 of the quaternion.
+    `PoseFileError` if the file cannot be written.
+    """
     try:
         lines = [f"{tum_line(pose)}\n" for pose in poses]
     except PoseFileError as error:
@@ -58,7 +60,9 @@ def tum_line(pose: StampedPose) -> str:
 
 
 def read_tum(path: Path) -> tuple[StampedPose, ...]:
-    """All poses of a TUM file, named by their time in ns. Blank lines and comments are skipped."""
+    """All poses of a TUM file, named by their time in ns. Blank lines and comments are skipped.
+    `PoseFileError` if the file cannot be read, a line is malformed, or there is no pose.
+    """
     try:
         lines = plain_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:

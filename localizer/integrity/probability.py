@@ -65,7 +65,10 @@ def place_features(result: Registration) -> Array | None:
 
 
 def evidence(quality: float, patches: int, share: float, peak: float, lead: float) -> Array:
-    """(4,) the features of these numbers of a `Registration` and its `PatchAgreement`."""
+    """(4,) the features of these numbers of a `Registration` and its `PatchAgreement`. quality: 0
+    to 1; patches: their number; share: of those that agree, 0 to 1; peak: in standard deviations;
+    lead: share of the winner's cost.
+    """
     return np.array(
         [
             np.log(max(quality, _LEAST_QUALITY)),

@@ -78,7 +78,7 @@ def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[
     """The pose after an independent measurement of single axes: Kalman's update.
 
     What hangs on those axes moves with them: a turn that is known better mends the position that
-    the registration took it for.
+    the registration took it for. covariance: (6, 6) of the pose before.
     """
     information = np.diag(constraint.information)
     known = np.flatnonzero(information > 0)

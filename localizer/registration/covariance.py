@@ -89,7 +89,7 @@ def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
 @dataclass(frozen=True)
 class CovarianceSums:
     """What equation 11 adds up over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior;
-    meat: Σ_cells G Gᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
+    meat: Σ_cells F Fᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
     cell_px: their side in level px; prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi
     moves the image by sqrt(xi' motion xi) level px, rms; anchors: how many are in view, of all that
     the pose was fitted to; share: of those, that were added up; curvature: equation 11a.

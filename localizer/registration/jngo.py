@@ -379,7 +379,7 @@ def _totals(
 
 
 def make_backend(name: str, threads: int = 2) -> Backend:
-    """The backend called `name`: "numba" or "reference"."""
+    """The backend called `name`: "numba" or "reference". ValueError for another name."""
     if name == "numba":
         return NumbaBackend(threads)
     if name == "reference":

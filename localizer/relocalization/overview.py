@@ -125,7 +125,9 @@ class MapOverview:
 
 
 def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
-    """The features of an image that are compared: the level whose stride is `STRIDE`."""
+    """The features of an image that are compared: the level whose stride is `STRIDE`.
+    `MapCacheError` if the network has none.
+    """
     for level in extractor.extract(rgb).levels:
         if level.stride == STRIDE:
             return level
@@ -147,10 +149,14 @@ def open_overview(
     progress: Progress = lambda _done, _total: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> MapOverview | None:
-    """The map's overview from the disk, or computed and put there; None if stopped before its end.
+    """The map's overview from the disk, or computed, stored there and returned; None if
+    `should_stop` returned true before its end.
 
-    A file that is damaged is named in the log and made again. A folder that cannot be written costs
-    the time of computing it at every start, and the log says so.
+    progress: called with the number of squares that are done and of all. A damaged file is named in
+    the log and computed again. If the folder cannot be written, the log says so, and the overview
+    is computed again at every start. A new overview removes the longest unused ones.
+    `MapCacheError` if a search would need more than half of the free memory, or if the network has
+    no comparable level.
     """
     key = overview_key(cache, model_key(extractor))
     folder = cache.path / "overview" / key

@@ -140,7 +140,9 @@ class TileRenderer(ABC):
 
 
 def require_pinhole(camera: Camera) -> None:
-    """Renderers draw straight lines straight: distortion is the caller's (`undistortion_maps`)."""
+    """Renderers draw straight lines straight: distortion is the caller's (`undistortion_maps`).
+    `CameraError` if the camera has distortion.
+    """
     if camera.is_distorted:
         raise CameraError(
             "the renderer takes an ideal pinhole camera; use camera.without_distortion() and "

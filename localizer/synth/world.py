@@ -84,7 +84,9 @@ class WorldInfo:
 
     @classmethod
     def load(cls, folder: Path) -> WorldInfo:
-        """Read what `save` wrote."""
+        """Read what `save` wrote. `MapSourceError` if the file is missing, malformed or of another
+        format.
+        """
         path = Path(folder) / _INFO
         try:
             data = json.loads(path.read_text())
@@ -134,8 +136,8 @@ def build_world(
     """Generate a world and write it to the folder `out` as tileset.json, GLB tiles and world.json.
 
     variant: "survey" is what the map shows, "live" the same place at another visit. config and look
-    replace what seed, size and variant stand for. More than one process needs the usual
-    ``if __name__ == "__main__"`` guard in a script.
+    replace what seed, size and variant stand for. processes: how many paint at the same
+    time; more than one needs the usual ``if __name__ == "__main__"`` guard in a script.
     """
     config = config or WorldConfig(seed, size_m)
     visit = Visit(variant, look or look_of(variant))

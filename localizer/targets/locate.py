@@ -67,7 +67,8 @@ def ray_spread(
 
     A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel's error
     turns the ray by the camera model's own derivative. drift: one sigma of an error (pixels) along
-    a line, as of a click whose frame is not quite known.
+    a line, as of a click whose frame is not quite known. pixel_sigma: of the pixel, px, per axis.
+    distance: along the ray, m.
     """
     _, d = ray_in_world(estimate, pixel)
     sideways = np.linalg.svd(d[None, :])[2][1:]
@@ -112,7 +113,8 @@ def locate(
     Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
     a surface's is the mean of its own hits. drift: as of `ray_spread`. outline_sigma_m: how far the
     map's outlines (roofs, crowns) lie beside today's; it decides which surfaces are met, and is no
-    error of a place on one.
+    error of a place on one. pixel_sigma: of the pixel, px, per axis. map_sigma_m: of the map's
+    surface.
     """
     eye, d = ray_in_world(estimate, pixel)
     distance = float(cast(eye, d[None, :]).distances[0])

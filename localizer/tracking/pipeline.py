@@ -230,7 +230,9 @@ class Localizer:
 
     @property
     def frame(self) -> LocalFrame:
-        """The map's ENU frame, in which poses are given: to and from WGS84."""
+        """The map's ENU frame, in which poses are given: to and from WGS84. `GeoreferenceError` if
+        the localizer was made without it.
+        """
         if self._map_frame is None:
             raise GeoreferenceError("this localizer was made without its map's frame")
         return self._map_frame
@@ -352,6 +354,7 @@ class Localizer:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2).
 
         at: where the camera will be soon, if the view is to be rendered from there.
+        `OutsideMapError` if the view shows no map, `MapLoadingError` while tiles are being read.
         """
         pose = (at or prior).world_from_camera
         view = self._renderer.render(pose, self.camera, wait=wait)
@@ -387,6 +390,7 @@ class Localizer:
         """Register the frame against the anchors, test the result and update the filter.
 
         anchors: None where no reference can be had: the odometry answers, if it can.
+        `OutsideMapError` before there is a prior.
         """
         seen = self.tracker
         ahead = self._tracker.at_frame(seen, frame.exposure_time_ns)

@@ -116,7 +116,9 @@ class GnssFault:
 def gnss_fault(
     state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
 ) -> GnssFault | None:
-    """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; or None."""
+    """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; or None.
+    sigmas: how many of both errors a difference may have.
+    """
     if not gnss_healthy(state, now_ns):
         return GnssFault(GnssProblem.LOST, proven=True)
     glitch = mavlink.EKF_GPS_GLITCHING if state.autopilot == "ardupilot" else 0

@@ -165,7 +165,9 @@ class Link:
             self._transport.keep_peer()
 
     def start(self) -> None:
-        """Start the owner thread; the first connection attempt happens in it."""
+        """Start the owner thread; the first connection attempt happens in it. `BridgeStateError` if
+        it was started before.
+        """
         if self._thread is not None:
             raise BridgeStateError(f"{self.name}: already started; make a new link")
         self._thread = threading.Thread(target=self._run, name=f"mavlink-{self.name}", daemon=True)

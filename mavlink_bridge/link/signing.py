@@ -19,7 +19,9 @@ _LONGEST_TEXT = 1024
 
 
 def load_key(path: Path) -> bytes:
-    """The 32-byte key of a file of 64 hexadecimal digits that only its owner can read."""
+    """The 32-byte key of a file of 64 hexadecimal digits that only its owner can read.
+    `SigningKeyError` for every other file.
+    """
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # a pipe would be waited for without end

@@ -28,7 +28,9 @@ _INTEGER_FORMATS = {
 
 
 def decode_value(value: float, kind: int, *, bytewise: bool) -> float:
-    """The number in PARAM_VALUE: PX4 puts an integer's bytes into the float, ArduPilot casts."""
+    """The number in PARAM_VALUE: PX4 puts an integer's bytes into the float, ArduPilot casts. kind:
+    MAV_PARAM_TYPE; bytewise: as PX4 does.
+    """
     if bytewise and kind in _INTEGER_FORMATS:
         return float(struct.unpack(_INTEGER_FORMATS[kind], struct.pack("<f", value))[0])
     return float(value)
@@ -76,7 +78,9 @@ class ParameterClient(VehicleClient):
         return {name: self._values[name][0] for name in names if name in self._values}
 
     def write(self, name: str, value: float) -> None:
-        """Set a parameter and check what the flight controller made of it."""
+        """Set a parameter and check what the flight controller made of it. `ParameterError` if it
+        has no such parameter or did not take the value.
+        """
         if self.read(name) is None:
             raise ParameterError(f"{name}: the flight controller has no such parameter")
         kind = self._values[name][1]

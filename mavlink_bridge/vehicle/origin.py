@@ -51,8 +51,9 @@ def north_east(
 ) -> tuple[float, float]:
     """(north, east) metres from the origin, in the firmware's own scaling.
 
-    ArduPilot: `Location::get_distance_NE` (longitude scaled at the mean latitude).
-    PX4: azimuthal equidistant projection on a sphere (`MapProjection::project`).
+    ArduPilot: `Location::get_distance_NE` (longitude scaled at the mean latitude). PX4: azimuthal
+    equidistant projection on a sphere (`MapProjection::project`). Latitudes and longitudes in
+    degrees.
     """
     d_lon = wrap_degrees(longitude_deg - origin_lon)
     if projection == "ardupilot":

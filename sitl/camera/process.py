@@ -106,7 +106,9 @@ class WorldCameraProcess:
         self.statistics: CameraStatistics | None = None
 
     def start(self) -> None:
-        """Starts the process and waits until it can take samples."""
+        """Starts the process and waits until it can take samples. `WorldCameraError` if it is not
+        ready in time.
+        """
         self._process.start()
         self._child.close()  # so that a dead child is seen as the end of the pipe
         if not self._connection.poll(_START_S):

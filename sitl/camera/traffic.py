@@ -31,7 +31,7 @@ def traffic(
     """Movers ``car0``... and ``person0``... on the world's main roads and pavements.
 
     frame: the map's ENU, in which they are given. The same arguments give the same traffic, so the
-    truth of every object is known at every time.
+    truth of every object is known at every time. cars, people: how many.
     """
     if not world.roads:  # a map of the user's has none that are known
         return ()

@@ -41,7 +41,9 @@ class Zooming:
 
 
 def level_of(factor: float) -> float:
-    """What CAMERA_SETTINGS says at a focal length, per cent of the range."""
+    """What CAMERA_SETTINGS says at a focal length, per cent of the range. factor: that focal
+    length, divided by the shortest one.
+    """
     return 100.0 * (factor - 1.0) / (MOST - 1.0)
 
 

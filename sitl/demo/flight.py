@@ -219,7 +219,9 @@ def camera_config(flight: FilmedFlight, folder: Path) -> WorldCameraConfig:
 
 
 def write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
-    """True and EKF positions in the map's ENU, at the EKF's times."""
+    """Write true and EKF positions in the map's ENU (m) at the EKF's times, in ns of the clock of
+    the vehicle record.
+    """
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = ("east_m", "north_m", "up_m")

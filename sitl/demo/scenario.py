@@ -172,7 +172,7 @@ class Scenario(StrictModel):
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read a scenario file; unknown keys and bad values are named."""
+    """Read a scenario file; unknown keys and bad values are named. `ScenarioError` holds them."""
     try:
         return validated(Scenario, read_settings(path, ScenarioError))
     except SettingsError as error:
@@ -185,7 +185,7 @@ def scenario_names() -> tuple[str, ...]:
 
 
 def named_scenario(name: str) -> Scenario:
-    """A scenario file by its path, or a shipped one by its name."""
+    """A scenario by its file's path, or a shipped one by its name; `ScenarioError` if none is."""
     shipped = DEMO_SCENARIOS / f"{name}.yaml"
     if shipped.exists() and not Path(name).exists():
         return load_scenario(shipped)

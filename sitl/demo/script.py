@@ -115,7 +115,9 @@ class FlightScript:
         self._pilot.land(_LANDING_TIMEOUT_S)
 
     def await_companion(self) -> None:
-        """On the ground: its first start on a machine compiles for a minute or more."""
+        """On the ground: its first start on a machine compiles for a minute or more. `FlightError`
+        if it takes longer than allowed.
+        """
         started = time.monotonic()
         while self._health() is None:
             self._require_companion()

@@ -149,7 +149,9 @@ def type_of(name: str) -> int:
 
 
 def read_parameter_file(path: Path) -> dict[str, float]:
-    """Values of an ArduPilot .parm file: name and value, split by blanks or comma; # comments."""
+    """Values of an ArduPilot .parm file: name and value, split by blanks or comma; # comments.
+    `ParameterFileError` if the file cannot be read or a line is malformed.
+    """
     values: dict[str, float] = {}
     try:
         lines = plain_text(path).splitlines()

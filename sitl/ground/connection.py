@@ -34,7 +34,7 @@ class Connection:
         self._send_lock = threading.Lock()
 
     def open(self, deadline: float, alive: Callable[[], None]) -> None:
-        """Connect, trying again until time.monotonic() is the deadline."""
+        """Connect, trying again until time.monotonic() is the deadline. `PilotError` after it."""
         while self._link is None:
             alive()
             try:

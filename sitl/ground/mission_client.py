@@ -20,7 +20,9 @@ class MissionClient:
         self._link = link
 
     def upload(self, steps: Sequence[MissionStep]) -> None:
-        """Replace the vehicle's mission; the first step becomes item 1, after home."""
+        """Replace the vehicle's mission; the first step becomes item 1, after home. `PilotError` if
+        the vehicle refuses it.
+        """
         home = MissionStep(mavlink.MAV_CMD_NAV_WAYPOINT)
         items = [home, *steps]
         kinds = ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK")

@@ -145,7 +145,9 @@ class Pilot:
         self.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
     def set_origin(self, origin: Location) -> None:
-        """Set the EKF origin (needed where there is no GNSS), and read back which one holds."""
+        """Set the EKF origin (needed where there is no GNSS), and read back which one holds.
+        `PilotError` if the vehicle did not take one.
+        """
         self.link.send(
             mavlink.MAVLink_set_gps_global_origin_message(
                 VEHICLE,

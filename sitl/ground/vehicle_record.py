@@ -80,7 +80,7 @@ class VehicleRecord:
 
     @property
     def truth(self) -> Truth:
-        """The newest true state."""
+        """The newest true state. `PilotError` if none was received."""
         newest = self._truth.newest
         if newest is None:
             raise PilotError("no truth has been received: connect first")

@@ -58,7 +58,7 @@ def make_chase(
     world: WorldInfo, frame: LocalFrame, epoch_ns: int, lead_s: float, seed: int = 0
 ) -> Chase:
     """The stretch of road nearest to home that is long enough; the car reaches it `lead_s` after
-    the epoch. frame: the map's ENU.
+    the epoch. frame: the map's ENU. ValueError if there is none.
     """
     needed = _ROOFS_AFTER_S[-1] * SPEED_MPS + 0.5 * _roof_length() + _AHEAD_M
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu

@@ -32,7 +32,9 @@ def find_arducopter() -> Path | None:
 
 
 def find_defaults(binary: Path) -> Path:
-    """ArduPilot's default SITL parameters: beside the binary or below ARDUPILOT_HOME."""
+    """ArduPilot's default SITL parameters: beside the binary or below ARDUPILOT_HOME.
+    `ArduPilotNotFoundError` if there are none.
+    """
     folders = [binary.parent, *binary.parents[1:4]]
     home = os.environ.get("ARDUPILOT_HOME")
     if home:

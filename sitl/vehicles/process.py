@@ -140,7 +140,9 @@ class VehicleProcess(ABC):
         return fault
 
     def restart(self) -> None:
-        """End the vehicle and start it anew on the same ports, as after a power loss."""
+        """End the vehicle and start it anew on the same ports, as after a power loss.
+        `VehicleProcessError` if it does not come back.
+        """
         self._end()
         self._launch()
         if fault := self._wait_listening():

@@ -82,7 +82,9 @@ class Assembled:
 def assemble(
     tree: SourceTree, records: dict[int, TileRecord], staged: Staging, frame: LocalFrame
 ) -> Assembled:
-    """Put the imported tiles in their places in the staging folder."""
+    """Put the imported tiles in their places in the staging folder. `MapSourceError` if no tile has
+    a surface.
+    """
     root = _graft(tree.root, records)
     nodes = [root]
     child_start = []

@@ -73,7 +73,9 @@ def build_tree(
     *,
     progress: Progress | None = None,
 ) -> Manifest:
-    """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
+    """Build a cache from any importer's tree; see `build_cache`. name: of the source.
+    `MapSourceError` if a tile cannot be read and bad tiles are not to be skipped.
+    """
     options = options or BuildOptions()
     rules = options.rules
     date = _date(options.imagery_date) or tree.imagery_date

@@ -16,7 +16,8 @@ _PADDING = 2  # texels around a packed chart
 
 def cropped(mesh: SourceMesh, left: float, top: float, size: float) -> SourceMesh | None:
     """The triangles whose centroids lie in a square (x, y; metres), with just their part of the
-    texture; None where there are none.
+    texture; None where there are none. left, top: its western and northern edge, m; size: its side,
+    m.
     """
     centroid = mesh.positions[mesh.faces, :2].mean(axis=1)
     here = (

@@ -27,6 +27,7 @@ def heights_of(
 
     separation_m, datum: as given. The source's own statement, the given number and EGM96 must
     agree; what nobody says is computed (the separation) or an error (the datum).
+    `GeoreferenceError` if the datum is unknown or its separation cannot be found.
     """
     if datum not in (None, "ellipsoidal", "amsl"):
         raise GeoreferenceError(f"vertical datum {datum!r}: ellipsoidal and amsl are known")

@@ -115,6 +115,8 @@ def _stored_from_json(data: dict[str, Any]) -> StoredTile:
 def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterator[Staging]:
     """The staging folder of a build, locked; what an interrupted build of the same `parameters`
     left there is kept. On an exception it stays for the next try, `out` is not touched.
+    `MapCacheError` if the cache exists (unless it may be replaced), the folder cannot be made, or
+    another build holds it. overwrite: an existing cache may be replaced.
     """
     if out.exists() and not overwrite:
         raise MapCacheError(

@@ -41,7 +41,8 @@ def seen_from_above(
     groups: Iterable[Sequence[Textured]], left: float, top: float, size: float
 ) -> list[SourceMesh]:
     """A square (metres, z up) of the meshes as one textured height field; the groups are drawn one
-    after the other, so that only one need be in memory.
+    after the other, so that only one need be in memory. left, top: the square's western and
+    northern edge; size: its side.
     """
     step = size / CELLS
     heights = np.full((CELLS + 1, CELLS + 1), -np.inf)

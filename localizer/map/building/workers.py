@@ -89,7 +89,8 @@ def import_all(
     root: SourceNode, job: ImportJob, workers: ImportWorkers, progress: Progress
 ) -> dict[int, TileRecord]:
     """Records of every source tile, by its place in `tiles_of` order. progress: called here, in the
-    caller's thread, with the number of tiles that are done and of all.
+    caller's thread, with the number of tiles that are done and of all. `MapSourceError` if no tile
+    has content.
     """
     records: dict[int, TileRecord] = {}
     todo: list[tuple[int, TileSource]] = []

@@ -241,7 +241,9 @@ def encode_tile(
 
 
 def decode_tile(data: bytes, world_from_tile: Pose, *, textured: bool = True) -> TileMesh:
-    """Inverse of `encode_tile`. textured: False leaves the mips out."""
+    """Inverse of `encode_tile`. textured: False leaves the mips out. `MapCacheError` if the bytes
+    are not a tile.
+    """
     try:
         arrays = safetensors.numpy.load(data)
         positions, uvs, faces = (arrays[k] for k in ("positions", "uvs", "faces"))

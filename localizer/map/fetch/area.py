@@ -56,7 +56,9 @@ class Area:
         return float(width), float(_WGS84.inv(longitude, self.south, longitude, self.north)[2])
 
     def bounds_in(self, crs: CRS) -> tuple[float, float, float, float]:
-        """Left, bottom, right, top in a CRS, its first axis being easting or longitude."""
+        """Left, bottom, right, top in a CRS, its first axis being easting or longitude.
+        `MapFetchError` if the CRS does not reach the area.
+        """
         shares = np.linspace(0.0, 1.0, _DENSE)
         lon = self.west + (self.east - self.west) * shares
         lat = self.south + (self.north - self.south) * shares
@@ -83,7 +85,9 @@ class Area:
 
 
 def around(points: Array, margin_m: float) -> Area:
-    """What lies within `margin_m` of places, (n, 2) latitude and longitude in degrees."""
+    """What lies within `margin_m` of places, (n, 2) latitude and longitude in degrees.
+    `MapFetchError` without a place, or if the margin is not above 0 and at most 100 km.
+    """
     at = np.asarray(points, np.float64).reshape(-1, 2)
     if not len(at) or not np.isfinite(at).all():
         raise MapFetchError("no place to fetch a map around")

@@ -134,6 +134,7 @@ def choose(
 ) -> CatalogueSource:
     """The source of that name, else the finest whose bounds hold the area. role: imagery, or
     heights, which takes a surface before a terrain and a world's model only as the last resort.
+    `MapFetchError` if there is none.
     """
     fitting = [s for s in sources if s.has_heights == (role == "heights")]
     if name is not None:

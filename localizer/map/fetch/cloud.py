@@ -137,7 +137,10 @@ def plan_files(
     source: CatalogueSource, area: Area, resolution_m: float, files: Sequence[CloudFile],
     client: PoliteClient,
 ) -> FetchPlan:  # fmt: skip
-    """Windows of the files that meet an area. The grid is the files' own where they share it."""
+    """Windows of the files that meet an area. The grid is the files' own where they share it.
+    `MapFetchError` if there is no file or there are too many, `NoFileError` if none of the named
+    ones exists.
+    """
     wanted = [f for f in files if area.meets(f.bounds)]
     if not wanted:
         raise MapFetchError(f"{source.name}: has no file at {area}")

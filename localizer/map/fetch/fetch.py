@@ -65,6 +65,7 @@ def fetch(
 ) -> float:  # fmt: skip
     """The raster `out`. Pieces that lie in the folder from a run that was cut off are not asked for
     again; those of another plan are removed. Returns the share of the raster that is known.
+    `MapFetchError` if the source has too little of the area.
     """
     _claim(source, plan, folder)
     missing = [p for p in plan.pieces if not (folder / p.name).exists()]

@@ -29,7 +29,9 @@ _LOWEST_M, _HIGHEST_M = -1000.0, 9500.0
 
 
 def assemble(source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path) -> float:
-    """Write the raster; what no piece has is masked. Returns the share of it that is known."""
+    """Write the raster; what no piece has is masked. Returns the share of it that is known.
+    `MapFetchError` if the pieces make no raster.
+    """
     grid, heights = plan.grid, source.has_heights
     profile: dict[str, Any] = {
         "driver": "GTiff", "width": grid.width, "height": grid.height, "tiled": True,

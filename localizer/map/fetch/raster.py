@@ -102,7 +102,9 @@ def grid_over(
 
 
 def cut(grid: FetchGrid, side: int) -> list[tuple[int, int, int, int]]:
-    """Column, row, width and height of pieces with at most `side` pixels a side."""
+    """Column, row, width and height of pieces with at most `side` pixels a side. `MapFetchError` if
+    there are too many.
+    """
     count = math.ceil(grid.width / side) * math.ceil(grid.height / side)
     if count > _MOST_PIECES:
         raise MapFetchError(f"{count} pieces: a smaller area or a coarser --resolution")

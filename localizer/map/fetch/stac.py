@@ -22,7 +22,10 @@ _TIFFS = ("image/tiff", "image/vnd.stac.geotiff")
 
 
 def stac_files(source: CatalogueSource, area: Area, client: PoliteClient) -> list[CloudFile]:
-    """The asset of each item that meets the area; of items of one place the newest comes first."""
+    """The asset of each item that meets the area; of items of one place the newest comes first.
+    `MapFetchError` if pystac is missing, the answer cannot be read, or it has no GeoTIFF or too
+    many items.
+    """
     try:
         import pystac
     except ImportError as error:

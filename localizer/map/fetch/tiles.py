@@ -53,7 +53,9 @@ class Level:
 def plan_tiles(
     source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
 ) -> FetchPlan:
-    """The tiles over an area, of the level that is about as fine as wished."""
+    """The tiles over an area, of the level that is about as fine as wished. `MapFetchError` if the
+    source has none there.
+    """
     if source.kind == "wmts":
         level = _wmts_level(source, area, resolution_m, client)
     else:

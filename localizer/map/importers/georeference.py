@@ -37,7 +37,9 @@ class Georeference:
     unread: tuple[str, ...] = ()
 
     def ecef(self, points: Array) -> Array:
-        """ECEF (N, 3) of the mesh's points (N, 3), z up, metres."""
+        """ECEF (N, 3) of the mesh's points (N, 3), z up, metres. `GeoreferenceError` without a CRS
+        or an origin.
+        """
         if self.crs is not None:
             return ecef_from_crs(self.crs, points + np.array(self.offset))
         if self.origin is None:
@@ -66,8 +68,9 @@ class Georeference:
 
 def read_georeference(path: Path) -> Georeference:
     """Read OpenDroneMap's offset file (``WGS84 UTM 29N`` and ``easting northing``), or JSON:
-    ``{"origin": {"lat": ..., "lon": ..., "height": ...}, "heading_deg": 0}`` or
-    ``{"epsg": 32629, "offset": [easting, northing, height]}``.
+    ``{"origin": {"lat": ..., "lon": ..., "height": ...}, "heading_deg": 0}`` or ``{"epsg": 32629,
+    "offset": [easting, northing, height]}``. `GeoreferenceError` if the file cannot be read or is
+    neither.
     """
     try:
         text = plain_text(path)
@@ -133,7 +136,9 @@ def _geographic(crs: str) -> Transformer:
 
 
 def ecef_from_crs(crs: str, points: Array) -> Array:
-    """ECEF (N, 3) of a CRS's eastings, northings and ellipsoidal heights (N, 3)."""
+    """ECEF (N, 3) of a CRS's eastings, northings and ellipsoidal heights (N, 3).
+    `GeoreferenceError` for coordinates outside the CRS's area.
+    """
     lon, lat = _geographic(crs).transform(points[:, 0], points[:, 1])
     if not np.isfinite(lon).all():
         raise GeoreferenceError("coordinates outside the area where their CRS is defined")

@@ -76,6 +76,7 @@ def read_gltf(
     """Meshes of a GLB or glTF document, and its CESIUM_RTC centre (3,), zero when it has none.
 
     Meshes of one image are merged. Positions are in the document's axes (y up), nodes applied.
+    `MapSourceError` if it is malformed.
     """
     try:
         document = _Document(data, read_uri, rules or ImportRules())
@@ -85,7 +86,9 @@ def read_gltf(
 
 
 def gltf_weight(data: bytes, read_uri: Reader, rules: ImportRules | None = None) -> tuple[int, int]:
-    """Triangles and texels of a document, from its headers alone; see `read_gltf`."""
+    """Triangles and texels of a document, from its headers alone; see `read_gltf`. `MapSourceError`
+    if it is malformed.
+    """
     try:
         return _Document(data, read_uri, rules or ImportRules()).weight()
     except MALFORMED as error:
@@ -96,7 +99,7 @@ def gltf_bounds(
     data: bytes, read_uri: Reader, rules: ImportRules | None = None
 ) -> tuple[Array, Array]:
     """Corners (N, 3) of boxes that hold the document's surfaces, by its headers where they say it,
-    and its CESIUM_RTC centre (3,); see `read_gltf`.
+    and its CESIUM_RTC centre (3,); see `read_gltf`. `MapSourceError` if it is malformed.
     """
     try:
         document = _Document(data, read_uri, rules or ImportRules())

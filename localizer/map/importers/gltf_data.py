@@ -42,7 +42,9 @@ class GltfData:
         return self._uri(image.get("uri", ""))
 
     def accessor(self, index: int) -> NDArray[Any]:
-        """An accessor's elements (count, components)."""
+        """An accessor's elements (count, components). `MapSourceError` if it is sparse, of an
+        unknown type, or larger than its buffer view.
+        """
         accessor = item(self.json.get("accessors", []), index, "accessor")
         if "sparse" in accessor:
             raise MapSourceError("uses sparse accessors, not supported")
@@ -63,7 +65,9 @@ class GltfData:
         return normalised(array, accessor)
 
     def buffer_view(self, index: int) -> tuple[bytes, int]:
-        """A view's bytes and its stride, 0 if it is packed."""
+        """A view's bytes and its stride, 0 if it is packed. `MapSourceError` if it is compressed or
+        reaches beyond its buffer.
+        """
         view = item(self.json.get("bufferViews", []), index, "buffer view")
         if "EXT_meshopt_compression" in view.get("extensions", {}):
             raise MapSourceError("uses EXT_meshopt_compression, not supported")
@@ -93,7 +97,7 @@ class GltfData:
 
 
 def checked_count(accessor: dict[str, Any]) -> int:
-    """How many elements an accessor claims, within what can be."""
+    """How many elements an accessor claims, within what can be. `MapSourceError` otherwise."""
     count = whole(accessor.get("count", 0), "count")
     if not 0 < count <= MAX_ELEMENTS:
         raise MapSourceError(f"an accessor has {count} elements; 1 to {MAX_ELEMENTS} can be")
@@ -149,7 +153,9 @@ def normalised_bounds(bounds: Array, accessor: dict[str, Any]) -> Array:
 
 
 def vector(values: Any, length: int, what: str) -> Array:
-    """Numbers of the JSON as (length,); `what` names them in the error."""
+    """Numbers of the JSON as (length,); `what` names them in the error. `MapSourceError` if they
+    are not so many finite numbers.
+    """
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -160,14 +166,14 @@ def vector(values: Any, length: int, what: str) -> Array:
 
 
 def whole(value: Any, what: str) -> int:
-    """A whole number of the JSON, from 0 up."""
+    """A whole number of the JSON, from 0 up. `MapSourceError` for another value."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
         raise MapSourceError(f"{what} is {reprlib.repr(value)}, not a whole number from 0 up")
     return value
 
 
 def item(items: Any, index: Any, what: str) -> dict[str, Any]:
-    """The object at an index of one of the JSON's lists."""
+    """The object at an index of one of the JSON's lists. `MapSourceError` if there is none."""
     if (
         not isinstance(items, list)
         or not isinstance(index, int)

@@ -25,7 +25,12 @@ def height_mesh(
 ) -> tuple[Array, NDArray[np.int32]] | None:
     """Vertices (V, 3), x east and y north of the tile's first vertex, and faces (F, 3).
 
-    None where nothing is left. Cells with an unknown corner or no picture are left out.
+    heights: (n + 1, n + 1), m, the northern row first; masked where unknown. shown: which pixels of
+    the tile's picture are known. step: distance of neighbouring vertices to the east and to the
+    south, m. lossless: keep the surface exact (the finest level); otherwise simplification removes
+    half of the triangles. Vertical strips (skirts) two steps deep hang from the tile's border, so
+    that no gap shows between neighbouring tiles. Cells with an unknown corner or no picture are
+    left out; None where nothing is left.
     """
     n = heights.shape[0] - 1
     known = ~np.ma.getmaskarray(heights)

@@ -120,7 +120,7 @@ def _require_plain_sidecar(path: Path) -> None:
 
 def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
     """What every raster of a map must have: a size within the limits, a CRS and a place. Returns
-    the doubts that were set aside.
+    the doubts that were set aside. `GeoreferenceError` if one is missing or singular.
     """
     rules.require("pixels", float(data.width) * data.height, path)
     if data.crs is None:
@@ -176,7 +176,9 @@ def has_own_mask(data: DatasetReader) -> bool:
 
 
 def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
-    """Red, green and blue of an orthophoto, by what its bands are called."""
+    """Red, green and blue of an orthophoto, by what its bands are called. `MapSourceError` if they
+    are indices into a palette.
+    """
     meaning = list(data.colorinterp)
     if meaning[0] == ColorInterp.palette:
         raise MapSourceError(
@@ -264,7 +266,9 @@ def height_band(
     nodata: float | None,
     rules: ImportRules,
 ) -> tuple[HeightBand, list[str]]:
-    """Conversion of the DSM's numbers to metres; an unknown unit is an error."""
+    """Conversion of the DSM's numbers to metres; an unknown unit is an error. `GeoreferenceError`
+    for the unit, `MapSourceError` if scale and offset give no heights.
+    """
     unit, warnings = stated.unit_m, []
     if height_unit is not None:
         given = unit_of(height_unit)

@@ -57,7 +57,9 @@ class ImportRules:
 
     @classmethod
     def of(cls, limits: Iterable[str] = (), trusted: Iterable[str] = ()) -> ImportRules:
-        """From the command line's ``NAME=NUMBER`` and names of doubts."""
+        """From the command line's ``NAME=NUMBER`` and names of doubts. `MapSourceError` for another
+        name or no number.
+        """
         given: dict[str, Any] = {}
         for text in limits:
             name, _, number = text.partition("=")

@@ -104,7 +104,7 @@ def read_tileset(
     path: Path, rules: ImportRules | None = None, up_axis: UpAxis | None = None
 ) -> SourceTree:
     """Read `tileset.json` (or the folder that holds it) and every tileset it refers to. up_axis: of
-    its glTF, whatever it says itself.
+    its glTF, whatever it says itself. `MapSourceError` if one cannot be read or is malformed.
     """
     try:
         return _read_tileset(path, rules or ImportRules(), up_axis)
@@ -140,7 +140,7 @@ def _read_tileset(path: Path, rules: ImportRules, up_axis: UpAxis | None) -> Sou
 
 
 def read_file(path: Path, rules: ImportRules) -> bytes:
-    """Bytes of a source file, which must exist and be of a sane size."""
+    """Bytes of a source file. `MapSourceError` if it is missing, an archive or too large."""
     require_plain_file(path)
     try:
         rules.require("file_bytes", path.stat().st_size, path)
@@ -167,7 +167,9 @@ def _gunzipped(data: bytes, path: Path, rules: ImportRules) -> bytes:
 
 
 def inside(folder: Path, base: Path, uri: str) -> Path:
-    """The file that `uri` means, relative to `base`; it must lie within `folder`."""
+    """The file that `uri` means, relative to `base`; it must lie within `folder`. `MapSourceError`
+    otherwise.
+    """
     parts = urlsplit(uri)
     if parts.scheme or parts.netloc:
         raise MapSourceError(f"{uri!r} is not a local file; download the tileset first")
@@ -275,15 +277,17 @@ class _Reader:
 
     def _doubted(self, T: Array, path: Path) -> Array:
         """A tile's transform, which should move and turn only."""
-        text = stretched(T)
+        text = stretch_of(T)
         if text is not None:
             name = "mirrored" if np.linalg.det(T[:3, :3]) < 0 else "scaled"
             self.warnings.append(self.rules.doubt(name, f"{path}: a tile's transform {text}"))
         return T
 
 
-def stretched(T: Array) -> str | None:
-    """What a transform (4, 4) does besides moving and turning; None where that is nothing."""
+def stretch_of(T: Array) -> str | None:
+    """Text on how a transform (4, 4) mirrors or scales what it places; None if it does neither, up
+    to 1 % of scale. `MapSourceError` if it flattens space or projects it.
+    """
     sizes = np.linalg.svd(T[:3, :3], compute_uv=False)
     if sizes[-1] <= 1e-12 * max(sizes[0], 1e-300) or not np.allclose(T[3], (0, 0, 0, 1)):
         raise MapSourceError("a transform flattens space or projects it")

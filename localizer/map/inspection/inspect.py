@@ -145,7 +145,9 @@ def _place(cache: TileCache) -> str:
 
 
 def depth_picture(depth: NDArray[np.float32]) -> Image:
-    """Depth as colours (RGB), near is bright; black where there is no surface."""
+    """Depth (H, W), m, as false colours (H, W, 3) RGB: near is red, far is blue, no surface (0) is
+    black. The scale is linear in 1/depth between this picture's 1st and 99th percentile.
+    """
     shown = depth > 0
     if not shown.any():
         return np.zeros((*depth.shape, 3), np.uint8)

@@ -89,7 +89,9 @@ def _store(path: Path, code: bytes) -> None:
 def compile_image(
     nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: list[str]
 ) -> Image:
-    """Compile `main` with the others as its headers, past the cache."""
+    """Compile `main` with the others as its headers, past the cache. `CudaError` with the
+    compiler's log if it fails.
+    """
     headers = {name: text for name, text in sources.items() if name != main}
     program = _checked(
         nvrtc,

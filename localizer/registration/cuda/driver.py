@@ -63,7 +63,9 @@ class Device:
         return np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(address))
 
     def upload(self, address: int, array: NDArray[Any]) -> None:
-        """Queue a copy of a C-contiguous array to the device; pageable memory is staged at once."""
+        """Queue a copy of a C-contiguous array to the device; pageable memory is staged at once.
+        ValueError for another layout.
+        """
         if not array.flags.c_contiguous:
             raise ValueError("only C-contiguous arrays can be copied to the device")
         self._call(

@@ -49,7 +49,9 @@ class Appearance:
 
 
 def sample_appearance(rng: np.random.Generator, condition: str | None = None) -> Appearance:
-    """Draw an appearance; `condition` is one of `CONDITIONS`, None draws it too."""
+    """Draw an appearance; `condition` is one of `CONDITIONS`, None draws it too. ValueError for
+    another condition.
+    """
     if condition is None:
         condition = str(rng.choice(CONDITIONS, p=(0.4, 0.15, 0.15, 0.12, 0.1, 0.08)))
     if condition not in CONDITIONS:

@@ -45,7 +45,7 @@ class TileNode:
 
 
 def encode_jpeg(image: Image) -> bytes:
-    """JPEG bytes of an RGB image."""
+    """JPEG bytes of an RGB image. `MapSourceError` if it cannot be encoded."""
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:

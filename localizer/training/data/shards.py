@@ -113,7 +113,7 @@ def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:
 
 
 def read_shard(path: Path) -> list[Pair]:
-    """The pairs of one shard."""
+    """The pairs of one shard. `SequenceError` if the file cannot be read or holds no pairs."""
     try:
         # Opened here: NumPy leaves a damaged archive open.
         with path.open("rb") as file, np.load(file) as data:

@@ -31,7 +31,9 @@ from localizer.training.data.seeds import FIRST_WORLD_SEED
 def world_pairs(
     seed: int, scenes: SceneConfig, *, count: int, size_m: float = 800.0, flight_days: int = 2
 ) -> Iterator[Pair]:
-    """`count` pairs of the world of `seed`: surveyed once, seen again on other days."""
+    """`count` pairs of the world of `seed`: surveyed once, seen again on other days.
+    `MapSourceError` for a seed below `FIRST_WORLD_SEED`.
+    """
     if seed < FIRST_WORLD_SEED:
         raise MapSourceError(f"training worlds have seeds from {FIRST_WORLD_SEED} on, got {seed}")
     rng = np.random.default_rng((seed, 7))

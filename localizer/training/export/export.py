@@ -53,7 +53,9 @@ class Deployed(nn.Module):
 
 
 def load_network(checkpoint: Path) -> tuple[Network, TrainConfig, dict[str, object]]:
-    """The averaged network of a checkpoint in evaluation mode, its configuration, its progress."""
+    """The averaged network of a checkpoint in evaluation mode, its configuration, its progress.
+    `ModelError` if the checkpoint is not a run's or of another version.
+    """
     state = read_checkpoint(checkpoint)
     try:
         config = TrainConfig.model_validate(state["config"])
@@ -70,7 +72,8 @@ def load_network(checkpoint: Path) -> tuple[Network, TrainConfig, dict[str, obje
 def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
     """Write `model` (ONNX) and its JSON; returns how it compares with torch in float32, checked.
 
-    half: float16 inside, for GPUs. `tiny` is refused: its fixed channels need float32.
+    half: float16 inside, for GPUs. `tiny` is refused: its fixed channels need float32. `ModelError`
+    for a precision that the network does not support.
     """
     network, config, progress = load_network(checkpoint)
     if half and not isinstance(network, S0Net):

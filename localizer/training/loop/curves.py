@@ -11,7 +11,9 @@ from localizer.errors import SequenceError
 
 
 def plot(log: Path) -> Path:
-    """Plot every column of a run's CSV over its steps; returns the PNG beside it."""
+    """Plot every column of a run's CSV over its steps; returns the PNG beside it. `SequenceError`
+    if the file is not a run's CSV.
+    """
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 

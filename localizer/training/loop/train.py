@@ -195,7 +195,7 @@ class Trainer:
 
 
 def learning_rate(step: int, o: OptimizerSection) -> float:
-    """Linear warm-up, a plateau, a cosine to zero over the last `decay_steps`."""
+    """Linear warm-up, a plateau, a cosine to zero over the last `decay_steps`. step: from 0."""
     warm = min(1.0, (step + 1) / max(o.warmup_steps, 1))
     left = min(1.0, (o.steps - step) / o.decay_steps)
     return float(o.learning_rate * warm * 0.5 * (1 - np.cos(np.pi * left)))

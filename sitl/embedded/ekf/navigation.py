@@ -73,7 +73,10 @@ def predict(s: Array, cov: Array, imu: Array, noise: Array) -> None:
 
 @njit(cache=True)
 def fuse(s: Array, cov: Array, index: int, innovation: float, variance: float) -> None:
-    """Scalar Kalman update of the error state `index` that was observed directly, in place."""
+    """Scalar Kalman update of the error state `index` that was observed directly, in place. s:
+    nominal state (16,); cov: (15, 15); innovation: measured minus predicted; variance: of the
+    measurement.
+    """
     gain = cov[:, index] / (cov[index, index] + variance)
     row = cov[index, :].copy()
     for i in range(ERROR_SIZE):

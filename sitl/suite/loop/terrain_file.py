@@ -15,7 +15,10 @@ _METRES_PER_DEG = 111_320.0
 
 
 def terrain_file(world: WorldInfo, path: Path, off_m: float) -> Path:
-    """Write a GeoTIFF (EPSG:4326) of the world's ground, a height each 30 m, `off_m` too high."""
+    """Write a GeoTIFF (EPSG:4326, float32) of the world's ground to `path`, which is returned. It
+    holds a height above the ellipsoid every 30 m, over the whole world; `off_m`: added to each
+    height, m.
+    """
     here = world.origin
     lat = _POST_M / _METRES_PER_DEG
     lon = lat / np.cos(np.radians(here.latitude_deg))
