@@ -345,7 +345,11 @@ def _with_log(
     exposed = exposures_of([f.time_ns for f in frames], log.exposures) if utc else None
     told: Sequence[Telemetry | None]
     if exposed is not None:
-        told, ahead_ns = exposed, _exposure_ahead_ns(frames, exposed, file, notes)
+        told = exposed
+        stamps = [(e.time_ns or 0) - (f.time_ns or 0) for f, e in zip(frames, exposed, strict=True)]
+        ahead_ns = round(float(np.median(stamps))) if is_dated else 0
+        by = f"times, {1e-9 * ahead_ns:+.2f} s apart" if is_dated else "order: they have no times"
+        notes.append(f"each image is one of {file.name}'s exposures (CAM, TRIG), by their {by}")
     elif reach is None:
         raise FootageError(
             f"{file}: the images have no times, so the log cannot be laid beside them; use "
@@ -383,21 +387,6 @@ def _with_log(
     ]
     fixed_pitch_deg = None if log.has_gimbal else options.fixed_pitch_deg
     return moved, LogBeside(file, ahead_ns, fixed_pitch_deg)
-
-
-def _exposure_ahead_ns(
-    frames: Sequence[RecordedFrame], exposed: Sequence[Telemetry], file: Path, notes: list[str]
-) -> int:
-    """The log's clock less that of images whose exposures are in it; 0 for images without times."""
-    ahead = [
-        e.time_ns - f.time_ns
-        for f, e in zip(frames, exposed, strict=True)
-        if f.time_ns is not None and e.time_ns is not None
-    ]
-    ahead_ns = round(float(np.median(ahead))) if ahead else 0
-    by = f"times, {1e-9 * ahead_ns:+.2f} s apart" if ahead else "order, as they have no times"
-    notes.append(f"each image is one of {file.name}'s exposures (CAM, TRIG), by their {by}")
-    return ahead_ns
 
 
 def _apart_m(a: RecordedPosition, b: RecordedPosition) -> float:

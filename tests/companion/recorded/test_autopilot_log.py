@@ -189,7 +189,7 @@ _EXPOSED = (4.03, 5.21, 7.34, 8.02, 11.57, 12.66)
     ("stamps", "by"),
     [
         ([round(t) for t in _EXPOSED[1:]], r"by their times, \+\d\d\.\d\d s apart"),
-        ([None] * 6, "by their order, as they have no times"),
+        ([None] * 6, "by their order: they have no times"),
     ],
 )
 def test_photos_whose_exposures_are_logged_take_those(tmp_path, stamps, by):
