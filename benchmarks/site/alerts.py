@@ -29,7 +29,8 @@ switch to vision do not start; injection that is running continues. The pilot (m
 A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
 the shadow check; it becomes a STATUSTEXT in mode inject only, if fixes come but injection has not
 started for 10 s.
-Alerts of localization are assessed once a second; the same one is sent at most every 10 s.
+Alerts of localization are assessed once a second; the same one is sent at most every 10 s. An alert
+whose row does not mention fixes or positions has no effect on them.
 
 The end of an alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the
 text in brackets. The end of the rest shows by the next status, for example `localization tracking`.

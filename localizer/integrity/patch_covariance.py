@@ -1,5 +1,5 @@
 """Covariance of a registered pose from the displacements of its image's patches (registration.md,
-8).
+8a).
 
 At the registered pose each patch of the image has a shift under which it matches the map best. If
 the map were right everywhere, these shifts would be noise of a fraction of a pixel. Where it is of
@@ -7,8 +7,8 @@ another date or sensor they scatter more, and where the map lacks buildings and 
 displaced by its parallax. Neighbouring patches on one roof err together, so counting anchors as
 independent makes a pose look ten times better known than it is.
 
-The pose follows the displacements by least squares, ``xi = (A'A)^-1 A'd``. So its covariance is
-``(A'A)^-1 A' S A (A'A)^-1``, where S has two parts: noise that is independent from patch to patch,
+The pose follows the displacements by least squares, ``xi = (X'X)^-1 X'd``. So its covariance is
+``(X'X)^-1 X' W X (X'X)^-1``, where W has two parts: noise that is independent from patch to patch,
 measured from the displacements themselves, and heights that the map does not have.
 """
 

@@ -3,7 +3,7 @@
 The registration uses no other sensor. Its covariance says what the image cannot determine, such as
 a tilt against a shift over flat ground, or a tilt against roofs that the map lacks. One Kalman
 update with roll, pitch and height, each with its own sigma, then gives the fused pose
-(docs/explanation/registration.md, section 9).
+(docs/explanation/registration.md, section 9a).
 
 The same registrations estimate two errors that no sensor reports: the constant bias of the reported
 attitude (`attitude_bias`) and the map's height error (`localizer.integrity.height_error`).

@@ -23,9 +23,10 @@ _NUMBER: dict[str, Kind] = {"number": ""}
 _NUMBER_WHY: dict[str, Kind] = {"number": "", "why": "name"}
 
 HEALTH: tuple[AlertSpec, ...] = (
-    condition(A.INITIALIZING, INFO, "localization initializing", {}, "frames are processed, and "
-    "none is accepted yet",
-              "the first fix", f"the position is not known yet; {_NO_FIX}", _WAIT),
+    condition(A.INITIALIZING, INFO, "localization initializing", {},
+              "frames are processed, and the position is not confirmed yet",
+              "at least three frames in a row are accepted, and the position is confirmed",
+              f"the position is not known yet; {_NO_FIX}", _WAIT),
     condition(A.TRACKING, INFO, "localization tracking", {}, "frames are accepted",
               "another status follows", "fixes are made, and sent if injection runs", _NONE),
     condition(A.DEGRADED, WARNING, "localization degraded", {},
@@ -87,16 +88,16 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.VIDEO_STALLED, WARNING, "video feed stalled", {}, "no frame for 1 s",
               "a frame is received", _NO_FIX, _VIDEO),
     condition(A.VIDEO_SCALED, WARNING, "video scaled", {},
-              "the frames have another size than the calibration, with the same "
-              "aspect ratio", "they have the calibrated size",
+              "the frames have another size than the calibration, with the same aspect ratio",
+              "they have the calibrated size",
               f"{_SENT}, with a scaled camera model; if the camera crops, they are wrong",
               "set the camera to the calibrated resolution"),
     condition(A.MAP_UNREADABLE, WARNING, "map unreadable", {}, "map tiles cannot be read from disk",
-              "every tile is read", f"{_SENT}, but less accurate, because coarser tiles replace "
-              "them",
+              "every tile is read",
+              f"{_SENT}, but less accurate, because coarser tiles replace them",
               "check the disk after landing"),
-    condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {}, "a write to the record "
-    "failed, or its disk was gone at a restart",
+    condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {},
+              "a write to the record failed, or its disk was gone at a restart",
               "not before the next start",
               f"{_SENT}; recording goes on if the disk allows it", _RECORD),
     event(A.ENDING, NOTICE, "ending, nothing is injected any more", {},
@@ -117,8 +118,8 @@ HEALTH: tuple[AlertSpec, ...] = (
           "a second address sends video", f"{_SENT}; the second video is ignored",
           "if it is your camera, set camera.settings.sender"),
     condition(A.ZOOM_UNKNOWN, WARNING, "zoom unknown, no fixes: no CAMERA_SETTINGS", {},
-              "a frame has no recent CAMERA_SETTINGS; again every 10 s", "CAMERA_SETTINGS is "
-              "received",
+              "a frame has no recent CAMERA_SETTINGS; again every 10 s",
+              "CAMERA_SETTINGS is received",
               f"the focal length is unknown, so {_NO_FIX}",
               "check the camera's MAVLink connection; " + _BY_HAND),
     condition(A.ZOOM_NOT_IN_TABLE, WARNING, "zoom {level:.0f} not in table, no fixes",
@@ -127,8 +128,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "set a zoom level inside the table; " + _BY_HAND),
     event(A.MAP_OFFSET, NOTICE, "map {metres:.1f} m {direction} of GNSS{applied}",
           {"metres": "m", "direction": Direction, "applied": MapOffsetUse},
-          "for a minute or more vision and GNSS differ by a constant offset of at most 15 m; again "
-          "if it changes by 2 m",
+          "for a minute or more vision and GNSS differ by a constant offset of at most 15 m; "
+          "again if it changes by 2 m",
           f"{_SENT}; the map or GNSS has this offset; *applied*: it is subtracted from them",
           "check the map's georeference after landing"),
     event(A.DETECTOR_OFF, WARNING, "the detector is off, see the log", {},

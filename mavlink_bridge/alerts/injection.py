@@ -36,9 +36,9 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
               "mode inject, message external_position_estimate: no fix is sent for 2 s, because "
               "the autopilot did not accept the command while its EKF used GNSS",
-              "the autopilot accepts the command", "this firmware cannot use the command; the EKF "
-              "receives no position", "set another bridge.injection.message; " + _BY_HAND,
-              lead=_NOT_SENT),
+              "the autopilot accepts the command",
+              "this firmware cannot use the command; the EKF receives no position",
+              "set another bridge.injection.message; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {},
               "a fix is due, the message is relative to the EKF origin, and no GPS_GLOBAL_ORIGIN "
               "was received", "GPS_GLOBAL_ORIGIN is received", "the EKF receives no position",
@@ -103,8 +103,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "check had failed, at most 10 min ago", "the shadow check passes",
               "the failure is still valid; nothing is sent", _MAP, lead=_NOT_READY),
     event(A.INJECTION_FORCED, WARNING, "injection forced, no shadow check", {},
-          "mode inject: injection starts with bridge.injection.force set, and the shadow check has "
-          "not passed", _UNVERIFIED, "use it in tests only"),
+          "mode inject: injection starts with bridge.injection.force set, and the shadow check "
+          "has not passed", _UNVERIFIED, "use it in tests only"),
     event(A.INJECTION_NOT_READY, WARNING, "injecting although not ready", {},
           "mode rc: the pilot enables injection, but the shadow check has not passed in the last "
           "10 min, or an alert inhibits", _UNVERIFIED, _LANDMARKS),
@@ -121,7 +121,8 @@ INJECTION: tuple[AlertSpec, ...] = (
           {"seconds": "s"},
           "mode rc: the process before this one crashed or was killed while injection was enabled "
           "by RC or command, at most 10 min ago",
-          "injection stays enabled; seconds: age of the stored state",
+          "injection stays enabled, and fixes that pass the checks are sent; seconds: age of the "
+          "stored state",
           "use the RC channel or the command to disable it"),
     event(A.JUMP_REPEATED, NOTICE, "the EKF missed a jump: announced again", {},
           "after an announced jump the EKF's position stays elsewhere in three comparisons; at "
@@ -153,8 +154,7 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
               "fixes are sent for 3 s, and the horizontal test ratio in EKF_STATUS_REPORT is "
               "above 1", "it is 1 or less", f"{_SENT}; the EKF does not use them",
-              "act as for `ekf_rejects_vision`; later check VISO_POS_M_NSE and the delay "
-              "parameter"),
+              "act as for `ekf_rejects_vision`; later check VISO_POS_M_NSE and the delay"),
     condition(A.FIXES_LATE, WARNING, "fixes {age_ms:.0f} ms old, delay_ms {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
               "the last 50 fixes are over 10 ms older than delay_ms",

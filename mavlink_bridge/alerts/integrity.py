@@ -17,8 +17,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VIDEO_FROZEN, ERROR, "video frozen", "video frozen {seconds:.0f} s",
               {"seconds": "s"},
               "in flight: identical frames for 1.5 s; no image motion while the EKF's velocity "
-              "moves "
-              "the vehicle by 2 m; or none in a hover for 3 s, or longer high above the ground",
+              "moves the vehicle by 2 m; or none in a hover for 3 s, or longer high above the "
+              "ground",
               "frames change for 2 s",
               "the camera or its link repeats an old frame, so the position does not change",
               _STABILIZE, action=OutputAction.EXCLUDE_AND_RESET, clear_s=2.0),
@@ -38,23 +38,24 @@ INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VISION_IMU_MISMATCH, ERROR, "vision/IMU mismatch",
               "vision/IMU mismatch {metres:.0f} m", {"metres": "m"},
               "over 1, 3 or 10 s the vision position moves by 0.8 to 1.5 m (+ 4 sigma) more or "
-              "less than the integrated IMU, for 0.2 s", "both agree for 5 s and the position "
-              "moves",
+              "less than the integrated IMU, for 0.2 s",
+              "both agree for 5 s and the position moves",
               "the vision position does not move as the vehicle does, so it is wrong", _STABILIZE,
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=0.2, clear_s=5.0),
     AlertSpec(A.HEIGHT_MISMATCH, ERROR, "height mismatch", "height {metres:.0f} m off barometer",
               {"metres": "m"},
-              "vision's height and the barometer's drift apart by more than 8 m, + 4 sigma and "
-              "16 % of the climb, for 2 s", "both agree for 5 s",
+              "vision's height and the barometer's drift apart by more than 8 m, + 4 sigma and 16 "
+              "% of the climb, for 2 s", "both agree for 5 s",
               "vision's height is wrong, and its position is probably wrong too", _STABILIZE,
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=2.0, clear_s=5.0),
     AlertSpec(A.POSITION_JUMP, ERROR, "position jump", "position jumped {metres:.0f} m",
-              {"metres": "m"}, "at once: a fix is 3 m (after an announced jump 10 m) farther from "
-              "the last one than the "
-              "vehicle can have flown",
-              "the new position agrees with the IMU for 5 s, or the old one is back",
+              {"metres": "m"},
+              "at once: a fix is 3 m (after an announced jump 10 m) farther from the last one "
+              "than the vehicle can have flown",
+              "the new position agrees with the IMU for 5 s (a turned one up to 60 s), or the old "
+              "one is back",
               "vision has found another position; the old or the new one is wrong",
-              "wait until it clears; do not change the mode until then",
+              "do not change the mode for 5 s; if it lasts, fly in STABILIZE or ALT_HOLD",
               action=OutputAction.EXCLUDE_AND_RESET),
     AlertSpec(A.POSITION_STEP, WARNING, "position step",
               "position step {metres:.0f} m, unexplained", {"metres": "m"},
@@ -80,13 +81,13 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               "EKF rejects vision ({ratio:.1f})", {"ratio": ""},
               "there are fixes, and the horizontal test ratio in EKF_STATUS_REPORT is above 1 for "
               "2 s",
-              "it is below 1 for 3 s", f"{_SENT}; the EKF does not use them, and its position "
-              "drifts",
+              "it is below 1 for 3 s",
+              f"{_SENT}; the EKF does not use them, and its position drifts",
               "fly in STABILIZE or ALT_HOLD, or select GNSS if it is good", raise_s=2.0,
               clear_s=3.0, repeat_s=10.0),
     AlertSpec(A.EKF_JUMP, WARNING, "EKF jump", "EKF jumped {metres:.0f} m, unconfirmed",
-              {"metres": "m"}, "armed: LOCAL_POSITION_NED steps by 3 m more than the velocity "
-              "explains, at once",
+              {"metres": "m"},
+              "armed: LOCAL_POSITION_NED steps by 3 m more than the velocity explains, at once",
               "vision and the IMU agree for 10 s",
               f"{_SENT}; the EKF was reset to a position that is not confirmed yet; *the EKF "
               "follows* is not reported",
@@ -107,8 +108,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               raise_s=1.0, clear_s=3.0),
     AlertSpec(A.FOCAL_LENGTH, WARNING, "focal length", "focal length {percent:.1f} % {direction}",
               {"percent": "%", "direction": CalibrationError},
-              "the estimated focal length differs from the calibration by 2.5 % and 4 sigma "
-              "for 2 s", "it is within the limit for 10 s",
+              "the estimated focal length differs from the calibration by 2.5 % and 4 sigma for 2 "
+              "s", "it is within the limit for 10 s",
               f"{_WIDER}; positions are wrong by about this share of the height above ground",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=2.0, clear_s=10.0, repeat_s=60.0),
@@ -116,8 +117,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               {"degrees": "deg", "axis": CalibrationError},
               "the attitude from vision differs from that of gimbal and autopilot by 3 deg and 4 "
               "sigma for 3 s", "it is within the limit for 10 s",
-              f"{_SENT}; the mounting angles in the deployment file, the gimbal or the compass are "
-              "wrong",
+              f"{_SENT}; the mounting angles in the deployment file, the gimbal or the compass "
+              "are wrong",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=3.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.TIME_OFFSET, WARNING, "time offset",
@@ -132,8 +133,9 @@ INTEGRITY: tuple[AlertSpec, ...] = (
 MONITOR: tuple[AlertSpec, ...] = (
     AlertSpec(A.MONITOR_FAILED, ERROR, "integrity monitor failed", "integrity monitor failed", {},
               "a check raises an exception, or the monitor's thread does not run for 2 s",
-              "all checks run again for 3 s", "no position is sent while the thread does not run, "
-              "or after checks have failed for 1 s; a shorter failure stops only its own fix",
+              "all checks run again for 3 s",
+              "no position is sent while the thread does not run, or after checks have failed for "
+              "1 s; a shorter failure stops only its own fix",
               _LAND, action=OutputAction.HOLD, clear_s=3.0,
               repeat_s=10.0),
     AlertSpec(A.FIXES_NOT_CHECKED, ERROR, "fix checks failed", "fix checks failed", {},
@@ -154,8 +156,7 @@ SOURCES: tuple[AlertSpec, ...] = (
               "vision or IMU, it scatters, or it states an accuracy above 5 m, for 2 s",
               "it agrees for 5 s",
               "fixes are still sent, and the EKF continues on vision; the receiver is jammed, "
-              "spoofed or "
-              "not settled, or the map has an offset", "stay on vision; select GNSS only if "
-              "landmarks confirm it",
+              "spoofed or not settled, or the map has an offset",
+              "stay on vision; select GNSS only if landmarks confirm it",
               cleared_text="GNSS agrees with vision", raise_s=2.0, clear_s=5.0, repeat_s=10.0),
 )  # fmt: skip

@@ -60,8 +60,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           {"component": "id"}, "a heartbeat with this program's own ids is received",
           f"{_SENT}, by two programs", "stop one of them"),
     event(A.DUPLICATE_SYSTEM_ID, WARNING, "two autopilots have system id {system}",
-          {"system": "id"}, "heartbeats of a second autopilot, or boot times that run back 40 "
-          "times in 5 s",
+          {"system": "id"},
+          "heartbeats of a second autopilot, or boot times that run back 40 times in 5 s",
           f"{_SENT}; the data of both autopilots are mixed", "change the system id of one"),
     event(A.AUTOPILOT_IGNORED, WARNING, "autopilot {system} ignored, using {used}",
           {"system": "id", "used": "id"}, "heartbeats of another autopilot",
@@ -119,8 +119,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
               "GNSS is bad for 1.5 s, but the vision set must not be selected; again every 10 s",
               "GNSS is good, or vision is selected",
-              "the EKF stays on its source set; *not ready*: the shadow check has not passed, or "
-              "an alert inhibits",
+              f"{_SENT}; the EKF stays on its source set; *not ready*: the shadow check has not "
+              "passed, or an alert inhibits",
               "decide by landmarks which source is right, and select it"),
     event(A.LOOK_AT_REFUSED, WARNING, "look-at refused: {why}", {"why": LookAtRefusal},
           "a command to point the gimbal cannot be carried out", "the gimbal does not move",

@@ -219,8 +219,8 @@ def camera_config(flight: FilmedFlight, folder: Path) -> WorldCameraConfig:
 
 
 def write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
-    """Write true and EKF positions in the map's ENU (m) at the EKF's times, in ns of the clock of
-    the vehicle record.
+    """Write true and EKF positions in the map's ENU (m) at the EKF's times, CLOCK_MONOTONIC (ns).
+    Truth and EKF are matched by the vehicle's own boot time.
     """
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
