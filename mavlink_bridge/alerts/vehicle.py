@@ -146,8 +146,10 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "if it is yours: add it to bridge.ground_systems, or sign its link"),
     event(A.SENDERS_REFUSED, WARNING, "system {system} and more refused: {why}",
           {"system": "id", "why": SenderRefusal},
-          "a fourth such system; later ones are not reported",
-          "their commands are ignored", _SIGN),
+          "a fourth system sends a command that it is not allowed to send; later ones are not "
+          "reported",
+          "their commands are denied",
+          "if they are yours: add them to bridge.ground_systems, or sign their link"),
     event(A.HINT_TAKEN, NOTICE, "search {metres:.0f} m about the place given", {"metres": "m"},
           "the operator gives a position", "the map is searched there", _NONE),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
