@@ -63,7 +63,7 @@ def vision_fix(
 
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
     Without them the vehicle's attitude is unknown, and the camera's position is reported: the
-    lever arm's length is added to its covariance.
+    square of the lever arm's length is added to each axis' variance. For accepted estimates.
     """
     frame, arm, pose = extrinsics.frame, extrinsics.lever_arm_m, estimate.world_from_camera
     world_from_body: Array | None = None

@@ -27,8 +27,9 @@ switch to vision do not start; injection that is running continues. The pilot (m
 `bridge.injection.force` override it. *Event*: it has no end.
 
 A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
-the shadow check; it becomes a STATUSTEXT in mode inject only, if fixes come but injection has not
-started for 10 s.
+the shadow check, which compares fixes with the EKF's position on GNSS over two minutes. It becomes
+a STATUSTEXT in mode inject only, if fixes come but injection has not started for 10 s. It ends
+after 50 or more compared fixes; without GNSS a failed check stays failed.
 Alerts of localization are assessed once a second; the same one is sent at most every 10 s. An alert
 whose row does not mention fixes or positions has no effect on them.
 

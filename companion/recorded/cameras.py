@@ -30,9 +30,14 @@ _SENSOR_WIDTH_MM: Mapping[str, float] = {
 
 
 def camera_of_tags(tags: PhotoTags) -> CameraGuess:
-    """The camera of a photo, by the best of its tags. `FootageError` where none says the lens."""
+    """The camera of a photo at its present size, by the most accurate tag that it has: the maker's
+    calibration first, the 35 mm equivalent last. `FootageError` if no usable tag gives the lens.
+    """
     for guess in (_dewarp, _calibrated, _perspective, _by_sensor, _equivalent):
-        found = guess(tags)
+        try:
+            found = guess(tags)
+        except CameraError:  # nan, or no lens: the next tag may hold
+            continue
         if found is not None:
             return found
     raise FootageError(

@@ -31,7 +31,8 @@ from localizer.types import PosePrior
 
 _LEAST_CLEARANCE_M, _MOST_CLEARANCE_M = 3.0, 10_000.0
 _IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not used at all
-_UNKNOWN_CLEARANCE_M = (15.0, 115.0)  # where cameras of small drones are
+_UNKNOWN_CLEARANCE_M = (15.0, 150.0)  # of small drones: 120 m is the usual limit, over relief
+_DATUM_M = 10.0  # between the heights of two datums: more is worth a look before a flight
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
 _FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
@@ -235,15 +236,16 @@ def _usable(
         sigmas[datum] = float(np.median([h.sigma_m for h, _ in rows]))
         clearances[datum] = float(np.median(above))
     if not sigmas:
-        notes.append("no height is known: heights of 15 to 115 m above the ground are tried")
+        low, high = _UNKNOWN_CLEARANCE_M
+        notes.append(f"no height is known: {low:.0f} to {high:.0f} m above the ground are tried")
         return None
     best = min(sigmas, key=lambda d: sigmas[d])
     for datum, clearance in clearances.items():
         apart = clearance - clearances[best]
-        if abs(apart) > 3.0 * math.hypot(sigmas[datum], sigmas[best]):
+        if abs(apart) > _DATUM_M:
             notes.append(
                 f"heights above the {datum.value} are {apart:+.0f} m from those above the "
-                f"{best.value}, which are used: is the map's height datum right?"
+                f"{best.value}, which are used: check the map's height datum before a flight"
             )
     return best
 

@@ -68,7 +68,9 @@ class Rectification:
 
 
 def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
-    """Turns (rad) of the query's rotation to try, (n,)."""
+    """(n,) turns of the query's rotation to try, rad counter-clockwise about up: the whole circle
+    if the heading is not known.
+    """
     step = math.radians(config.heading_step_deg)
     if query.heading_sigma_rad is None:
         reach = math.pi
@@ -143,7 +145,11 @@ def search(
     pool: ThreadPoolExecutor | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> list[PlaceCandidate] | None:
-    """The places that look most like the frame from above, best first; None if stopped."""
+    """The places that look most like `view` from above, the most distinct first.
+
+    Up to `candidates` + 1; none if the map has no ground heights there; None if stopped.
+    correlators: of the levels, finest first. A place's height is the query's.
+    """
     heights = scales(query, ground_of(correlators[0].level, query), config)
     if len(heights) == 0:
         return []

@@ -73,7 +73,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               repeat_s=60.0),
     AlertSpec(A.GNSS_VISION_MISMATCH, WARNING, "GNSS/vision mismatch",
               "GNSS/vision mismatch {metres:.0f} m", {"metres": "m"},
-              "GNSS and vision differ by more than their error bounds for 2 s",
+              "their horizontal distance exceeds vision's protection level plus the error that the "
+              "receiver states, for 2 s; not with gps_input",
               "they agree for 5 s", f"{_SENT}; GNSS or vision is wrong; which one is not known",
               "compare with landmarks; select the source set that is right", raise_s=2.0,
               clear_s=5.0, repeat_s=10.0),

@@ -92,7 +92,9 @@ def stream_address(uri: str) -> tuple[int, str]:
 def camera_fov_status(
     view: CameraView, config: CameraConfig, geoid_separation_m: float, uptime_ms: int
 ) -> Any:
-    """CAMERA_FOV_STATUS (271): camera position, attitude and the ground point in its centre."""
+    """CAMERA_FOV_STATUS (271): camera position, attitude and the ground point in the middle of the
+    image. geoid_separation_m: ellipsoid height minus height above mean sea level, which is sent.
+    """
 
     def degrees_e7(value: float | None) -> int:
         return _INVALID_LATLON if value is None else round(value * 1e7)

@@ -69,7 +69,10 @@ class _Speaker:
 
 
 def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float = 0.8) -> bool:
-    """Send an alert on every link of the bridge; whether it went out on one of them in time."""
+    """Send an alert on every link of the bridge; whether one of them opened within `timeout_s`,
+    which all links share, not whether anybody received it. For the supervisor. `SigningKeyError`
+    for an unusable key file.
+    """
     message = status_text(alert)
     spoken = []
     ends = [(config.connection, config.signing, True)]

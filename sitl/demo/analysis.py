@@ -108,7 +108,8 @@ class BoundFigures:
 
 def bound_figures(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> BoundFigures:
     """Of the accepted estimates in the span, by their horizontal errors; None without any. The
-    ellipse is that of the east and north sigmas that were reported.
+    ellipse is that of the east and north sigmas that were reported. truth: in the map's ENU, m,
+    matched by exposure time. Fixes without a level do not count in inside_level.
     """
     rows, found = _matched(truth, estimates, span_ns)
     if not len(rows):

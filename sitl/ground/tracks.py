@@ -178,7 +178,7 @@ def slerp(a: Array, b: Array, t: float) -> Array:
 
 
 def between(a: Truth, b: Truth, time_ns: int) -> Truth:
-    """The true state at a time between two others, interpolated."""
+    """The true state at a time from a's to b's, interpolated linearly."""
     t = share(a.time_ns, b.time_ns, time_ns)
     return Truth(
         time_ns,

@@ -29,7 +29,8 @@ _PICTURE = re.compile(r"(?im)^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(
 def file_of(folder: Path, name: str) -> Path:
     """The file that a name means, beside `folder`: as it stands; else with backslashes for slashes
     and in other letter case, as Windows has it; else, for an absolute name of another machine, the
-    file of that name here. What is not found is returned as it stands.
+    file of that name in `folder`. What is not found is returned as it stands. The result may lie
+    outside of `folder`.
     """
     plain = folder / name
     if "\0" in name or _exists(plain):

@@ -152,7 +152,9 @@ def pose_tangent_map(rotation: Array, translation: Array) -> Array:
 def prior_terms(
     prior: QuadraticPrior, rotation: Array, translation: Array
 ) -> tuple[float, Array, Array]:
-    """Cost, Hessian (6, 6) and gradient (6,) of a `QuadraticPrior` (equation 15)."""
+    """Cost of a `QuadraticPrior` (equation 15) at a pose camera_from_local, and Hessian (6, 6) and
+    gradient (6,) of half of it.
+    """
     R0, t0 = prior.camera_from_local.rotation, prior.camera_from_local.translation
     d = np.concatenate([R0.T @ t0 - rotation.T @ translation, so3_log(rotation.T @ R0)])
     J = pose_tangent_map(rotation, translation)

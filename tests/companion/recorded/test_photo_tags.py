@@ -110,6 +110,9 @@ def test_the_focal_length_by_the_best_tag(tmp_path):
         read_photo_tags(write_photo(tmp_path / "c.jpg", dewarp, size=(400, 300)))
     ).camera
     assert (camera.fx, camera.cx, camera.distortion[0]) == (310.0, 198.0, -0.1)
+    spoilt = dji(DewarpData="a;nan,311,-2,3,0,0,0,0,0", CalibratedFocalLength="300.5")
+    damaged = read_photo_tags(write_photo(tmp_path / "f.jpg", spoilt, size=(400, 300)))
+    assert camera_of_tags(damaged).camera.fx == pytest.approx(300.5)
     sensor = write_photo(tmp_path / "d.jpg", exif={_MODEL: "FC6310", _FOCAL: 8.8}, size=(400, 300))
     assert camera_of_tags(read_photo_tags(sensor)).camera.fx == pytest.approx(8.8 / 13.2 * 400)
     with pytest.raises(FootageError, match="--camera FILE"):

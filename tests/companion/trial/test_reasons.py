@@ -64,7 +64,7 @@ def test_a_height_of_another_datum_that_disagrees_is_told(cache):
     above = Height(80.0, Datum.TAKEOFF, 3.0)
     high = Height(cache.frame.origin.height_m + 400.0, Datum.ELLIPSOID, 10.0)
     found = priors_of(_flight(cache.frame, [(0.0, 0.0)] * 3, (above, high), course=90.0), cache)
-    assert any("is the map's height datum right?" in note for note in found.notes)
+    assert any("check the map's height datum" in note for note in found.notes)
     assert all(p.is_complete and not p.measured for p in found.priors)
     # The image's top points to the course: east.
     np.testing.assert_allclose(-found.priors[0].rotation[:, 1], [1.0, 0.0, 0.0], atol=1e-3)
