@@ -104,7 +104,7 @@ def test_errors_of_a_flat_map_name_the_orthophoto(ortho, tmp_path):
     flat = ("--out", tmp_path / "made" / "c", "--flat-ground", 430)
     assert str(run("build", ortho, *flat).exception).startswith(f"{ortho} does not say")
     with rasterio.open(ortho, "r+") as file:
-        file.crs = None
+        file.crs = rasterio.CRS()
     assert str(run("build", ortho, *flat).exception).startswith(f"{ortho}: the raster has no CRS")
     assert not list((tmp_path / "made").iterdir())
 
