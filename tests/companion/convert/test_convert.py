@@ -95,10 +95,13 @@ def test_heights_of_unknown_datum_are_no_guess(poses, tmp_path):
                  *PLACE)  # fmt: skip
 
 
-@pytest.mark.parametrize("separation", ["nan", "-4000"])
-def test_a_geoid_separation_that_is_none_is_refused(poses, tmp_path, separation):
+@pytest.mark.parametrize(
+    ("separation", "named"),
+    [("nan", "give a finite number"), ("-4000", "no such separation occurs on Earth")],
+)
+def test_a_geoid_separation_that_is_none_is_refused(poses, tmp_path, separation, named):
     heights = ("--heights", "amsl", "--geoid-separation", separation, *PLACE)
-    with pytest.raises(ConfigError, match="no such separation occurs on Earth"):
+    with pytest.raises(ConfigError, match=named):
         _convert(poses, tmp_path / "x", "--from", "poses", "--to", "photos", *heights)
     assert not (tmp_path / "x").exists()
 
