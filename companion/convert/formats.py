@@ -201,11 +201,14 @@ def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     from companion.offline.record import read_estimates
 
     file = path / "estimates.csv" if path.is_dir() else path
-    return tuple(
+    poses = tuple(
         StampedPose(snapshot_name(e.exposure_time_ns), e.world_from_camera, e.exposure_time_ns)
         for e in read_estimates(file)
         if e.accepted
     )
+    if not poses:
+        raise PoseFileError(f"{file}: holds no accepted estimate; is the record whole?")
+    return poses
 
 
 def _read_photos(path: Path, place: MapReference) -> tuple[StampedPose, ...]:

@@ -38,7 +38,15 @@ from localizer.geometry.pose import euler_from_matrix, matrix_from_euler, matrix
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.clock import BootClock
 from mavlink_bridge.link.tlog import read_tlog
-from mavlink_bridge.vehicle.readings import boot_time_ns, gimbal_in_earth_frame, is_autopilot
+from mavlink_bridge.quaternion import normalise
+from mavlink_bridge.vehicle.readings import (
+    ANGLE_RAD,
+    boot_time_ns,
+    check_place,
+    check_within,
+    gimbal_in_earth_frame,
+    is_autopilot,
+)
 
 LOG_SUFFIXES = frozenset({".bin", ".log", ".tlog", ".ulg"})
 _GNSS_M, _AMSL_M, _TAKEOFF_M = 2.0, 5.0, 2.0
@@ -46,6 +54,7 @@ _TILT_DEG, _HEADING_DEG = 1.0, 5.0
 _FIXED_TILT_DEG = 3.0  # how well a camera is screwed on
 _STEP_S = 0.1  # of the samples that are made
 _GIMBAL_AGE_S = 1.0
+_LONGEST_NS = 30 * 86_400_000_000_000  # of one log: its samples would fill the memory
 
 
 @dataclass(frozen=True)
@@ -69,6 +78,7 @@ class _LogRows:
     attitudes: list[tuple[int, float, float, float]]
     gimbals: list[tuple[int, GimbalAngles]]
     feedback: list[tuple[int, Any]]
+    refused: int = 0  # that say no place or no rotation
 
     @cached_property
     def gimbal_times(self) -> np.ndarray:
@@ -94,21 +104,29 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
             f"{path.name} has no gimbal's angles: the camera is taken as fixed to the airframe, "
             f"pitch {fixed_pitch_deg:g} degrees"
         )
+    if raw.refused:
+        notes.append(f"{path.name}: {raw.refused} rows say no place or no rotation: not used")
     track = Track(samples)
     exposures = tuple(_exposures(raw, track, fixed_pitch_deg))
+    stamps = [time_ns for time_ns, _ in _of_first_camera(raw)]
+    if len(exposures) > 1 and (len(set(stamps)) == 1 or stamps != sorted(stamps)):
+        notes.append(
+            f"{path.name}: the times of its exposures (CAM, TRIG) stand still or run back: not used"
+        )
+        exposures = ()
     return LogTrack(track, exposures, bool(raw.gimbals), tuple(notes))
 
 
-def _exposures(raw: _LogRows, track: Track, fixed_pitch_deg: float) -> Iterator[Telemetry]:
-    """Of the first camera; what was asked for counts only where no exposure is logged. Two links to
-    the ground bring each message twice.
-    """
+def _of_first_camera(raw: _LogRows) -> list[tuple[int, Any]]:
+    """In the log's order; what was asked for counts only where no exposure is logged."""
     kinds = [(m.flags == mavlink.CAMERA_FEEDBACK_OPENLOOP, m.cam_idx) for _, m in raw.feedback]
-    told = {
-        (m.time_usec, m.img_idx): (time_ns, m)
-        for (time_ns, m), kind in zip(reversed(raw.feedback), reversed(kinds), strict=True)
-        if kind == min(kinds)
-    }
+    return [row for row, kind in zip(raw.feedback, kinds, strict=True) if kind == min(kinds)]
+
+
+def _exposures(raw: _LogRows, track: Track, fixed_pitch_deg: float) -> Iterator[Telemetry]:
+    """Of the first camera. Two links to the ground bring each message twice."""
+    rows = _of_first_camera(raw)
+    told = {(m.time_usec, m.img_idx): (time_ns, m) for time_ns, m in reversed(rows)}
     for time_ns, m in sorted(told.values(), key=lambda one: one[0]):
         said = track.at(time_ns) or Telemetry()
         if m.lat or m.lng:
@@ -189,6 +207,7 @@ def vehicle_messages(path: Path) -> Iterator[Dated]:
 def _read(path: Path) -> _LogRows:
     raw, clock = _LogRows([], [], [], []), BootClock()
     vehicle: int | None = None
+    first_ns: int | None = None
     for received_ns, message in vehicle_messages(path):
         kind = message.get_type()
         if vehicle is None and is_autopilot(message):
@@ -199,15 +218,26 @@ def _read(path: Path) -> _LogRows:
         if boot_ns is not None:
             clock.observe(boot_ns, received_ns)
             time_ns = clock.to_monotonic(boot_ns, received_ns)
-        _take(raw, kind, message, time_ns)
+        first_ns = received_ns if first_ns is None else first_ns
+        if abs(time_ns - first_ns) > _LONGEST_NS or time_ns >= 1 << 63:
+            raise FootageError(
+                f"{path}: a {kind} is of {time_ns * 1e-9:.0f} s after 1970, its first row of "
+                f"{first_ns * 1e-9:.0f} s: no times of one flight; is the log damaged?"
+            )
+        try:
+            _take(raw, kind, message, time_ns)
+        except ValueError:  # as in flight
+            raw.refused += 1
     return raw
 
 
 def _take(raw: _LogRows, kind: str, m: Any, time_ns: int) -> None:
     if kind == "GLOBAL_POSITION_INT" and (m.lat or m.lon):
+        check_place(m.lat, m.lon)
         above_m = m.relative_alt * 1e-3
         raw.positions.append((time_ns, m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3, above_m))
     elif kind == "ATTITUDE":
+        check_within(ANGLE_RAD, m.roll, m.pitch, m.yaw)
         raw.attitudes.append((time_ns, m.roll, m.pitch, m.yaw))
     elif kind == "ATTITUDE_QUATERNION":
         raw.attitudes.append((time_ns, *_euler((m.q1, m.q2, m.q3, m.q4))))
@@ -218,6 +248,7 @@ def _take(raw: _LogRows, kind: str, m: Any, time_ns: int) -> None:
         raw.gimbals.append((time_ns, GimbalAngles(roll, pitch, yaw, GimbalFrame.HEADING)))
     elif kind == "MOUNT_ORIENTATION":
         roll, pitch, yaw = (math.radians(x) for x in (m.roll, m.pitch, m.yaw))
+        check_within(ANGLE_RAD, roll, pitch, yaw)
         raw.gimbals.append((time_ns, GimbalAngles(roll, pitch, yaw, GimbalFrame.HEADING)))
     elif kind == "GIMBAL_DEVICE_ATTITUDE_STATUS":
         frame = GimbalFrame.EARTH if gimbal_in_earth_frame(m.flags) else GimbalFrame.HEADING
@@ -227,4 +258,4 @@ def _take(raw: _LogRows, kind: str, m: Any, time_ns: int) -> None:
 
 
 def _euler(q: Sequence[float]) -> tuple[float, float, float]:
-    return euler_from_matrix(matrix_from_quaternion(q))
+    return euler_from_matrix(matrix_from_quaternion(normalise(tuple(q))))

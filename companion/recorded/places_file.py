@@ -39,6 +39,10 @@ _COLUMNS = {
     "time": ("utc", "timestamp", "unixtime"),
     "accuracy": ("horizontalaccuracy", "hacc", "gpsxyaccuracy", "accuracy"),
 }
+_LIMITS = {  # degrees; seconds since 1970, whose nanoseconds fit 64 bits; metres
+    "roll": (-180.0, 180.0), "pitch": (-180.0, 90.0), "yaw": (-360.0, 360.0),
+    "course": (-360.0, 360.0), "time": (0.0, 9e9), "accuracy": (1e-3, 1e5),
+}  # fmt: skip
 
 
 def read_places(path: Path) -> dict[str, Telemetry]:
@@ -96,10 +100,14 @@ def _columns(first: list[str]) -> dict[str, int] | None:
 def _place(row: list[str], columns: dict[str, int], where: str) -> tuple[str, Telemetry]:
     def number(key: str) -> float | None:
         index = columns.get(key)
-        return _number(row[index]) if index is not None and index < len(row) else None
+        value = _number(row[index]) if index is not None and index < len(row) else None
+        low, high = _LIMITS.get(key, (-math.inf, math.inf))
+        if value is not None and not low <= value <= high:
+            raise FootageError(f"{where}: {key} {value:g} is not from {low:g} to {high:g}")
+        return value
 
     latitude, longitude = number("latitude"), number("longitude")
-    if latitude is None or longitude is None:
+    if latitude is None or longitude is None or len(row) <= columns["name"]:
         raise FootageError(f"{where}: expected a name, longitude and latitude, got {row[:4]}")
     if abs(latitude) > 90.0 or abs(longitude) > 360.0:
         raise FootageError(

@@ -6,12 +6,16 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from datetime import date
 from typing import Literal
 
+from pydantic import StrictFloat
+
 Heights = Literal["surface", "terrain", "flat"]
 IMAGERY_DATE = r"\d{4}(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?"  # a year, a month or a day
+RESOLUTION_M = (1e-4, 100.0)  # of imagery
 
 # A surface model's own error where nothing has changed since. Caliterra's, against points that its
 # photos did not make: half of them within 0.1 m, 90 % within 0.33 m.
@@ -41,12 +45,13 @@ class MapKind:
     hold, over the whole ground; the same for all of one roof or one block.
     effective_resolution_m: side of the smallest square that the imagery resolves, by its spectrum;
     at least the size of a texel.
-    imagery_date: as 2024, 2024-06 or 2024-06-30; sensor: as the source names it. None: not known.
+    imagery_date: as 2024, 2024-06 or 2024-06-30; sensor: as the source names it, with "?" for what
+    cannot be printed. None: not known. ValueError for what is no such value.
     """
 
     heights: Heights
-    unknown_height_sigma_m: float
-    effective_resolution_m: float
+    unknown_height_sigma_m: StrictFloat
+    effective_resolution_m: StrictFloat
     imagery_date: str | None = None
     sensor: str | None = None
 
@@ -54,10 +59,18 @@ class MapKind:
         if self.heights not in UNKNOWN_HEIGHT_SIGMA_M:
             known = ", ".join(UNKNOWN_HEIGHT_SIGMA_M)
             raise ValueError(f"heights {self.heights!r}: one of {known}")
-        for name in ("unknown_height_sigma_m", "effective_resolution_m"):
+        for name, low, high in (
+            ("unknown_height_sigma_m", 0.0, 1000.0),
+            ("effective_resolution_m", *RESOLUTION_M),
+        ):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} {value!r}: a number of metres from 0 up")
+            if not low <= value <= high:
+                raise ValueError(f"{name} {value!r}: metres from {low:g} to {high:g}")
+        if self.imagery_date and not re.fullmatch(IMAGERY_DATE, self.imagery_date):
+            raise ValueError(f"imagery_date {self.imagery_date!r}: as 2024, 2024-06 or 2024-06-30")
+        if self.sensor:  # a terminal would obey its control sequences
+            plain = "".join(c if c.isprintable() else "?" for c in self.sensor)
+            object.__setattr__(self, "sensor", plain)
 
     @property
     def has_buildings(self) -> bool:

@@ -30,7 +30,7 @@ _PRESSURE_HPA = (1.0, 1200.0)  # of air that an aircraft flies in
 # Beyond these no sensor measures and no aircraft flies. One such value would stay for good in what
 # is integrated (the heading of the gyros, the way of the IMU) or make a flight look like a jump.
 _ZOOM_PERCENT = 100.0
-_ANGLE_RAD = 10.0
+ANGLE_RAD = 10.0
 _RATE_RADPS = 100.0
 _FORCE_MPS2 = 1_000.0
 _DISTANCE_M = 1e6
@@ -169,14 +169,14 @@ class VehicleReadings:
             raise ValueError(f"{autopilot}: an autopilot of another make")
 
     def _attitude_euler(self, m: Any, time_ns: int) -> None:
-        _check_within(_ANGLE_RAD, m.roll, m.pitch, m.yaw)
-        _check_within(_RATE_RADPS, m.rollspeed, m.pitchspeed, m.yawspeed)
+        check_within(ANGLE_RAD, m.roll, m.pitch, m.yaw)
+        check_within(_RATE_RADPS, m.rollspeed, m.pitchspeed, m.yawspeed)
         q = quat.from_euler(m.roll, m.pitch, m.yaw)
         rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
         self.attitudes.add(Attitude(time_ns, m.roll, m.pitch, m.yaw, q, rates))
 
     def _attitude_quaternion(self, m: Any, time_ns: int) -> None:
-        _check_within(_RATE_RADPS, m.rollspeed, m.pitchspeed, m.yawspeed)
+        check_within(_RATE_RADPS, m.rollspeed, m.pitchspeed, m.yawspeed)
         q = quat.normalise((m.q1, m.q2, m.q3, m.q4))
         self.attitudes.add(attitude(time_ns, q, (m.rollspeed, m.pitchspeed, m.yawspeed)))
 
@@ -188,7 +188,7 @@ class VehicleReadings:
 
     def _mount_orientation(self, m: Any, time_ns: int) -> None:
         roll, pitch, yaw = (math.radians(a) for a in (m.roll, m.pitch, m.yaw))
-        _check_within(_ANGLE_RAD, roll, pitch, yaw)
+        check_within(ANGLE_RAD, roll, pitch, yaw)
         q = quat.from_euler(roll, pitch, yaw)
         self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[1]))
 
@@ -197,19 +197,19 @@ class VehicleReadings:
         pitch, roll, yaw = (
             math.radians(0.01 * a) for a in (m.pointing_a, m.pointing_b, m.pointing_c)
         )
-        _check_within(_ANGLE_RAD, roll, pitch, yaw)
+        check_within(ANGLE_RAD, roll, pitch, yaw)
         q = quat.from_euler(roll, pitch, yaw)
         self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
 
     def _camera_settings(self, m: Any, time_ns: int) -> None:
         level = float(m.zoomLevel)
         if math.isfinite(level):
-            _check_within(_ZOOM_PERCENT, level)
+            check_within(_ZOOM_PERCENT, level)
         self.zooms.add(time_ns, m.get_srcComponent(), level if level >= 0.0 else math.nan)
 
     def _local_position(self, m: Any, time_ns: int) -> None:
-        _check_within(_DISTANCE_M, m.x, m.y, m.z)
-        _check_within(_SPEED_MPS, m.vx, m.vy, m.vz)
+        check_within(_DISTANCE_M, m.x, m.y, m.z)
+        check_within(_SPEED_MPS, m.vx, m.vy, m.vz)
         self.locals.add(time_ns, (m.x, m.y, m.z))
         self.state = replace(
             self.state,
@@ -221,7 +221,7 @@ class VehicleReadings:
     def _global_position(self, m: Any, time_ns: int) -> None:
         if m.lat == 0 and m.lon == 0:
             return  # what firmwares send before they have a position
-        _check_place(m.lat, m.lon)
+        check_place(m.lat, m.lon)
         _check_heights(m.alt, m.relative_alt)
         self.globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
         self.state = replace(
@@ -259,7 +259,7 @@ class VehicleReadings:
         if fixed:
             # A receiver that claims a fix where there is no place is none: its report is not heard
             # at all, and GNSS counts as gone once no better one comes.
-            _check_place(m.lat, m.lon)
+            check_place(m.lat, m.lon)
             if m.lat == 0 and m.lon == 0:
                 raise ValueError("a 3D fix at 0, 0")
             _check_heights(m.alt)
@@ -291,8 +291,8 @@ class VehicleReadings:
 
     def _highres_imu(self, m: Any, time_ns: int) -> None:
         force, rates = (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro)
-        _check_within(_FORCE_MPS2, *force)
-        _check_within(_RATE_RADPS, *rates)
+        check_within(_FORCE_MPS2, *force)
+        check_within(_RATE_RADPS, *rates)
         self.inertial.add(InertialSample(time_ns, force, rates))
 
     def _pressure(self, m: Any, time_ns: int) -> None:
@@ -338,7 +338,8 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _check_place(latitude_e7: int, longitude_e7: int) -> None:
+def check_place(latitude_e7: int, longitude_e7: int) -> None:
+    """ValueError where 1e-7 degrees are no place on Earth."""
     if abs(latitude_e7) > 900_000_000 or abs(longitude_e7) > 1_800_000_000:
         raise ValueError(f"no place on Earth: {latitude_e7}, {longitude_e7}")
 
@@ -352,7 +353,8 @@ def _check_heights(*heights_mm: int) -> None:
         raise ValueError(f"{heights_mm} mm: no height of an aircraft")
 
 
-def _check_within(limit: float, *values: float) -> None:
+def check_within(limit: float, *values: float) -> None:
+    """ValueError for a value that is not finite, or beyond +-limit."""
     if not all(abs(value) <= limit for value in values):  # NaN is within nothing
         raise ValueError(f"{values}: not finite, or beyond {limit:g}")
 

@@ -34,7 +34,7 @@ def _codes(text):
         ("**estimates.csv**", "**targets.csv**", ESTIMATE_COLUMNS),
         ("**targets.csv**", "**events.csv**", TARGET_COLUMNS),
         ("**events.csv**", "**snapshots/", EVENT_COLUMNS),
-        ("| `frames.csv` | |", "## Trajectory", ("frames.csv", *CSV_COLUMNS)),
+        ("| values of `frames.csv` |", "## Trajectory", ("frames.csv", *CSV_COLUMNS)),
     ],
 )
 def test_columns_stand_in_their_order(begin, end, columns):
@@ -43,7 +43,7 @@ def test_columns_stand_in_their_order(begin, end, columns):
 
 
 def test_what_json_files_hold():
-    report = _section("| `report.json` | |", "| `frames.csv` | |")
+    report = _section("| values of `report.json` |", "| values of `frames.csv` |")
     assert {f.name for f in dataclasses.fields(LocalizationMetrics)} <= set(_codes(report))
     health = set(_codes(_section("**health.json**", "**.tlog**")))
     assert {f.name for f in dataclasses.fields(EngineHealth)} <= health

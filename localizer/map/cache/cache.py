@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ from localizer.errors import GeoreferenceError, MapCacheError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import PackedTexture, TileMesh, mesh_fault
-from localizer.map.kind import MapKind
+from localizer.map.kind import IMAGERY_DATE, MapKind
 from localizer.plain_files import plain_bytes
 from localizer.types import Float32, Image
 
@@ -72,7 +73,7 @@ class Manifest(BaseModel):
     def imagery_date(self) -> str | None:
         """Of the map's images; an older build kept it beside its other options."""
         stated = self.build.get("imagery_date") if self.kind is None else self.kind.imagery_date
-        return str(stated) if stated else None
+        return str(stated) if re.fullmatch(IMAGERY_DATE, str(stated)) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.kind import UNKNOWN_HEIGHT_SIGMA_M, Heights, MapKind
+from localizer.map.kind import RESOLUTION_M, UNKNOWN_HEIGHT_SIGMA_M, Heights, MapKind
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import TopView, render_top_view
 from localizer.types import Float32
@@ -63,7 +63,8 @@ def measure_kind(
             resolution = _resolution(_Sampler(cache, renderer), cache.manifest.gsd_m)
         finally:
             renderer.close()
-    return MapKind(found, UNKNOWN_HEIGHT_SIGMA_M[found], round(resolution, 4), imagery_date, sensor)
+    resolution = round(float(np.clip(resolution, *RESOLUTION_M)), 4)
+    return MapKind(found, UNKNOWN_HEIGHT_SIGMA_M[found], resolution, imagery_date, sensor)
 
 
 @dataclass(frozen=True)

@@ -95,10 +95,13 @@ def test_heights_of_unknown_datum_are_no_guess(poses, tmp_path):
                  *PLACE)  # fmt: skip
 
 
-@pytest.mark.parametrize("separation", ["101", "-4000"])
-def test_a_geoid_separation_that_is_none_is_refused(poses, tmp_path, separation):
+@pytest.mark.parametrize(
+    ("separation", "named"),
+    [("nan", "give a finite number"), ("-4000", "no such separation occurs on Earth")],
+)
+def test_a_geoid_separation_that_is_none_is_refused(poses, tmp_path, separation, named):
     heights = ("--heights", "amsl", "--geoid-separation", separation, *PLACE)
-    with pytest.raises(ConfigError, match="no such separation occurs on Earth"):
+    with pytest.raises(ConfigError, match=named):
         _convert(poses, tmp_path / "x", "--from", "poses", "--to", "photos", *heights)
     assert not (tmp_path / "x").exists()
 
@@ -315,7 +318,7 @@ def test_a_flights_record_becomes_a_trajectory(tmp_path):
         ("tum", "inf 0 0 0 0 0 0 1\n"), ("tum", "# nothing\n"),
         ("colmap", "1 1 0 0 0 0 0 1 a.jpg\n"), ("colmap", "1 2 0 0 0 0 0 0 1 a.jpg\n\n"),
         ("colmap", "\n"), ("autopilot", "name,time_ns\na,1\n"), ("autopilot", "name\n"),
-        ("poses", "a 1 2 3\n"),
+        ("poses", "a 1 2 3\n"), ("record", "exposure_time_ns,seq"),
     ],
 )  # fmt: skip
 def test_what_is_no_pose_is_named_with_its_file(tmp_path, of, text):

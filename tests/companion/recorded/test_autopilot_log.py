@@ -2,11 +2,13 @@
 
 import math
 import re
+import struct
 import sys
 
 import cv2
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import FootageError
 from companion.recorded.autopilot_log import read_autopilot_log
@@ -15,6 +17,7 @@ from companion.recorded.flight import Datum, RecordedFrame, Telemetry
 from companion.recorded.footage import FootageOptions, read_footage
 from localizer.geometry.camera import Camera
 from tests.companion.recorded.logs import (
+    BOOT_S,
     ORIGIN,
     UTC_S,
     place,
@@ -79,6 +82,42 @@ def test_half_a_log_and_no_log_are_named(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(FootageError, match=name):
             read_autopilot_log(tmp_path / name)
+
+
+def _framed(seconds, *messages):
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    stamp = struct.pack(">Q", seconds if seconds > 1e12 else round((UTC_S + seconds) * 1e6))
+    return b"".join(stamp + message.pack(codec) for message in messages)
+
+
+def test_rows_of_a_log_that_are_no_numbers_are_counted_and_not_used(tmp_path):
+    path = write_tlog(tmp_path / "flight.tlog", swaying, 10.0, -60.0)
+    ms, nan, inf = round((BOOT_S + 10.0) * 1000), math.nan, math.inf
+    path.write_bytes(path.read_bytes() + _framed(
+        10.0,
+        mavlink.MAVLink_attitude_message(ms, nan, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_message(ms, 0, inf, 0, 0, 0, 0),
+        mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, ms, 0, [nan] * 4, 0, 0, 0, 0),
+        mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, ms, 0, [0] * 4, 0, 0, 0, 0),
+        mavlink.MAVLink_mount_orientation_message(ms, 0, 1e38, 0),
+    ))  # fmt: skip
+    log = read_autopilot_log(path)
+    assert any("5 rows say no place or no rotation" in note for note in log.notes)
+    views = [log.track.at(int(t)).view.ned_from_camera for t in log.track.times_ns]
+    assert np.isfinite(views).all()
+    late = mavlink.MAVLink_attitude_message(ms, 0, 0, 0, 0, 0, 0)
+    path.write_bytes(path.read_bytes() + _framed(2**64 - 1, late))
+    with pytest.raises(FootageError, match=r"flight\.tlog: .* no times of one flight"):
+        read_autopilot_log(path)
+
+
+@pytest.mark.parametrize("times", [(3.0, 3.0, 3.0), (5.0, 4.0, 3.0)])
+def test_exposures_whose_times_run_back_are_not_used(tmp_path, times):
+    log = read_autopilot_log(
+        write_dataflash(tmp_path / "flight.bin", swaying, 10.0, exposures=times)
+    )
+    assert not log.exposures
+    assert any("stand still or run back" in note for note in log.notes)
 
 
 def _ground(rng):

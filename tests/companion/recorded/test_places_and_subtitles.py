@@ -36,6 +36,16 @@ def test_places_that_cannot_be_are_named(tmp_path):
         ("\n", "holds no place"),
         ("a.jpg 8.5 47.3\na.jpg 8.5 47.4\n", r":2: a second line of a\.jpg"),
         ("name,lat,lon\na.jpg,149.2,-35.4\n", "are they swapped"),
+        ("lat,lon,name\n47.48,8.13\n", "txt:2: expected a name"),
+        ("name,lat,lon,timestamp\na.jpg,47.3,8.5,1e300\n", r"txt:2: time 1e\+300 is not"),
+        *(
+            (f"name,lat,lon,accuracy\na.jpg,47.3,8.5,{m}\n", "txt:2: accuracy .* is not from")
+            for m in ("1e200", "1e30", "-3", "0")
+        ),
+        *(
+            (f"name,lat,lon,gimbal_pitch\na.jpg,47.3,8.5,{deg}\n", "txt:2: pitch .* is not from")
+            for deg in ("1e9", "95")
+        ),
     ):
         file.write_text(text)
         with pytest.raises(FootageError, match=why):

@@ -85,11 +85,11 @@ def test_waypoints_of_mission_planner_are_read_alike(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "named"),
     [
-        ("a.plan", "{", "no .plan"),
+        ("a.plan", "{", "its JSON breaks off at line 1"),
         ("a.plan", "[]", "no .plan"),
         ("a.plan", '{"mission": {"items": []}}', "plannedHomePosition"),
         ("a.waypoints", "hello", "no QGC WPL"),
-        ("a.waypoints", "QGC WPL 110\n0 1 0 16 x", "no QGC WPL"),
+        ("a.waypoints", "QGC WPL 110\n0 1 0 16 x", "5 of 12 fields"),
         ("a.waypoints", "QGC WPL 110\n0 1 0 16 0 0 0 0 47 8 440 1", "holds no waypoint"),
         ("a.waypoints", "QGC WPL 110\n0 1 0 16 0 0 0 0 47 8 4 1\n1 0 0 16 0 0 0 0 47 8 500 1",
          "relative altitudes"),

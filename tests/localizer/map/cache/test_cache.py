@@ -81,6 +81,9 @@ def test_damaged_index_is_found(copy):
         TileCache.open(copy)
 
 
+_KIND = {"heights": "flat", "unknown_height_sigma_m": 6.0, "effective_resolution_m": 0.2}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -90,6 +93,11 @@ def test_damaged_index_is_found(copy):
         ({"geoid_separation_m": float("nan")}, "geoid_separation_m"),
         ({"extent": [[float("inf"), 0.0]]}, "extent"),
         ({"surprise": 1}, "surprise"),
+        ({"kind": _KIND | {"unknown_height_sigma_m": 1001.0}}, "from 0 to 1000"),
+        ({"kind": _KIND | {"unknown_height_sigma_m": True}}, "unknown_height_sigma_m"),
+        ({"kind": _KIND | {"effective_resolution_m": 0}}, "to 100"),
+        ({"kind": _KIND | {"effective_resolution_m": 101.0}}, "to 100"),
+        ({"kind": _KIND | {"imagery_date": "2024-13-45"}}, "imagery_date"),
         ({"origin": {"latitude_deg": 200, "longitude_deg": 0, "height_m": 0}}, "out of range"),
     ],
 )

@@ -129,6 +129,10 @@ def test_the_imagerys_age(stated, words, recent):
     assert kind.imagery_age(date(2024, 10, 8), 200) == (words, recent)
 
 
+def test_a_sensors_name_cannot_steer_the_terminal():
+    assert "\x1b" not in MapKind("surface", 0.3, 0.1, None, "PHR\x1b[2J1B").line()
+
+
 @pytest.mark.real
 @pytest.mark.parametrize(
     ("name", "files", "heights", "least_m", "most_m"),
