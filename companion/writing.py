@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from companion.errors import ReportError
-from localizer.map.cache.cache import MANIFEST_NAME
+from localizer.map.cache.cache import INDEX_NAME
 from mavlink_bridge.atomic_file import replace_file
 
 _BY_UMASK = 0o666
@@ -43,16 +43,18 @@ def result_file(path: Path, option: str, suffixes: tuple[str, ...], *inputs: Pat
     if path.suffix.lower() not in suffixes:
         raise ReportError(f"{option} {path}: give a file that ends in {' or '.join(suffixes)}")
     refuse_input(path, option, *inputs)
-    if (path.parent / MANIFEST_NAME).is_file():
-        raise ReportError(f"{option} {path}: lies in a tile cache; give a file beside it")
     return path
 
 
 def refuse_input(path: Path, option: str, *inputs: Path | None) -> None:
-    """`ReportError` where a file to be written is one that was given to be read."""
+    """`ReportError` where a file to be written is one that was given to be read, or lies in a tile
+    cache.
+    """
     for given in inputs:
         if given is not None and path.exists() and given.exists() and path.samefile(given):
             raise ReportError(f"{option}: would replace {given}, which is read; give another one")
+    if any((folder / INDEX_NAME).is_file() for folder in path.resolve().parents):
+        raise ReportError(f"{option} {path}: lies in a tile cache; give a file beside it")
 
 
 class NewestFile:

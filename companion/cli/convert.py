@@ -15,7 +15,7 @@ from rich.markup import escape
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
 from companion.terminal.steps import shown_work
-from companion.writing import writing
+from companion.writing import refuse_input, writing
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
 
@@ -76,6 +76,7 @@ def convert_command(
     from companion.convert.formats import READERS, WRITERS, MapReference
     from companion.convert.photos import Heights
 
+    refuse_input(out, "OUT", source, source / "estimates.csv", times)
     frame, separation = _frame(map_cache, origin)
     if geoid_separation is not None:
         separation = _on_earth(geoid_separation)

@@ -22,7 +22,7 @@ from rich.text import Text
 from companion.config import load_config
 from companion.terminal.steps import shown_steps, shown_work
 from companion.versions import made_by
-from companion.writing import result_file
+from companion.writing import refuse_input, result_file, writing
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 
@@ -46,6 +46,7 @@ def doctor_command(
     settings = load_config(config)
     if page is not None:
         result_file(page, "--page", (".html",), config, plan)
+        refuse_input(page.with_suffix(".txt"), "--page", config, plan)
     vehicle, feed = vehicle and not beside_flight, not beside_flight
     console = Console()
     with shown_steps(Console(stderr=True)) as say:
@@ -107,6 +108,8 @@ def self_test_command(
     out: Annotated[Path | None, typer.Option(help="figures and versions, JSON")] = None,
 ) -> None:
     """Localize over a generated map: compiles the kernels and checks this computer."""
+    if out is not None:
+        refuse_input(out, "--out")
     from companion.preflight.self_test import self_test
 
     console, told = Console(), Console(stderr=True)
@@ -119,4 +122,5 @@ def self_test_command(
     )
     if out is not None:
         data = asdict(report) | {"versions": made_by()}
-        out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        with writing(out, "--out"):
+            out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

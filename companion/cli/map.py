@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -14,8 +16,12 @@ from rich.table import Table
 
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
+from companion.errors import ConfigError
 from companion.terminal.steps import READING, shown_count, shown_work
-from companion.writing import result_file, writing
+from companion.writing import refuse_input, result_file, writing
+
+if TYPE_CHECKING:
+    from localizer.map.importers.rules import ImportRules
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -107,18 +113,20 @@ def build(
     """Import a source into a tile cache; continues an interrupted build."""
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
-    from localizer.map.importers.raster_file import write_flat_ground
     from localizer.map.importers.rules import ImportRules
 
     rules = ImportRules.of(limit or (), trust or ())
+    name = None
     if flat_ground is not None:
-        with writing(out, "--out"):
-            ground = out.with_name(f"{out.name}-ground.tif")
-            source = [write_flat_ground(source[0], flat_ground, ground), *source]
+        _require_flat(flat_ground, source, height_unit, heights)
+        height_unit, name = "m", str(source[0])
     try:
-        with shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
+        with (
+            _with_ground(source, flat_ground, out, rules) as sources,
+            shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar,
+        ):
             manifest = build_cache(
-                source,
+                sources,
                 out,
                 BuildOptions(
                     geoid_separation_m=geoid_separation,
@@ -139,6 +147,7 @@ def build(
                     rules=rules,
                 ),
                 progress=bar,
+                name=name,
             )
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what is done")
@@ -156,6 +165,45 @@ def build(
         _make_overview(out)
 
 
+def _require_flat(
+    ground_m: float, source: list[Path], height_unit: str | None, heights: str | None
+) -> None:
+    """`ConfigError` where the options contradict a flat ground."""
+    from localizer.map.importers.height_crs import unit_of
+    from localizer.map.importers.rules import HIGHEST_M, LOWEST_M
+
+    option = f"--flat-ground {ground_m:g}"
+    if not LOWEST_M <= ground_m <= HIGHEST_M:
+        raise ConfigError(f"{option}: give metres from {LOWEST_M:g} to {HIGHEST_M:g}")
+    if len(source) != 1:
+        raise ConfigError("--flat-ground is for an orthophoto alone; leave it out with a DSM")
+    if height_unit is not None and unit_of(height_unit) != 1.0:
+        raise ConfigError(f"{option} is in metres; leave out --height-unit {height_unit}")
+    if heights not in (None, "flat"):
+        raise ConfigError(f"{option} makes a flat map; leave out --heights {heights}")
+
+
+@contextmanager
+def _with_ground(
+    source: list[Path], ground_m: float | None, out: Path, rules: ImportRules
+) -> Iterator[list[Path]]:
+    """The source, and a flat ground in a folder beside the cache that is removed afterwards: the
+    workers of a scheduler share that file system. Warnings name a raster by its file's name, so
+    the ground has the orthophoto's.
+    """
+    from localizer.map.importers.raster_file import write_flat_ground
+
+    with ExitStack() as stack:
+        if ground_m is not None:
+            with writing(out, "--out"):
+                out.parent.mkdir(parents=True, exist_ok=True)
+                made = TemporaryDirectory(prefix=f"{out.name}.ground-", dir=out.parent)
+                ground = Path(stack.enter_context(made)) / source[0].name
+                write_flat_ground(source[0], ground_m, ground, rules)
+            source = [*source, ground]
+        yield source
+
+
 def _print_warnings(warnings: Iterable[str]) -> None:
     for text in warnings:
         Console().print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
@@ -168,11 +216,11 @@ def info(
     kml: Annotated[Path | None, typer.Option(help="file for the map's outline")] = None,
 ) -> None:
     """Coverage, heights, texel size, levels and sizes."""
-    _require_place(*(file for file in (geojson, kml) if file is not None))
     if geojson is not None:
         result_file(geojson, "--geojson", (".geojson", ".json"))
     if kml is not None:
         result_file(kml, "--kml", (".kml",))
+    _require_place(*(file for file in (geojson, kml) if file is not None))
     from localizer.geometry.antimeridian import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
@@ -330,6 +378,7 @@ def _make_overview(cache: Path) -> None:
 def _require_place(*files: Path) -> None:
     """Check that the files can be written, before the long computation."""
     for file in files:
+        refuse_input(file, "--out")
         if file.is_dir():
             raise typer.BadParameter(f"--out {file}: is a folder; give a file's name")
         if not file.parent.is_dir():

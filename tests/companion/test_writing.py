@@ -1,6 +1,8 @@
 """A result never replaces what was given to be read."""
 
+import re
 import shutil
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -16,7 +18,7 @@ def test_a_result_is_no_input_has_its_suffix_and_lies_beside_a_cache(tmp_path):
     given, cache = tmp_path / "a.json", tmp_path / "cache"
     given.write_text("{}")
     cache.mkdir()
-    (cache / "manifest.json").write_text("{}")
+    (cache / "index.safetensors").touch()
     with pytest.raises(ReportError, match="would replace"):
         result_file(given, "--json", (".json",), given)
     with pytest.raises(ReportError, match=r"ends in \.json"):
@@ -37,6 +39,27 @@ def test_localize_keeps_its_priors(small_assets, small_sequence, tmp_path):
     ])  # fmt: skip
     assert isinstance(found.exception, ReportError)
     assert (tmp_path / "poses.txt").read_text() == (small_sequence / "poses.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["map export area --out area/index.safetensors", "self-test --out area/manifest.json",
+     "convert poses.txt area/manifest.json --from poses --to tum",
+     "convert poses.txt poses.txt --from poses --to poses", "convert . . --from photos --to photos",
+     "map raise dsm.tif fp.json --out dsm.tif", "map raise dsm.tif fp.json --out fp.json",
+     "try photos --places r/frames.csv --report r", "doctor pg.txt --page pg.html"],
+)  # fmt: skip
+def test_a_command_replaces_none_of_its_inputs(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("companion.cli.doctor.load_config", lambda _path: None)
+    for name in ("area/index.safetensors", "area/manifest.json", "poses.txt", "dsm.tif", "fp.json",
+                 "r/frames.csv", "pg.txt", "photos/a.jpg"):  # fmt: skip
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text("kept")
+    found = CliRunner().invoke(app, command.split())
+    assert isinstance(found.exception, ReportError)
+    assert re.search("would replace|lies in a tile cache", str(found.exception))
+    assert {path.read_text() for path in tmp_path.rglob("*.*") if path.is_file()} == {"kept"}
 
 
 @pytest.mark.parametrize(

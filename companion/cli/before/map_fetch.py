@@ -18,6 +18,7 @@ from rich.table import Table
 
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, shown_count, shown_work
+from companion.writing import refuse_input
 
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
@@ -139,6 +140,7 @@ def raise_command(
     height_property: HeightProperty = None,
 ) -> None:
     """Raise buildings on a terrain from footprints: a surface for `map build`."""
+    refuse_input(out, "--out", terrain, footprints)
     from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
 
     with shown_work(Console(stderr=True), "raising buildings"):

@@ -14,7 +14,7 @@ from rich.markup import escape
 from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, shown_count, shown_steps
-from companion.writing import made_folder
+from companion.writing import made_folder, refuse_input
 
 if TYPE_CHECKING:
     from companion.recorded.flight import RecordedFlight
@@ -47,6 +47,8 @@ def try_command(
     """
     from companion.recorded.footage import FootageOptions, read_footage
 
+    for name in ("report.html", "trial.json", "frames.csv", "deployment.yaml"):
+        refuse_input(report / name, "--report", footage, places, log, camera)
     made_folder(report, "--report")
     console = Console(stderr=True)
     options = FootageOptions(report, frames, places, log, camera, fov, mount_pitch)

@@ -35,6 +35,7 @@ def build_cache(
     options: BuildOptions | None = None,
     *,
     progress: Progress | None = None,
+    name: str | None = None,
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
@@ -42,12 +43,13 @@ def build_cache(
 
     source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder with
     one of these. progress: called with the number of imported tiles and of all tiles.
+    name: of the source, in errors and in the manifest; None: its files.
     """
     options = options or BuildOptions()
     given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     sources, georeference = find_source(given, options.georeference)
     reading = SourceOptions(options.up_axis, options.height_unit, options.nodata, options.rules)
-    named = " ".join(map(str, sources))
+    named = name or " ".join(map(str, sources))
     if options.is_apart:
         what = f"{named}: its reading"
         flat = call_apart(

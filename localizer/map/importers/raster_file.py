@@ -71,15 +71,21 @@ def open_raster(path: Path) -> DatasetReader:
         raise MapSourceError(f"{path}: cannot be read as a raster: {error}") from error
 
 
-def write_flat_ground(ortho: Path, height_m: float, path: Path) -> Path:
-    """A height model of one height below an orthophoto that has none: a flat map's."""
+def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRules) -> Path:
+    """A height model of one height below an orthophoto that has none: a flat map's.
+    `MapSourceError` or `GeoreferenceError` where the orthophoto has heights or no place.
+    """
     with offline(), open_raster(ortho) as data:
+        require_sane(ortho, data, rules)
+        if data.count == 1 and data.dtypes[0] != "uint8":
+            raise MapSourceError(
+                f"{ortho}: holds heights; --flat-ground is for an orthophoto alone"
+            )
         across, down = (min(n, _FLAT_CELLS) for n in (data.width, data.height))
         transform = data.transform * Affine.scale(data.width / across, data.height / down)
         heights = np.full((1, down, across), height_m, np.float32)
         shape = {"width": across, "height": down, "count": 1, "dtype": "float32"}
         place = {"crs": data.crs, "transform": transform, "nodata": -9999.0}
-        path.parent.mkdir(parents=True, exist_ok=True)
         with rasterio.open(path, "w", driver="GTiff", compress="deflate", **shape, **place) as out:
             out.write(heights)
     return path

@@ -13,7 +13,7 @@ import rasterio
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
-from companion.errors import ReportError
+from companion.errors import ConfigError, ReportError
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
@@ -58,13 +58,22 @@ def test_commands(source, tmp_path):
     assert "tile 2" in damaged.output
 
 
-def test_an_orthophoto_alone_becomes_a_flat_map(tmp_path):
-    ortho, out = tmp_path / "ortho.tif", tmp_path / "made" / "area"
+@pytest.fixture
+def ortho(tmp_path):
+    path = tmp_path / "ortho.tif"
     pixels = np.random.default_rng(0).integers(0, 255, (3, 90, 120), np.uint8)
     corner = rasterio.Affine(2.0, 0.0, 465_000.0, 0.0, -2.0, 5_250_000.0)
-    with rasterio.open(ortho, "w", driver="GTiff", width=120, height=90, count=3, dtype="uint8",
+    with rasterio.open(path, "w", driver="GTiff", width=120, height=90, count=3, dtype="uint8",
                        crs="EPSG:32632", transform=corner) as file:  # fmt: skip
         file.write(pixels)
+    return path
+
+
+def test_an_orthophoto_alone_becomes_a_flat_map(ortho, tmp_path):
+    out = tmp_path / "made" / "area"
+    own = out.with_name("area-ground.tif")
+    out.parent.mkdir()
+    own.write_text("the user's")
     alone = run("build", ortho, "--out", out)
     assert "--flat-ground METRES" in str(alone.exception)
     options = ("--flat-ground", 430, "--vertical-datum", "ellipsoidal", "--workers", 1)
@@ -72,6 +81,32 @@ def test_an_orthophoto_alone_becomes_a_flat_map(tmp_path):
     cache = TileCache.open(out)
     assert cache.manifest.height_range_m == pytest.approx((430.0, 430.0), abs=5.0)
     assert cache.manifest.kind.heights == "flat"
+    assert cache.manifest.source == str(ortho)
+    assert own.read_text() == "the user's"
+    assert sorted(out.parent.iterdir()) == [out, own]
+
+
+@pytest.mark.parametrize(
+    ("ground", "options", "why"),
+    [(430, ("--height-unit", "ft"), "leave out --height-unit ft"),
+     (430, ("--heights", "surface"), "leave out --heights surface"),
+     (9001, (), "-500 to 9000"), (-501, (), "-500 to 9000"),
+     (430, ("dsm.tif",), "for an orthophoto alone")],
+)  # fmt: skip
+def test_what_contradicts_a_flat_ground_is_named(ortho, tmp_path, ground, options, why):
+    result = run("build", ortho, *options, "--out", tmp_path / "c", "--flat-ground", ground)
+    assert isinstance(result.exception, ConfigError)
+    assert why in str(result.exception)
+
+
+def test_errors_of_a_flat_map_name_the_orthophoto(ortho, tmp_path):
+    (tmp_path / "made").mkdir()
+    flat = ("--out", tmp_path / "made" / "c", "--flat-ground", 430)
+    assert str(run("build", ortho, *flat).exception).startswith(f"{ortho} does not say")
+    with rasterio.open(ortho, "r+") as file:
+        file.crs = rasterio.CRS()
+    assert str(run("build", ortho, *flat).exception).startswith(f"{ortho}: the raster has no CRS")
+    assert not list((tmp_path / "made").iterdir())
 
 
 def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
