@@ -22,7 +22,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.render.base import MapRenderer
 
-_LEAST_FRAMES = 4
+LEAST_FRAMES = 4
 _TURNS = 2  # with the camera as given, and with the one that was found
 _MOST_FRAMES = 40  # more of them tell little that these do not
 _RELIEF_SHARE = 0.004  # of the height above ground: flatter ground shows no focal length
@@ -86,7 +86,7 @@ def estimate(
     used = consistent(priors, localized)
     if len(used) > _MOST_FRAMES:
         used = [used[int(k)] for k in np.linspace(0, len(used) - 1, _MOST_FRAMES).round()]
-    if len(used) < _LEAST_FRAMES:
+    if len(used) < LEAST_FRAMES:
         return None
     poses = {k: pose for k in used if (pose := localized[k].pose) is not None}
     shared, solution, camera = np.zeros(u.COUNT), None, guess.camera
@@ -102,7 +102,7 @@ def estimate(
             if parts is not None:
                 said = _said(priors[k], pose)
                 sighted[k] = CalibrationFrame(10_000_000_000 * (k + 1), pose, parts, said)
-        if len(sighted) < _LEAST_FRAMES:
+        if len(sighted) < LEAST_FRAMES:
             return None
         fixed = _fixed(list(sighted.values()), tools.has_buildings)
         evidence = CalibrationProblem(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
@@ -128,7 +128,7 @@ def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> 
     """
     which = [k for k, one in enumerate(localized) if one.pose is not None]
     placed = [k for k in which if priors[k].pose is not None and priors[k].height_known]
-    if len(placed) < _LEAST_FRAMES:
+    if len(placed) < LEAST_FRAMES:
         return [k for k in which if localized[k].accepted]
     rows, values, heights = [], [], []
     for k in placed:
@@ -260,7 +260,7 @@ def _shift_alone(priors: Sequence[FramePrior], poses: dict[int, Pose]) -> tuple[
         for k, pose in poses.items()
         if (prior := priors[k].pose) is not None
     ]
-    if len(away) < _LEAST_FRAMES:
+    if len(away) < LEAST_FRAMES:
         return np.zeros(3), np.full(3, np.inf), False
     middle = np.median(away, axis=0)
     spread = 1.48 * np.median(np.abs(np.array(away) - middle), axis=0) / np.sqrt(len(away))

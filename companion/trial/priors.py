@@ -230,7 +230,8 @@ def _usable(
             notes.append(
                 f"heights above the {datum.value} cannot be true over this map: they put "
                 f"{int(wrong.sum())} of {len(rows)} frames {above.min():.0f} to "
-                f"{above.max():.0f} m above its ground; they are not used"
+                f"{above.max():.0f} m above its ground; they are not used (heights above the "
+                "take-off belong into a column relative_alt_m)"
             )
             continue
         sigmas[datum] = float(np.median([h.sigma_m for h, _ in rows]))

@@ -10,12 +10,14 @@ import numpy as np
 from companion.integrity_monitor.config import ProtectionConfig
 from companion.integrity_monitor.protection import budget
 from companion.recorded.flight import RecordedFlight
-from companion.trial.estimate import Estimated
+from companion.trial.estimate import LEAST_FRAMES, Estimated
 from companion.trial.localize import Localized, horizontal_m
 from companion.trial.priors import FramePrior
 from localizer.geometry.pose import Array
 
-WORKS, PARTLY, NOT, UNKNOWN = "works", "works partly", "does not work", "cannot be told"
+WORKS, PARTLY, NOT, UNKNOWN = (
+    "works", "works partly", "does not work", "cannot be judged"
+)  # fmt: skip
 _GOOD_SHARE, _SOME_SHARE = 0.8, 0.3
 _SAME_PLACE_SIGMAS, _LEAST_SAME_M = 4.0, 10.0
 _STILL_MPS = (0.0, 0.0)  # of photos: time stamps are no part of their positions' error
@@ -123,12 +125,14 @@ def judge(trial: Trial) -> Judgement:
     if searched:
         found = f"without positions {right} of {searched} are found"
         parts.append(found + (f" and {wrong} at a wrong place" if wrong else ""))
+    if kind == UNKNOWN:
+        parts.append(f"give {LEAST_FRAMES} or more, so that a wrong angle or focal length shows")
     return Judgement(kind, f"Vision {kind} here: {'; '.join(parts)}{_because(trial)}.")
 
 
 def _kind(share: float, trial: Trial, known: Array) -> str:
     if share < _SOME_SHARE:
-        return NOT
+        return NOT if len(trial.best) >= LEAST_FRAMES else UNKNOWN
     wrong = trial.search_outcome()[2]
     spread = spread_limit_m(trial)
     scattered = len(known) > 0 and float(np.median(known)) > spread

@@ -21,7 +21,7 @@ from companion.recorded.flight import (
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, priors_of
 from companion.trial.reasons import reasons
-from companion.trial.result import Trial
+from companion.trial.result import NOT, UNKNOWN, Trial, judge
 from companion.trial.wanted_map import wanted_map
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -125,6 +125,16 @@ def test_a_search_is_wrong_where_neither_record_nor_registration_agree(cache):
     searched = {k: found(p, m) for k, (p, m) in enumerate(zip(priors, (3, 20, -30), strict=True))}
     trial = Trial(flight, priors, second, second, searched, None, {}, ())
     assert trial.search_outcome() == (3, 2, 1)
+
+
+@pytest.mark.parametrize(("count", "kind"), [(1, UNKNOWN), (4, NOT)])
+def test_too_few_frames_give_no_verdict_against_a_place(cache, count, kind):
+    """One photo of a folder that works was judged as "does not work"."""
+    flight = _flight(cache.frame, [(0.0, 0.0)] * count, ())
+    failed = (Localized("a", None, problem="no"),) * count
+    trial = Trial(flight, priors_of(flight, cache).priors, failed, failed, {}, None, {}, ())
+    assert judge(trial).kind == kind
+    assert judge(trial).exit_code == 1
 
 
 @pytest.mark.parametrize(
