@@ -38,12 +38,7 @@ def height_likelihood(
     """
     if len(patches.shift) < LEAST_PATCHES:
         return None
-    y = patches.shift.reshape(-1)
-    rows = patches.motion.reshape(-1, 6)
-    rise = patches.rise.reshape(-1)
-    correlation = np.kron(height_correlation(patches.ground), np.ones((2, 2)))
-    values, basis = np.linalg.eigh(correlation * np.outer(rise, rise))
-    y, rows = basis.T @ y, basis.T @ rows
+    values, y, rows = _decorrelated(patches)
     known, wanted = np.zeros((0, 6)), np.zeros(0)
     if constraint is not None:
         known, wanted = constraint_rows(constraint, pose)
@@ -54,6 +49,23 @@ def height_likelihood(
     result = _marginal(y, rows, known, wanted, 1.0 / variance).max(axis=1)
     relative: Array = result - result.max()
     return relative
+
+
+def _decorrelated(patches: PatchDisplacements) -> tuple[Array, Array, Array]:
+    """Variances (2 P,) that heights of spread one give to as many uncorrelated combinations of the
+    displacements, these (2 P,), and their motion (2 P, 6).
+
+    A height moves its patch along one line. So only the parts along these lines are correlated.
+    """
+    length = np.hypot(patches.rise[:, 0], patches.rise[:, 1])
+    along = np.where(length[:, None] > 0, patches.rise, (1.0, 0.0))
+    along = along / np.hypot(along[:, :1], along[:, 1:])
+    across = along[:, ::-1] * (-1.0, 1.0)
+    both = np.concatenate([patches.shift[..., None], patches.motion], axis=2)
+    values, basis = np.linalg.eigh(height_correlation(patches.ground) * np.outer(length, length))
+    moved = [np.einsum("pa,pai->pi", axis, both) for axis in (along, across)]
+    turned = np.concatenate([basis.T @ moved[0], moved[1]])
+    return np.concatenate([values, np.zeros(len(values))]), turned[:, 0], turned[:, 1:]
 
 
 def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array) -> Array:

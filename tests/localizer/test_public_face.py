@@ -1,5 +1,6 @@
 """`from localizer import ...`: every name is there, once, and costs nothing until it is used."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,18 @@ def test_importing_the_package_imports_no_kernel_and_no_network():
     heavy = "{'numba', 'onnxruntime', 'cv2', 'scipy', 'torch'}"
     code = f"import sys, localizer; sys.exit(bool({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted in /proc")
+def test_the_algebra_of_a_flight_has_no_threads_of_its_own():
+    """OpenBLAS's wait in a busy loop for a core that another thread has."""
+    unset = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    code = "import os, localizer, numpy; os._exit(len(os.listdir('/proc/self/task')) != 1)"
+    assert subprocess.run([sys.executable, "-c", code], env=unset, check=False).returncode == 0
+    timed = [sys.executable, "-X", "importtime", "-c", "from companion.cli import commands"]
+    shown = subprocess.run(timed, capture_output=True, text=True, check=True).stderr
+    ended = [line.split("|")[-1].strip() for line in shown.splitlines()]
+    assert ended.index("localizer") < ended.index("numpy")
 
 
 def test_the_page_begins_with_what_the_example_does():

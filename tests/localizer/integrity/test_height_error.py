@@ -7,7 +7,7 @@ import pytest
 
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.height_error import CANDIDATES_M, MapHeightError, height_likelihood
-from localizer.integrity.patch_covariance import patch_covariance
+from localizer.integrity.patch_covariance import height_correlation, patch_covariance
 from localizer.registration.agreement import PatchDisplacements
 from localizer.registration.priors import attitude_constraint, combine, fused, height_constraint
 
@@ -108,6 +108,23 @@ def test_a_surface_model_is_taken_at_its_word_until_images_contradict():
         seen, off = town(5.0, seed)
         surface = surface.after(height_likelihood(seen, registered(off), gravity(seed)))
     assert surface.sigma_m > 1.0
+
+
+def test_the_likelihood_is_that_of_the_whole_covariance():
+    """Of all displacements at once, the pose marginalised."""
+    seen, off = town(2.5, 3)
+    found = height_likelihood(seen, registered(off), None)
+    y, rows, rise = seen.shift.reshape(-1), seen.motion.reshape(-1, 6), seen.rise.reshape(-1)
+    raised = np.kron(height_correlation(seen.ground), np.ones((2, 2))) * np.outer(rise, rise)
+    wanted = np.full(len(CANDIDATES_M), -np.inf)
+    for k, spread_m in enumerate(CANDIDATES_M):
+        for noise_px in (0.1, 0.2, 0.4, 0.8, 1.2, 1.8, 2.6):
+            whole = noise_px**2 * np.eye(len(y)) + spread_m**2 * raised
+            normal = rows.T @ np.linalg.solve(whole, rows)
+            left = y - rows @ np.linalg.solve(normal, rows.T @ np.linalg.solve(whole, y))
+            logs = np.linalg.slogdet(whole)[1] + np.linalg.slogdet(normal)[1]
+            wanted[k] = max(wanted[k], -0.5 * (logs + left @ np.linalg.solve(whole, left)))
+    assert found == pytest.approx(wanted - wanted.max(), abs=1e-3)
 
 
 def test_too_few_patches_say_nothing():
