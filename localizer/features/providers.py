@@ -8,11 +8,14 @@ import contextlib
 import errno
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
+import numpy as np
 import onnxruntime as ort
+from numpy.typing import NDArray
 
 from localizer.caches import cache_folder
 from localizer.errors import ModelError
@@ -24,8 +27,20 @@ _log = logging.getLogger(__name__)
 _TENSORRT, _CUDA, _CPU = (f"{n}ExecutionProvider" for n in ("Tensorrt", "CUDA", "CPU"))
 SHORT_NAMES = {_TENSORRT: "TensorRT", _CUDA: "CUDA", _OPENVINO: _OPENVINO, _CPU: "CPU"}
 
-Session = ort.InferenceSession | OpenVinoSession
 Provider = str | tuple[str, dict[str, str]]
+
+
+class Session(Protocol):
+    """A loaded network: onnxruntime's or OpenVINO's."""
+
+    def run(self, outputs: list[str], inputs: dict[str, NDArray[np.uint8]], /) -> list[Any]:
+        """The named outputs."""
+
+    def get_outputs(self) -> Sequence[Any]:
+        """All outputs, each with its name."""
+
+    def get_providers(self) -> list[str]:
+        """Full names of what computes, the first choice first."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +116,9 @@ def _started(
         check(alone)
         return alone
     providers = [_configured(n, expected) for n in names if n != _OPENVINO]
-    session = ort.InferenceSession(str(model), options, providers=providers, enable_fallback=False)
+    session: Session = ort.InferenceSession(
+        str(model), options, providers=providers, enable_fallback=False
+    )
     if names[0] != session.get_providers()[0]:
         raise RuntimeError("its libraries could not be loaded")
     check(session)

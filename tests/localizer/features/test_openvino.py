@@ -1,4 +1,4 @@
-"""OpenVINO: where it is chosen, what happens if it fails, and its features where it is installed."""
+"""OpenVINO: where it is chosen, what happens if it fails, its features where it is installed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localizer.features import OnnxExtractor, openvino_session, providers
+from localizer.features import OnnxExtractor, providers
 from localizer.features.extractor import SHIPPED_MODEL
 from localizer.features.openvino_session import OpenVinoSession, is_worthwhile
 
@@ -35,7 +35,7 @@ def image(seed: int, width: int = 64, height: int = 48) -> np.ndarray:
 )
 def test_it_is_used_where_the_processor_has_tiles(installed, text, wanted, tmp_path, monkeypatch):
     spec = ModuleSpec("openvino", None) if installed else None
-    monkeypatch.setattr(openvino_session.importlib.util, "find_spec", lambda _: spec)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: spec)
     file = tmp_path / "cpuinfo"
     if text is not None:
         file.write_text(text)
