@@ -72,8 +72,8 @@ def self_test(
     """
     config = config or LocalizerConfig()
     say("building a map")
-    cache = _map(folder)
-    pose, frame = _view(cache, config)
+    cache = made_map(folder)
+    pose, frame = made_view(cache, config)
     say("compiling and tracking")
     tracked = _track(folder / "map", pose, frame, config)
     say("searching without a prior")
@@ -92,7 +92,7 @@ def self_test(
     return report
 
 
-def _map(folder: Path) -> TileCache:
+def made_map(folder: Path) -> TileCache:
     """Ground that is alike nowhere, from a DSM and an orthophoto as a user brings them."""
     n = round(_SIDE_M / _CELL_M)
     rng = np.random.default_rng(0)
@@ -122,7 +122,7 @@ def _write(path: Path, raster: np.ndarray, **profile: float) -> None:
         file.write(np.moveaxis(raster, -1, 0))
 
 
-def _view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
+def made_view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
     """The map seen from its middle, 100 m above ground."""
     camera = Camera.from_fov(config.width, config.width * 3 // 4, 60.0)
     middle = cache.frame.position((0.0, 0.0, 0.0))  # a source's centre is its origin
