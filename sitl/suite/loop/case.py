@@ -52,7 +52,7 @@ class Drag(StrictModel):
 
 
 class Load(StrictModel):
-    """CPU load: `processes` busy processes share one processor with the companion for some seconds."""
+    """CPU load: `processes` busy processes run on one processor with the companion."""
 
     processes: int = Field(ge=1, le=32)
     for_s: float = Field(gt=0, le=300)
