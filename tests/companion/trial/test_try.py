@@ -18,6 +18,7 @@ from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer
 from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
+from companion.trial.run import sampled
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -132,6 +133,27 @@ def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequen
             assert one.pose.distance_to(same.pose)[0] < 1e-6
             assert one.quality == pytest.approx(same.quality, abs=0.01)
     stack.close()
+
+
+def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(small_assets, tmp_path):
+    cache = TileCache.open(small_assets.map_cache)
+    middle = cache.frame.position(np.zeros(3))
+    for k in range(90):
+        view = {} if k % 2 else {"GimbalRollDegree": 1, "GimbalPitchDegree": -89,
+                                 "GimbalYawDegree": 5}  # fmt: skip
+        xmp = dji(GpsLatitude=middle.latitude_deg, GpsLongitude=middle.longitude_deg + 1e-6 * k,
+                  RelativeAltitude=60, **view)  # fmt: skip
+        write_photo(tmp_path / f"{k:02d}.jpg", xmp, exif={_FOCAL_35: 24})
+    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
+    known = priors_of(flight, cache)
+    kept, priors = sampled(flight, known)
+    names = [int(frame.name[:2]) for frame in kept.frames]
+    assert [k for k in names if not k % 2] == list(range(0, 90, 2))  # their heading is known
+    odd = [k for k in names if k % 2]
+    assert (len(odd), odd[0], odd[-1]) == (40, 1, 89)
+    assert len(priors.priors) == len(names)
+    assert sum("40 of them" in note for note in priors.notes) == 1
+    assert sampled(kept, priors)[0] is kept
 
 
 @pytest.mark.parametrize(("factor", "told"), [(1.0, 0), (0.3048, 1), (0.6, 0)])
