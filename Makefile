@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # `make newest` takes the newest ones that pyproject.toml allows.
 LOCK := constraints.txt
 INSTALL = PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
-EXTRAS := cluster console dev docs fetch mcap pyrender ulog
+EXTRAS := cluster console dev docs fetch mcap openvino pyrender ulog
 
 CHECKED := tests/test_house.py tests/test_docs_commands.py tests/companion/test_config.py \
 	tests/localizer/geometry tests/localizer/integrity tests/companion/integrity_monitor \

@@ -62,7 +62,7 @@ def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[Check
     speed = (python, "-m", "benchmarks.features.network_speed")
     found.append(ChecklistStep("networks: s0 and tiny on every provider", speed, 120))
     found.append(ChecklistStep("pairs while training", (python, "-m", "benchmarks.pairs",
-                      "configs/train_s0.yaml", "--pairs", "32", "--no-photos"), 90))  # fmt: skip
+                      "configs/train_s0.yaml", "--pairs", "32", "--no-photos"), 120))  # fmt: skip
     found.append(ChecklistStep("optimizer", (python, "-m", "benchmarks.optimizer.gpu"), 150))
     if sequence is not None and cache is not None:
         for device in ("cuda", "cpu"):

@@ -28,6 +28,8 @@ with needs_torch():
     from localizer.training.data.pairs import Pair, SceneConfig, draw_views
     from localizer.training.data.streams import photo_source, scene_config
 
+_ON_CPU = 4  # pairs are enough for a rate: each takes a second or more
+
 
 def numpy_pairs(
     place: PlaceVisits, scenes: SceneConfig, loader: LoaderConfig, count: int
@@ -84,7 +86,7 @@ def main() -> None:
         f"place of {data.cells} cells with {data.flight_days} flight days: {each:.2f} s on one core"
     )
     numpy_pairs(places[0], scenes, loader, 1)
-    made, seconds = numpy_pairs(places[0], scenes, loader, args.pairs)
+    made, seconds = numpy_pairs(places[0], scenes, loader, min(args.pairs, _ON_CPU))
     print(f"NumPy, one core: {made / seconds:.2f} pairs/s")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     plan = LivePlan(data.first_seed, data.scenes, 2, 1, data.flight_days)

@@ -11,8 +11,8 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-_PACKAGES = ("pilot-companion", "numpy", "numba", "onnxruntime", "opencv-python-headless", "av",
-             "pymavlink")  # fmt: skip
+_PACKAGES = ("pilot-companion", "numpy", "numba", "onnxruntime", "openvino",
+             "opencv-python-headless", "av", "pymavlink")  # fmt: skip
 
 
 def versions() -> dict[str, str]:

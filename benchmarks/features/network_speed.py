@@ -16,14 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 
 from benchmarks.common.arguments import Parser, existing, whole
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
 from localizer.features import OnnxExtractor
 from localizer.features.extractor import SHIPPED_MODEL
-from localizer.features.providers import SHORT_NAMES
+from localizer.features.providers import SHORT_NAMES, available_providers
 from localizer.types import Image
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -80,7 +79,7 @@ def measure(
     models: Sequence[Path], sizes: Sequence[tuple[int, int]], threads: int, count: int
 ) -> Iterator[SpeedRow]:
     """Every model at every size on every installed provider that runs it."""
-    installed = [SHORT_NAMES[n] for n in ort.get_available_providers() if n in SHORT_NAMES]
+    installed = [SHORT_NAMES[n] for n in available_providers() if n in SHORT_NAMES]
     for model in models:
         for provider in installed:
             for size in sizes:
@@ -94,7 +93,7 @@ def measure(
                     continue
                 host = median_ms(extractor.extract, image, count)
                 device = None
-                if provider != "CPU":
+                if provider not in ("CPU", "OpenVINO"):
                     device = median_ms(extractor.extract_on_device, image, count)
                 yield SpeedRow(extractor.info.name, provider, size, host, device)
 

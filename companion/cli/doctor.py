@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -21,9 +21,12 @@ from rich.text import Text
 
 from companion.config import load_config
 from companion.terminal.steps import shown_steps, shown_work
-from companion.versions import made_by
+from companion.versions import made_by, processor
 from companion.writing import refuse_input, result_file, writing
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
+
+if TYPE_CHECKING:
+    from companion.preflight.bench import BenchRow
 
 
 def doctor_command(
@@ -106,6 +109,9 @@ def _mark(finding: DoctorFinding) -> str:
 
 def self_test_command(
     out: Annotated[Path | None, typer.Option(help="figures and versions, JSON")] = None,
+    bench: Annotated[
+        bool, typer.Option("--bench", help="measure speed and memory at 10, 30 and 60 frames/s")
+    ] = False,
 ) -> None:
     """Localize over a generated map: compiles the kernels and checks this computer."""
     if out is not None:
@@ -113,14 +119,36 @@ def self_test_command(
     from companion.preflight.self_test import self_test
 
     console, told = Console(), Console(stderr=True)
+    rows: list[BenchRow] = []
     with tempfile.TemporaryDirectory(prefix="companion-self-test-") as folder:
-        report = self_test(Path(folder), lambda line: told.print(f"{line} ..."))
+        report = self_test(
+            Path(folder),
+            lambda line: told.print(f"{line} ..."),
+            timed=rows.append if bench else None,
+        )
     console.print(
         f"[green]self-test passed[/]: tracked to {report.error_m:.4f} m, found to "
         f"{report.found_error_m:.4f} m, {report.frame_ms:.0f} ms of processor a frame, the first "
         f"after {report.compiled_s:.0f} s"
     )
+    if rows:
+        console.print(_speed_table(rows, report.features))
     if out is not None:
         data = asdict(report) | {"versions": made_by()}
+        if rows:
+            data["bench"] = [asdict(row) for row in rows]
         with writing(out, "--out"):
             out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def _speed_table(rows: Sequence[BenchRow], features: str) -> Table:
+    table = Table(title=f"{processor()}; {features}")
+    for name in ("offered, Hz", "answered, Hz", "latency p50 / p95, ms", "processor, ms a frame",
+                 "cores", "peak memory, MiB"):  # fmt: skip
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(
+            str(row.offered_hz), f"{row.answered_hz:.1f}", f"{row.p50_ms:.0f} / {row.p95_ms:.0f}",
+            f"{row.cpu_ms:.1f}", f"{row.cores:.2f}", f"{row.peak_mib:.0f}",
+        )  # fmt: skip
+    return table

@@ -19,6 +19,7 @@ import rasterio
 from rasterio.transform import from_origin
 
 from companion.errors import CompanionError
+from companion.preflight.bench import BenchRow, bench
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
@@ -46,41 +47,52 @@ class SelfTestError(CompanionError):
 @dataclass(frozen=True)
 class SelfTestReport:
     """error_m: of the tracked place, worst frame; found_error_m: of the one searched without a
-    prior; frame_ms: processor time a frame, median; compiled_s: until the first frame was done.
+    prior; frame_ms: processor time a frame, median; compiled_s: until the first frame was done;
+    features: what computes the features.
     """
 
     error_m: float
     found_error_m: float
     frame_ms: float
     compiled_s: float
+    features: str
 
 
 def self_test(
-    folder: Path, say: Callable[[str], None], config: LocalizerConfig | None = None
+    folder: Path,
+    say: Callable[[str], None],
+    config: LocalizerConfig | None = None,
+    *,
+    timed: Callable[[BenchRow], None] | None = None,
 ) -> SelfTestReport:
-    """Build a map in `folder`, track frames over it and find one without a prior.
+    """Build a map in `folder`, track frames over it and find one without a prior. timed: takes each
+    row of the measured speed, if it is to be measured.
 
     Raises SelfTestError where a result is off by more than 0.5 m or none is accepted.
     """
     config = config or LocalizerConfig()
     say("building a map")
-    cache = _map(folder)
-    pose, frame = _view(cache, config)
+    cache = made_map(folder)
+    pose, frame = made_view(cache, config)
     say("compiling and tracking")
     tracked = _track(folder / "map", pose, frame, config)
     say("searching without a prior")
     found_m = _search(cache, pose, frame, config)
-    report = SelfTestReport(tracked[0], found_m, tracked[1], tracked[2])
+    report = SelfTestReport(tracked[0], found_m, *tracked[1:])
     worst = max(report.error_m, report.found_error_m)
     if not worst <= _GOOD_M:
         raise SelfTestError(
             f"the self-test is {worst:.2f} m off where {_GOOD_M} m is the most: this computer or "
             "its packages compute wrongly; do not fly with them"
         )
+    if timed is not None:
+        say("measuring the speed, which is only right while nothing else runs")
+        for row in bench(folder / "map", pose, frame.camera, config):
+            timed(row)
     return report
 
 
-def _map(folder: Path) -> TileCache:
+def made_map(folder: Path) -> TileCache:
     """Ground that is alike nowhere, from a DSM and an orthophoto as a user brings them."""
     n = round(_SIDE_M / _CELL_M)
     rng = np.random.default_rng(0)
@@ -110,7 +122,7 @@ def _write(path: Path, raster: np.ndarray, **profile: float) -> None:
         file.write(np.moveaxis(raster, -1, 0))
 
 
-def _view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
+def made_view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
     """The map seen from its middle, 100 m above ground."""
     camera = Camera.from_fov(config.width, config.width * 3 // 4, 60.0)
     middle = cache.frame.position((0.0, 0.0, 0.0))  # a source's centre is its origin
@@ -123,8 +135,10 @@ def _view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
 
 def _track(
     path: Path, pose: Pose, frame: Frame, config: LocalizerConfig
-) -> tuple[float, float, float]:
-    """Worst error in metres, processor milliseconds a frame, seconds until the first was done."""
+) -> tuple[float, float, float, str]:
+    """Worst error in metres, processor milliseconds a frame, seconds until the first was done, and
+    what computes the features.
+    """
     began = time.perf_counter()
     off = Pose(pose.rotation, pose.translation + np.array([_OFF_M, -_OFF_M, 0.0]))
     spent_ms, errors, compiled_s = [], [], 0.0
@@ -142,7 +156,8 @@ def _track(
                 raise SelfTestError(f"frame {k} is refused ({found.status.value}): do not fly")
             apart = found.world_from_camera.translation - pose.translation
             errors.append(float(np.linalg.norm(apart)))
-    return max(errors), float(np.median(spent_ms[1:])), compiled_s
+        features = localizer.features_name
+    return max(errors), float(np.median(spent_ms[1:])), compiled_s, features
 
 
 def _search(cache: TileCache, pose: Pose, frame: Frame, config: LocalizerConfig) -> float:

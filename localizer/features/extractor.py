@@ -1,4 +1,4 @@
-"""Feature extractors: the shipped network through onnxruntime, or the labelled fallback.
+"""Feature extractors: the shipped network in onnxruntime or OpenVINO, or the labelled fallback.
 
 A model is two files: ``NAME.onnx`` and ``NAME.json``. The graph takes ``image`` (1, H, W, 3) uint8
 RGB with H and W divisible by the description's `multiple`, and gives for each level, coarse to
@@ -21,7 +21,8 @@ from localizer.errors import ModelError
 from localizer.features.bound_session import BoundSession
 from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
-from localizer.features.providers import Expected, provider_of, start_session
+from localizer.features.openvino_session import PROVIDER as OPENVINO
+from localizer.features.providers import Expected, Session, provider_of, start_session
 from localizer.plain_files import plain_bytes, plain_text
 from localizer.types import FeatureLevel, FeaturePyramid, Image
 
@@ -149,18 +150,21 @@ class OnnxExtractor:
             lambda session: self._check(session, model, width, height),
             only,
         )
-        device = bound_to or ("cuda" if self.provider != "CPU" else None)
+        on_gpu = self.provider not in ("CPU", OPENVINO)
+        device = bound_to or ("cuda" if on_gpu else None)
         self._bound = None if device is None else BoundSession(self._session, self._outputs, device)
         _log.info("features: %s", self.name)
 
     @property
     def provider(self) -> str:
-        """Short name of the execution provider in use: TensorRT, CUDA or CPU."""
+        """Short name of the execution provider in use: TensorRT, CUDA, OpenVINO or CPU."""
         return provider_of(self._session)
 
     @property
     def name(self) -> str:
         """Model and provider, for reports."""
+        if self.provider == OPENVINO:
+            return f"{self.info.name} (OpenVINO, CPU, bfloat16)"
         return f"{self.info.name} (onnxruntime, {self.provider})"
 
     def extract(self, rgb: Image) -> FeaturePyramid:
@@ -168,7 +172,7 @@ class OnnxExtractor:
         check_image(rgb, self._multiple)
         return FeaturePyramid(self._run(self._session, rgb), rgb.shape[1], rgb.shape[0])
 
-    def _run(self, session: ort.InferenceSession, rgb: Image) -> tuple[FeatureLevel, ...]:
+    def _run(self, session: Session, rgb: Image) -> tuple[FeatureLevel, ...]:
         arrays = session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
         return tuple(
             FeatureLevel(arrays[2 * k][0], arrays[2 * k + 1][0], level.stride)
@@ -193,7 +197,7 @@ class OnnxExtractor:
             )
         return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
-    def _check(self, session: ort.InferenceSession, model: Path, width: int, height: int) -> None:
+    def _check(self, session: Session, model: Path, width: int, height: int) -> None:
         """Run once: it warms up, and a wrong graph fails here, not in flight."""
         try:
             levels = self._run(session, np.zeros((height, width, 3), np.uint8))

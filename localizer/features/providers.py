@@ -1,4 +1,6 @@
-"""onnxruntime's execution providers: the first of TensorRT, CUDA and CPU that runs a model."""
+"""What runs a model: the first of TensorRT, CUDA, OpenVINO and CPU that does. All but OpenVINO are
+onnxruntime's execution providers.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +8,39 @@ import contextlib
 import errno
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
+import numpy as np
 import onnxruntime as ort
+from numpy.typing import NDArray
 
 from localizer.caches import cache_folder
 from localizer.errors import ModelError
+from localizer.features.openvino_session import PROVIDER as _OPENVINO
+from localizer.features.openvino_session import OpenVinoSession, is_worthwhile
 
 _log = logging.getLogger(__name__)
 
 _TENSORRT, _CUDA, _CPU = (f"{n}ExecutionProvider" for n in ("Tensorrt", "CUDA", "CPU"))
-SHORT_NAMES = {_TENSORRT: "TensorRT", _CUDA: "CUDA", _CPU: "CPU"}
+SHORT_NAMES = {_TENSORRT: "TensorRT", _CUDA: "CUDA", _OPENVINO: _OPENVINO, _CPU: "CPU"}
 
 Provider = str | tuple[str, dict[str, str]]
+
+
+class Session(Protocol):
+    """A loaded network: onnxruntime's or OpenVINO's."""
+
+    def run(self, outputs: list[str], inputs: dict[str, NDArray[np.uint8]], /) -> list[Any]:
+        """The named outputs."""
+
+    def get_outputs(self) -> Sequence[Any]:
+        """All outputs, each with its name."""
+
+    def get_providers(self) -> list[str]:
+        """Full names of what computes, the first choice first."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +60,9 @@ def start_session(
     model: Path,
     options: ort.SessionOptions,
     expected: Expected,
-    check: Callable[[ort.InferenceSession], None],
+    check: Callable[[Session], None],
     only: str | None = None,
-) -> ort.InferenceSession:
+) -> Session:
     """A session on the best installed provider that starts and passes `check`, which runs the model
     once: engines are built and algorithms chosen there, not at the first frame.
 
@@ -50,8 +70,8 @@ def start_session(
     model is one warning; TensorRT is tried again without what it kept, which may be damaged. Raises
     `ModelError` when none does.
     """
-    available = ort.get_available_providers()
-    names = [name for name in (_TENSORRT, _CUDA, _CPU) if name in available]
+    available = available_providers()
+    names = [name for name in SHORT_NAMES if name in available]
     if only is not None:
         names = [name for name in names if SHORT_NAMES[name] == only]
     for k, name in enumerate(names):
@@ -78,16 +98,27 @@ def start_session(
     )
 
 
+def available_providers() -> list[str]:
+    """Full names of what is installed and worth to be tried on this computer."""
+    return [*ort.get_available_providers(), *([_OPENVINO] if is_worthwhile() else [])]
+
+
 def _started(
     model: Path,
     options: ort.SessionOptions,
     expected: Expected,
     names: list[str],
-    check: Callable[[ort.InferenceSession], None],
-) -> ort.InferenceSession:
+    check: Callable[[Session], None],
+) -> Session:
     """A session on the first provider; later providers run what it cannot compute."""
-    providers = [_configured(n, expected) for n in names]
-    session = ort.InferenceSession(str(model), options, providers=providers, enable_fallback=False)
+    if names[0] == _OPENVINO:
+        alone = OpenVinoSession(model, options.intra_op_num_threads)
+        check(alone)
+        return alone
+    providers = [_configured(n, expected) for n in names if n != _OPENVINO]
+    session: Session = ort.InferenceSession(
+        str(model), options, providers=providers, enable_fallback=False
+    )
     if names[0] != session.get_providers()[0]:
         raise RuntimeError("its libraries could not be loaded")
     check(session)
@@ -98,8 +129,8 @@ def _line(error: Exception) -> str:
     return str(error).split("\n")[0]
 
 
-def provider_of(session: ort.InferenceSession) -> str:
-    """Short name of the provider that serves: TensorRT, CUDA or CPU."""
+def provider_of(session: Session) -> str:
+    """Short name of the provider that serves: TensorRT, CUDA, OpenVINO or CPU."""
     name = str(session.get_providers()[0])
     return SHORT_NAMES.get(name, name.removesuffix("ExecutionProvider"))
 

@@ -21,7 +21,7 @@ def content(array: DeviceArray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def bound():
     """The shipped network as it would be on a GPU, its outputs bound to memory of the CPU."""
-    return OnnxExtractor(SHIPPED_MODEL, threads=1, bound_to="cpu")
+    return OnnxExtractor(SHIPPED_MODEL, threads=1, only="CPU", bound_to="cpu")
 
 
 def image(height, width, seed=0):
@@ -56,7 +56,7 @@ def test_the_detail_level_stays_on_the_host(bound):
 
 
 def test_on_a_cpu_nothing_is_bound():
-    plain = OnnxExtractor(SHIPPED_MODEL, threads=1)
+    plain = OnnxExtractor(SHIPPED_MODEL, threads=1, only="CPU")
     assert plain.provider == "CPU"
     assert isinstance(plain, DeviceExtractor)
     levels = plain.extract_on_device(image(64, 64)).levels

@@ -69,7 +69,7 @@ def test_without_shipped_weights_the_fallback_says_so(monkeypatch, tmp_path, cap
 def test_shipped_weights_run_at_sizes_divisible_by_eight(image: np.ndarray) -> None:
     loaded = load_extractor(threads=1)
     assert isinstance(loaded, OnnxExtractor)
-    assert loaded.name == f"tiny (onnxruntime, {loaded.provider})"
+    assert loaded.name.startswith("tiny (")
     assert_is_pyramid(loaded.extract(image), image)
     odd = np.ascontiguousarray(image[:200, :264])
     assert_is_pyramid(loaded.extract(odd), odd)

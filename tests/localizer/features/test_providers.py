@@ -12,7 +12,7 @@ import onnxruntime as ort
 import pytest
 
 from localizer.errors import ModelError
-from localizer.features import OnnxExtractor
+from localizer.features import OnnxExtractor, providers
 from localizer.features.extractor import SHIPPED_MODEL
 
 NAMES = {"TensorRT": "Tensorrt", "CUDA": "CUDA", "CPU": "CPU", "Azure": "Azure"}
@@ -51,6 +51,7 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., As
     constructor raises, "silent", where onnxruntime leaves it out, or "run".
     """
     monkeypatch.setenv("PILOT_CACHE", str(tmp_path))
+    monkeypatch.setattr(providers, "is_worthwhile", lambda: False)
 
     def installed(names: list[str], **broken: str) -> Asked:
         asked: Asked = []
