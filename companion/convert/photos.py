@@ -1,10 +1,9 @@
-"""Poses in photos' tags: EXIF's GPS position, DJI's gimbal angles in XMP; XMP sidecars.
+"""Poses in photo tags: EXIF's GPS position, DJI's gimbal angles in XMP; XMP sidecars.
 
-XMP stands in the JPEG itself (an APP1 segment) or beside it as NAME.xmp, which wins. Gimbal angles:
-roll, pitch (0 horizontal, -90 down), yaw from north clockwise, Rz(yaw) Ry(pitch) Rx(roll).
-
-Tags that cannot be true are no measurements: angles that are all 0, a place at 0, 0, and heights of
-one flight that are above different surfaces.
+XMP is in the JPEG (an APP1 segment) or beside it as NAME.xmp, which takes precedence. Gimbal
+angles: roll, pitch (0 horizontal, -90 down), yaw clockwise from north, Rz(yaw) Ry(pitch) Rx(roll).
+Impossible tags are ignored: angles that are all 0, position 0, 0, and heights with different
+references in one flight.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class Heights:
 
     @property
     def lift_m(self) -> float:
-        """What is added to a tag's height to be above the ellipsoid."""
+        """Value to add to a tag's height to obtain the ellipsoidal height, m."""
         return self.separation_m if self.datum == "amsl" else 0.0
 
 
@@ -58,8 +57,8 @@ def read_photos(
     heights: Heights | None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[StampedPose, ...]:
-    """The pose of each photo of a folder, by name, or of one photo. tell: takes what is odd about
-    the tags and does not make them wrong. `PoseFileError` if there is no photo.
+    """Poses of one photo or of a folder's photos, by name. tell: receives warnings about the tags.
+    `PoseFileError` if there is no photo.
     """
     known = _known(path, heights)
     photos = [path]
@@ -145,7 +144,7 @@ def _number(tags: dict[str, str], name: str) -> float | None:
 def write_sidecars(
     folder: Path, poses: Sequence[StampedPose], frame: LocalFrame, heights: Heights | None
 ) -> None:
-    """``NAME.xmp`` per pose, with DJI's tags; photos themselves are never changed."""
+    """Write ``NAME.xmp`` with DJI's tags for each pose; photos are not changed."""
     lift = _known(folder, heights).lift_m
     folder.mkdir(parents=True, exist_ok=True)
     for pose in poses:

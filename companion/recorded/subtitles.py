@@ -39,14 +39,14 @@ _TILT_DEG, _HEADING_DEG = 2.0, 6.0
 
 @dataclass(frozen=True)
 class Subtitles:
-    """What a file says. samples: dated from the video's begin, ns; focal_35mm: of the lens."""
+    """Telemetry of a file. samples: time from the video's start, ns; focal_35mm: of the lens."""
 
     samples: tuple[Telemetry, ...]
     focal_35mm: float | None = None
 
 
 def read_subtitles(path: Path) -> Subtitles:
-    """Telemetry of a .SRT file. `FootageError` where it holds none."""
+    """Read telemetry of a .SRT file; `FootageError` without any."""
     try:
         text = plain_bytes(path).decode("utf-8-sig", "replace")
     except OSError as error:
