@@ -145,15 +145,6 @@ class PhotoTags:
         return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
 
     @property
-    def exif_position(self) -> tuple[float, float, float] | None:
-        """Latitude, longitude and altitude of EXIF; None where one of them is missing."""
-        latitude, longitude = self._exif_place
-        height = self._exif_altitude
-        if latitude is None or longitude is None or height is None:
-            return None
-        return latitude, longitude, height
-
-    @property
     def _exif_place(self) -> tuple[float | None, float | None]:
         gps, tag = self.gps, ExifTags.GPS
         latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef) == "S")
@@ -166,20 +157,20 @@ class PhotoTags:
         if relative is not None:
             sigma = math.hypot(_BAROMETER_M, _BAROMETER_SHARE * relative)
             heights.append(Height(relative, Datum.TAKEOFF, sigma))
-        absolute = self.number("AbsoluteAltitude")
+        return [*heights, self.altitude] if self.altitude is not None else heights
+
+    @property
+    def altitude(self) -> Height | None:
+        """The absolute height; AltitudeType, else the RTK fix, says what it is above."""
+        value = self.number("AbsoluteAltitude")
+        if value is None:
+            value = self._exif_altitude
+            return None if value is None else Height(value, Datum.AMSL, _GNSS_HEIGHT_M)
         kind = self.xmp.get("AltitudeType", "").lower()
         fixed = self.number("RtkFlag") in (16.0, 34.0, 50.0)
-        if absolute is not None and (kind == "rtkalt" or fixed):
-            heights.append(Height(absolute, Datum.ELLIPSOID, _RTK_M))
-        elif absolute is not None:
-            heights.append(Height(absolute, Datum.AMSL, _ABSOLUTE_M))
-        else:
-            heights += self._exif_height()
-        return heights
-
-    def _exif_height(self) -> list[Height]:
-        value = self._exif_altitude
-        return [] if value is None else [Height(value, Datum.AMSL, _GNSS_HEIGHT_M)]
+        if kind == "rtkalt" or (fixed and kind != "gpsfusionalt"):
+            return Height(value, Datum.ELLIPSOID, _RTK_M)
+        return Height(value, Datum.AMSL, _ABSOLUTE_M)
 
     @property
     def _exif_altitude(self) -> float | None:
@@ -220,7 +211,9 @@ def looking_down(heading_deg: float | None) -> RecordedView:
 
 
 def read_photo_tags(path: Path) -> PhotoTags:
-    """The tags of a photo. `FootageError` where it is no image."""
+    """The tags of a photo, or of a sidecar alone. `FootageError` where it is no image."""
+    if path.suffix.lower() == ".xmp":
+        return PhotoTags(path, 0, 0, xmp=_read_xmp(path))
     try:
         with Image.open(path) as image:
             exif = image.getexif()
@@ -231,10 +224,10 @@ def read_photo_tags(path: Path) -> PhotoTags:
             width, height = image.size
     except (OSError, ValueError, SyntaxError) as error:
         raise FootageError(f"{path}: not an image that can be read: {error}") from error
-    return PhotoTags(path, width, height, base | more, gps, read_xmp(path))
+    return PhotoTags(path, width, height, base | more, gps, _read_xmp(path))
 
 
-def read_xmp(path: Path) -> dict[str, str]:
+def _read_xmp(path: Path) -> dict[str, str]:
     """XMP tags by name, attributes and elements alike; empty where there are none. `FootageError`
     if the file cannot be read.
     """

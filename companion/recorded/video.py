@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 
 import av
@@ -21,6 +22,7 @@ VIDEO_SUFFIXES = frozenset(
 )  # fmt: skip
 _RATE_HZ = 30.0  # of a file that has no times, and no rate in its headers
 _LARGEST_PX = 1920  # of an image's width: registration works on less
+_NO_CLOCK_YEAR = 2000  # of a camera whose clock was never set: 1904 or 1970
 _QUALITY_SUFFIX = ".jpg"
 
 
@@ -38,7 +40,7 @@ class ExtractedFrame:
 class VideoFacts:
     """What a video file says. width, height: of its frames; has_dji_track: whether it holds DJI's
     own telemetry (protobuf, a layout for each model); assumed: about its times, empty if it has
-    some.
+    some; day: of the recording, UTC, None where it does not say.
     """
 
     width: int
@@ -47,6 +49,7 @@ class VideoFacts:
     rotation_deg: int
     has_dji_track: bool
     assumed: str
+    day: date | None = None
 
 
 def video_facts(path: Path) -> VideoFacts:
@@ -63,9 +66,19 @@ def video_facts(path: Path) -> VideoFacts:
             assumed = "" if frame.pts is not None else _assumed(path, stream)
             said = container.duration
             duration_s = said / av.time_base if said else _length_s(path)
-            return VideoFacts(frame.width, frame.height, duration_s, rotation, has_track, assumed)
+            day = _day(container.metadata.get("creation_time", ""))
+            size = frame.width, frame.height
+            return VideoFacts(*size, duration_s, rotation, has_track, assumed, day)
     except av.error.FFmpegError as error:
         raise FootageError(f"{path}: not a video, or damaged: {error}") from error
+
+
+def _day(text: str) -> date | None:
+    try:
+        day = date.fromisoformat(text[:10])
+    except ValueError:
+        return None
+    return day if day.year > _NO_CLOCK_YEAR else None
 
 
 def _assumed(path: Path, stream: av.VideoStream) -> str:

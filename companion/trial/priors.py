@@ -33,6 +33,7 @@ _LEAST_CLEARANCE_M, _MOST_CLEARANCE_M = 3.0, 10_000.0
 _IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not used at all
 _UNKNOWN_CLEARANCE_M = (15.0, 150.0)  # of small drones: 120 m is the usual limit, over relief
 _DATUM_M = 10.0  # between the heights of two datums: more is worth a look before a flight
+_FOOT_M = 0.3048
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
 _FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
@@ -138,6 +139,7 @@ def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     if known:
         levels = _levels(flight.frames, frame, geoid_m, known[0], float(np.std(known)))
         datum = _usable(levels, below, notes)
+        notes += _feet(levels, known[0] + frame.origin.height_m, geoid_m)
         if datum is not None:
             heights = [by_datum.get(datum) for by_datum in levels]
     usual = float(np.median(known)) if known else float(cache.index.box_min[:, 2].min())
@@ -249,6 +251,25 @@ def _usable(
                 f"{best.value}, which are used: check the map's height datum before a flight"
             )
     return best
+
+
+def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: float) -> list[str]:
+    """A note where absolute less relative heights, which is the take-off's, differ from the map's
+    ground there as feet differ from metres. takeoff_m: the map's, above the ellipsoid.
+    """
+    for datum, ground in ((Datum.ELLIPSOID, takeoff_m), (Datum.AMSL, takeoff_m - geoid_m)):
+        both = [(told[datum], told[Datum.TAKEOFF]) for told in levels
+                if {datum, Datum.TAKEOFF} <= told.keys()]  # fmt: skip
+        if not both:
+            continue
+        photos = ground + float(np.median([a.value_m - b.value_m for a, b in both]))
+        sigma = float(np.median([math.hypot(a.sigma_m, b.sigma_m) for a, b in both]))
+        if abs(photos - ground) > 3.0 * sigma and abs(photos - _FOOT_M * ground) < 2.0 * sigma:
+            return [
+                f"the map's ground is {ground:.0f} m above the {datum.value}, by the photos' "
+                f"heights {photos:.0f} m: are its heights in feet? Build it with --height-unit ft"
+            ]
+    return []
 
 
 def _prior(
