@@ -11,7 +11,7 @@ from types import FrameType
 from sitl.embedded.errors import VehicleError
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters, read_parameter_file
-from sitl.embedded.px4.parameters import Px4Parameters
+from sitl.embedded.px4_parameters import Px4Parameters
 from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 

@@ -11,6 +11,8 @@ from sitl.embedded.control.arming import GYRO_SETTLE_S, ArmingContext, arming_fa
 from sitl.embedded.control.loop import advance
 from sitl.embedded.control.mission import MissionStore
 from sitl.embedded.control.modes import FlightModes
+from sitl.embedded.control.px4_modes import Px4Modes
+from sitl.embedded.ekf.ekf2_injection import Px4PositionInput
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.ekf.injection import ExternalNavInput
 from sitl.embedded.ekf.measurements import Baro, Compass, GpsData
@@ -21,8 +23,6 @@ from sitl.embedded.physics.dynamics import TICK_S
 from sitl.embedded.physics.gimbal import Gimbal
 from sitl.embedded.physics.rotation import Array, euler
 from sitl.embedded.physics.sensors import GpsSample, Sensors
-from sitl.embedded.px4.injection import Px4PositionInput
-from sitl.embedded.px4.modes import Px4Modes
 from sitl.embedded.severity import CRITICAL, INFO
 from sitl.geodesy import Location
 

@@ -8,11 +8,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.mavlink.commands import Commands
+from sitl.embedded.mavlink.px4_dialect import Px4Commands, Px4Telemetry
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.mavlink.telemetry import DEFAULT_STREAMS, TelemetryBuilder
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.dynamics import TICK_S
-from sitl.embedded.px4.dialect import Px4Commands, Px4Telemetry
 from sitl.geodesy import Location
 
 _MAX_LAG_S = 0.25  # of wall time behind schedule after which the schedule starts anew

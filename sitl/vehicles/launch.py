@@ -110,7 +110,7 @@ def _sources(number: int, *, position: int, velocity: int, climb: int) -> dict[s
 
 
 class EmbeddedSitl(VehicleProcess):
-    """The embedded vehicle as a process of its own. px4: see `sitl.embedded.px4`."""
+    """The embedded vehicle as a process of its own. px4: see `sitl.embedded.px4_parameters`."""
 
     kind = "embedded"
     start_timeout_s = 300.0  # the first start compiles the kernels

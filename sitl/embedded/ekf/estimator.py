@@ -17,10 +17,10 @@ import numpy as np
 
 from sitl.embedded.ekf import navigation as nav
 from sitl.embedded.ekf.aided_filter import GPS, AidedFilter, Aiding
+from sitl.embedded.ekf.ekf2_filter import Ekf2Filter
 from sitl.embedded.ekf.measurements import ExternalPosition, ExternalVelocity, GpsData, Measurement
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import Array
-from sitl.embedded.px4.position_filter import Ekf2Filter
 from sitl.geodesy import Location
 
 _MAX_HORIZON_MS = 250

@@ -16,7 +16,7 @@ from sitl.embedded.ekf.timesync import JitterCorrection
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import euler
-from sitl.embedded.px4.parameters import Px4Parameters
+from sitl.embedded.px4_parameters import Px4Parameters
 from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 

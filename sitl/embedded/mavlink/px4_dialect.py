@@ -9,12 +9,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.control.mode import Mode
+from sitl.embedded.control.px4_modes import NUMBERS, custom_mode
+from sitl.embedded.ekf.ekf2_injection import Px4PositionInput, RemoteClock
 from sitl.embedded.mavlink.commands import Commands
 from sitl.embedded.mavlink.handling import ACCEPTED, FAILED
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import TelemetryBuilder
-from sitl.embedded.px4.injection import Px4PositionInput, RemoteClock
-from sitl.embedded.px4.modes import NUMBERS, custom_mode
 
 FIRMWARE_VERSION = (1, 17, 0, 255)  # major, minor, patch, FIRMWARE_VERSION_TYPE_OFFICIAL
 _TYPE_QUADROTOR, _AUTOPILOT_PX4 = 2, 12
