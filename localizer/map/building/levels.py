@@ -1,4 +1,4 @@
-"""Levels of detail for tilesets that have none, and smaller tiles where theirs are huge."""
+"""Adds levels of detail to tilesets without any, and cuts huge tiles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SMALL_BYTES = 1 << 20  # files up to here are not larger
 
 @dataclass(frozen=True)
 class ContentModel:
-    """A tile's content in ENU axes about an origin; one `Model`. key: what tells it from others."""
+    """A tile's content in ENU axes about an origin; implements `Model`. key: identifies it."""
 
     content: ContentFile = field(compare=False)
     origin: Geodetic
@@ -50,8 +50,8 @@ class ContentModel:
 
 @dataclass(frozen=True, eq=False)
 class MadeTile:
-    """The surface of other tiles from above; one `TileSource`. left, top, size: the square that
-    holds them, ENU metres about the origin.
+    """Coarser tile: the surface of other tiles seen from above; implements `TileSource`. left, top,
+    size: its square, ENU metres about the origin.
     """
 
     parts: tuple[ContentFile, ...]
@@ -82,7 +82,7 @@ class MadeTile:
 
 
 def with_levels(tree: SourceTree) -> SourceTree:
-    """The tree with huge leaves cut up, and with coarser levels if it has none at all."""
+    """The tree with huge leaves cut, and with coarser levels if it has none."""
     lat, lon, h = (float(x) for x in geodetic_from_ecef(tree.centre))
     origin = Geodetic(lat, lon, h)
     nodes = [node for node in tree.root.walk() if node.tiles and not node.children]

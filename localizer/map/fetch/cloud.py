@@ -1,5 +1,6 @@
-"""Cloud-optimised GeoTIFFs: of large files only the blocks that are needed, by HTTP ranges; named
-by an address or found in a STAC catalogue.
+"""Cloud-optimised GeoTIFFs: reads only the required blocks of remote files by HTTP ranges.
+
+Files are given by URL or found in a STAC catalogue.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ class NoFileError(MapFetchError):
 
 
 class RangeFile(io.RawIOBase):
-    """A file on a server, read in blocks that are asked for once; one thread. failed: is given the
-    errors, of which GDAL's own would only say that something could not be read.
+    """A remote file as a Python file object, read in cached blocks; one thread. failed: receives
+    errors, which GDAL would replace by a generic one.
     """
 
     def __init__(self, url: str, client: PoliteClient, failed: list[MapFetchError]) -> None:
@@ -124,8 +125,8 @@ class RangeFile(io.RawIOBase):
 
 @dataclass(frozen=True)
 class CloudFile:
-    """One file. bounds: west, south, east, north in degrees, of which it has something. may_lack:
-    whether there may be no such file, since its address is made and not found in a catalogue.
+    """A remote GeoTIFF. bounds: west, south, east, north in degrees, which it covers in part.
+    may_lack: it may not exist, because its URL was constructed.
     """
 
     url: str
@@ -137,9 +138,8 @@ def plan_files(
     source: CatalogueSource, area: Area, resolution_m: float, files: Sequence[CloudFile],
     client: PoliteClient,
 ) -> FetchPlan:  # fmt: skip
-    """Windows of the files that meet an area. The grid is the files' own where they share it.
-    `MapFetchError` if there is no file or there are too many, `NoFileError` if none of the named
-    ones exists.
+    """Plan the windows of the files that meet an area, on the files' common grid if there is one.
+    `MapFetchError` if there is no file or there are too many, `NoFileError` if none exists.
     """
     wanted = [f for f in files if area.meets(f.bounds)]
     if not wanted:
@@ -168,8 +168,8 @@ def plan_files(
 
 
 def degree_files(source: CatalogueSource, area: Area) -> list[CloudFile]:
-    """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file. A degree that
-    is all sea has no file, nor has some land whose heights are not public: nothing says which.
+    """Files of a model cut by whole degrees (Copernicus GLO-30), otherwise the single file. Files
+    of sea areas and of some restricted land do not exist.
     """
     if "{lat}" not in source.url:
         return [CloudFile(source.url, source.bounds)]
@@ -242,7 +242,7 @@ def _opened(url: str, client: PoliteClient, failed: list[MapFetchError]) -> Any:
 
 
 def check_depth(name: str, dtype: str) -> None:
-    """`MapFetchError` for more than 8 bits: which of them are black and white is not said."""
+    """`MapFetchError` for images of more than 8 bits, whose value range is unknown."""
     if dtype != "uint8":
         raise MapFetchError(
             f"{name} has pixels of {dtype}, no picture of 8 bits; ask for another layer or "
@@ -311,7 +311,7 @@ def _warped(data: Any, window: FetchGrid, how: Resampling, source: CatalogueSour
 
 
 def as_geotiff(bands: np.ndarray, known: np.ndarray, window: FetchGrid) -> bytes:
-    """A piece as a file. bands: (n, height, width); known: where they hold."""
+    """Encode a piece as GeoTIFF. bands: (n, height, width); known: mask of valid pixels."""
     heights = bands.dtype == np.float32
     values = np.where(known, bands, NODATA if heights else 0).astype(bands.dtype)
     profile: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Pictures that are ready as tiles: XYZ, TMS and WMTS."""
+"""Fetches imagery tiles: XYZ, TMS and WMTS."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SLACK = 1.3  # a level may be that much coarser than wished: the next has four 
 
 @dataclass(frozen=True)
 class Level:
-    """One level of tiles. left, top: of the first tile; pixel: CRS units; address: with {column}
+    """One zoom level. left, top: of the first tile; pixel: CRS units; address: URL with {column}
     and {row}, rows from the north.
     """
 
@@ -53,8 +53,8 @@ class Level:
 def plan_tiles(
     source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
 ) -> FetchPlan:
-    """The tiles over an area, of the level that is about as fine as wished. `MapFetchError` if the
-    source has none there.
+    """Plan the tiles over an area, at about the requested resolution. `MapFetchError` if the source
+    has none there.
     """
     if source.kind == "wmts":
         level = _wmts_level(source, area, resolution_m, client)

@@ -53,7 +53,7 @@ def plan_blocks(
 
 
 def wms_url(source: CatalogueSource, window: FetchGrid) -> str:
-    """GetMap; OGC 06-042. Version 1.3.0 names a CRS's axes in its own order."""
+    """URL of GetMap (OGC 06-042). Version 1.3.0 uses the CRS's own axis order."""
     version = source.version or "1.3.0"
     left, bottom, right, top = window.bounds
     bounds = (left, bottom, right, top)
@@ -73,7 +73,7 @@ def wms_url(source: CatalogueSource, window: FetchGrid) -> str:
 
 
 def wcs_1_url(source: CatalogueSource, window: FetchGrid) -> str:
-    """GetCoverage of 1.0.0 (OGC 03-065r6): a rectangle, east first, in so many pixels."""
+    """URL of GetCoverage 1.0.0 (OGC 03-065r6): a rectangle, east first, and its pixel size."""
     bounds = ",".join(f"{v:.10g}" for v in window.bounds)
     return _with(
         source.url,
@@ -87,7 +87,7 @@ def wcs_1_url(source: CatalogueSource, window: FetchGrid) -> str:
 
 
 def wcs_2_url(source: CatalogueSource, window: FetchGrid, axes: tuple[str, str]) -> str:
-    """GetCoverage of 2.0.1 (OGC 09-147r3): by its own pixels, with some more about them."""
+    """URL of GetCoverage 2.0.1 (OGC 09-147r3): at its native resolution, with a margin."""
     left, bottom, right, top = window.bounds
     east, south = (_MARGIN * p for p in window.pixel)
     url = _with(

@@ -1,4 +1,4 @@
-"""Whether a map is suitable for a flight: coverage, holes, texel size, seams, imagery offset."""
+"""Checks a map before a flight: coverage, holes, texel size, seams, imagery offset."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _GROUND = "ground"
 
 
 class Grade(Enum):
-    """How good a finding is."""
+    """Rating of a finding."""
 
     GOOD = "good"
     ADVICE = "advice"
@@ -91,14 +91,14 @@ class MapCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is bad."""
+        """Whether no finding is bad."""
         return all(f.grade is not Grade.BAD for f in self.findings)
 
 
 @dataclass(frozen=True)
 class Seam:
-    """A border between tiles. ends: rows and columns of its ends; height_m, grey: median steps
-    across it beyond those beside it.
+    """A visible border between tiles. ends: rows and columns of its ends; height_m, grey: median
+    steps across it, minus those beside it.
     """
 
     ends: tuple[tuple[int, int], tuple[int, int]]
@@ -107,7 +107,7 @@ class Seam:
 
     @property
     def seen(self) -> bool:
-        """Whether it shows."""
+        """Whether it is visible."""
         return self.height_m > _SEAM_M or self.grey > _SEAM_GREY
 
 
@@ -146,7 +146,7 @@ def check_map(cache: TileCache, use: MapUse) -> MapCheck:
 
 
 def seams_of(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
-    """The borders of the finest nodes, inside the map."""
+    """Borders of the finest nodes inside the map."""
     index, rows, columns = cache.index, *mosaic.height.shape
     grey = mosaic.rgb.astype(np.float32).mean(axis=2)
     found = []
