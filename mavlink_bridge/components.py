@@ -77,7 +77,7 @@ class Components:
         self._hints_told: dict[AlertId, int] = {}  # when
 
     def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
-        """Queue a text for the ground station; the oldest are dropped if the queue is full."""
+        """Queue an item for the ground station; the oldest is dropped if the queue is full."""
         self._outbound.append(item)
 
     def waiting(self) -> dict[str, int]:

@@ -41,7 +41,7 @@ _IDLE_NS = 100_000_000
 
 
 def message_id(name: str) -> int:
-    """The id of a MAVLink message."""
+    """MAVLink message id of a message name."""
     return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
 
 

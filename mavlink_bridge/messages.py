@@ -1,8 +1,8 @@
-"""The dataclasses that cross the bridge's border; none of them is a MAVLink message.
+"""The dataclasses of the bridge's public interface; none is a MAVLink message.
 
 Times are CLOCK_MONOTONIC nanoseconds of the exposure or measurement; heights are above the WGS84
 ellipsoid; NED is north, east, down; angles are radians, aerospace roll, pitch, yaw from true north.
-None is what is not known; NaN says that in MAVLink's fields and in arrays only (`or_nan`).
+None means unknown; NaN has this meaning in MAVLink fields and in arrays only (`or_nan`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LARGEST_SIGMA = 1e3  # of an angle or a speed
 
 
 class HealthLevel(enum.Enum):
-    """The localizer's health, as the heartbeat's system status tells it."""
+    """The localizer's health, sent as the heartbeat's system status."""
 
     STARTING = "starting"
     OK = "ok"
@@ -39,7 +39,7 @@ Figures = dict[str, int | float | str | None]
 
 
 def or_nan(value: float | None) -> float:
-    """A MAVLink field's value: NaN says there what None says here."""
+    """A MAVLink field's value: NaN instead of None."""
     return math.nan if value is None else value
 
 
@@ -83,13 +83,13 @@ def _is_covariance(P: Array) -> bool:
 
 
 def horizontal_sigma_m(P: Array) -> float:
-    """1 sigma along the worst horizontal direction of a covariance, north and east first, m^2."""
+    """1 sigma in the worst horizontal direction of an NED covariance (m^2), m."""
     return math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
 
 
 @dataclass(frozen=True)
 class VisionFix:
-    """One position (and attitude) of the vehicle's body, seen by the localizer.
+    """One position (and attitude) of the vehicle's body from vision.
 
     Raises `FixError` for what no autopilot should be told.
     """
@@ -151,28 +151,28 @@ class VisionFix:
 
     @property
     def by_odometry(self) -> bool:
-        """Whether odometry carried it on from an earlier fix."""
+        """Whether visual odometry propagated it from an earlier fix."""
         return self.scale_sigma is not None
 
     @property
     def horizontal_sigma_m(self) -> float:
-        """Along the worst direction."""
+        """1 sigma along the worst horizontal direction, m."""
         return horizontal_sigma_m(self.position_covariance_ned)
 
     @property
     def vertical_sigma_m(self) -> float:
-        """Of the height."""
+        """1 sigma of the height, m."""
         return math.sqrt(max(float(self.position_covariance_ned[2, 2]), 0.0))
 
     @property
     def yaw_rad(self) -> float | None:
-        """Heading from true north; None where the attitude is unknown."""
+        """Heading from true north; None if the attitude is unknown."""
         return None if self.quaternion is None else quat.to_euler(self.quaternion)[2]
 
 
 @dataclass(frozen=True)
 class TargetReport:
-    """A target's position for the ground station. Raises `FixError` for what is none."""
+    """A target's position for the ground station. Raises `FixError` for impossible values."""
 
     time_ns: int
     """Of the exposure in which it was seen."""
@@ -217,14 +217,14 @@ class TargetReport:
 
 @dataclass(frozen=True)
 class TargetEnd:
-    """Nothing is to be told of that target any more."""
+    """The target is no longer reported."""
 
     target_id: int
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where the camera is and what it looks at, for CAMERA_FOV_STATUS."""
+    """Camera position, attitude and ground point in the image's centre (CAMERA_FOV_STATUS)."""
 
     time_ns: int
     """Of the exposure."""
@@ -253,7 +253,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class TrackRequest:
-    """What the operator asked the camera component to track."""
+    """A request of the operator to track a point or rectangle of the image."""
 
     kind: str
     """"point", "rectangle" or "stop"."""
@@ -271,7 +271,7 @@ class TrackRequest:
 
 @dataclass(frozen=True)
 class PlaceHint:
-    """Where the operator says that the vehicle is: a place to look at first, never a position."""
+    """Vehicle position given by the operator; it limits the search and is never a fix."""
 
     latitude_deg: float
     longitude_deg: float
@@ -297,7 +297,7 @@ class Attitude:
 
 @dataclass(frozen=True)
 class InertialSample:
-    """What the IMU read (RAW_IMU, HIGHRES_IMU), before any estimator: body axes FRD."""
+    """IMU measurement (RAW_IMU, HIGHRES_IMU) in body axes FRD, not filtered by an estimator."""
 
     time_ns: int
     specific_force: tuple[float, float, float]
@@ -308,7 +308,7 @@ class InertialSample:
 
 @dataclass(frozen=True)
 class GimbalAttitude:
-    """The gimbal's attitude at a time, to NED, resolved from whatever frame the message used."""
+    """The gimbal's attitude to NED at a time, whatever frame the message used."""
 
     time_ns: int
     roll_rad: float
@@ -324,7 +324,7 @@ class GimbalAttitude:
 
 @dataclass(frozen=True)
 class Origin:
-    """The EKF origin, or another place in the autopilot's terms: WGS84."""
+    """The EKF origin, or another position with altitude AMSL (WGS84)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -333,7 +333,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class VehicleState:
-    """A snapshot of what the vehicle says about itself; None where it has not said it.
+    """Snapshot of the vehicle's telemetry; None if not received.
 
     Times are those of the message on CLOCK_MONOTONIC, 0 before the first.
     """

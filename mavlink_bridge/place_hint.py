@@ -1,7 +1,7 @@
-"""MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) to the localizer: where the operator says we are.
+"""MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) to the localizer: the operator's position hint.
 
-To the autopilot the same command is a position to be believed. Addressed to the localizer it says
-where to search, and is never injected.
+Sent to the autopilot, the same command sets the EKF's position. Sent to the localizer, it limits
+the search and is never injected.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _GLOBAL = (
 
 
 def place_hint(message: Any) -> PlaceHint | None:
-    """The hint of a COMMAND_INT or COMMAND_LONG; None where it names no place.
+    """The hint of a COMMAND_INT or COMMAND_LONG; None if it has no valid position.
 
     param3: accuracy, 1 sigma in metres, at least 10; param5, param6: latitude and longitude, as
     1e-7 degrees in COMMAND_INT, as degrees (to about a metre) in COMMAND_LONG.

@@ -1,4 +1,4 @@
-"""Quaternions (w, x, y, z) and aerospace angles, as MAVLink writes them; angles in radians."""
+"""Quaternions (w, x, y, z) and aerospace angles in MAVLink's conventions; radians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def wrap_pi(angle: float) -> float:
 
 
 def normalise(q: tuple[float, ...] | list[float]) -> Quaternion:
-    """Unit length; ValueError for one that has no direction."""
+    """Scale to unit length; ValueError for a zero quaternion."""
     w, x, y, z = q
     n = math.sqrt(w * w + x * x + y * y + z * z)
     if not n > 1e-6 or not math.isfinite(n):
@@ -40,7 +40,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
-    """The vector, rotated by q."""
+    """Rotate the vector by q."""
     _, x, y, z = multiply(multiply(q, (0.0, *v)), conjugate(q))
     return x, y, z
 
@@ -69,7 +69,7 @@ def to_euler(q: Quaternion) -> Vector:
 
 
 def slerp(a: Quaternion, b: Quaternion, t: float) -> Quaternion:
-    """Spherical interpolation, the short way; t = 0 gives a, t = 1 gives b."""
+    """Spherical interpolation along the shorter path; t = 0 gives a, t = 1 gives b."""
     dot = sum(p * q for p, q in zip(a, b, strict=True))
     if dot < 0.0:
         b, dot = (-b[0], -b[1], -b[2], -b[3]), -dot
@@ -82,7 +82,7 @@ def slerp(a: Quaternion, b: Quaternion, t: float) -> Quaternion:
 
 
 def turn(q: Quaternion, rates: Vector, seconds: float) -> Quaternion:
-    """The attitude q after turning at constant body rates (rad/s)."""
+    """Attitude after a rotation of q at constant body rates (rad/s)."""
     rx, ry, rz = (rate * seconds for rate in rates)
     angle = math.sqrt(rx * rx + ry * ry + rz * rz)
     if angle < 1e-9:

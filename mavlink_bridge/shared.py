@@ -1,4 +1,4 @@
-"""What the bridge lends to the ends of its links."""
+"""Objects that the handlers of all links share."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ FURTHER_CLICKS = 1_000_001
 
 
 def clicked_numbers() -> Iterator[int]:
-    """A number for each click, which is no detected target's."""
+    """Yield target numbers for clicks; they differ from those of detected targets."""
     return chain(CLICKED, count(FURTHER_CLICKS))
 
 
 @dataclass(frozen=True)
 class Shared:
-    """What the bridge shares with its links' handlers. report: sends an alert to the operator.
+    """Objects that the bridge shares with its links' handlers. report: sends an alert to the
+    operator.
 
     gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
     """
@@ -49,11 +50,11 @@ class Shared:
     """Of clicked targets, over all links; none is given twice."""
 
     def uptime_ms(self, now_ns: int) -> int:
-        """Milliseconds since the bridge began: its own time_boot_ms."""
+        """Milliseconds since the bridge started, its time_boot_ms."""
         return (now_ns - self.begun_ns) // 1_000_000 & 0xFFFFFFFF
 
     def mode(self) -> Mode:
-        """off, shadow or inject; mode rc follows its gate."""
+        """Current mode: off, shadow or inject; mode rc is resolved by the pilot's enable."""
         if self.enable is None:
             return self.config.mode
         return "inject" if self.enable.open else "shadow"

@@ -1,4 +1,4 @@
-"""Alerts and the localizer's health, as they go to the ground side: here alerts become text."""
+"""Sends alerts and the localizer's health to the ground station; alerts become text here."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SAME_NS = 1_000_000_000  # within it the same alert is not sent twice in a row
 
 
 class OperatorStatus:
-    """Tells the operator. Every method may be called from any thread.
+    """Reports alerts and health to the operator. Thread-safe.
 
     send: an alert's severity and message to the ground; on_alert: every alert, for a record.
     """
@@ -49,14 +49,14 @@ class OperatorStatus:
 
     @property
     def level(self) -> HealthLevel:
-        """The localizer's health, as the heartbeats tell it."""
+        """The localizer's health level for the heartbeats."""
         return self._level
 
     def set_health(
         self, level: HealthLevel, alerts: Sequence[Alert], *, tell: bool, now_ns: int | None = None
     ) -> None:
-        """What is true now, worst first; to be called again and again. Alerts that are new are
-        sent, if any are reported at all.
+        """Set the active alerts, most severe first; call it repeatedly. New ones are sent if
+        `tell`.
 
         A condition that comes and goes is sent once in 10 s, and its end once that has lasted: an
         overload may begin and end every other second. now_ns: CLOCK_MONOTONIC.
@@ -84,9 +84,8 @@ class OperatorStatus:
         return not bad or now_ns - self._reported_ns.get(alert.key, -_AGAIN_NS) >= _AGAIN_NS
 
     def report(self, alert: Alert, now_ns: int | None = None) -> None:
-        """STATUSTEXT, and the log. An alert that is repeated within a second is left out: a flood
-        of orders that are refused would hide every other, and wear out the link and the record. One
-        after another alert is no repetition: "on" after "off" tells how it stands.
+        """Send an alert as STATUSTEXT and log it. The same alert is left out if it is repeated
+        within a second, so that many refused commands do not hide other alerts.
         """
         if self._is_repeated(alert, self._clock() if now_ns is None else now_ns):
             return
@@ -105,7 +104,7 @@ class OperatorStatus:
             return False
 
     def alerts(self) -> list[Alert]:
-        """The last ones, oldest first."""
+        """The last alerts, oldest first."""
         return list(self._alerts)
 
 
@@ -116,8 +115,8 @@ def status_text(alert: Alert) -> Any:
 
 
 def named_values(figures: Mapping[str, float], uptime_ms: int) -> list[Any]:
-    """NAMED_VALUE_FLOAT (251) of each figure; a name holds 10 characters. ValueError for a longer
-    or empty name.
+    """NAMED_VALUE_FLOAT (251) of each value. ValueError for a name that is empty or longer than 10
+    characters.
     """
     too_long = [name for name in figures if not 0 < len(name) <= _NAME_LENGTH]
     if too_long:

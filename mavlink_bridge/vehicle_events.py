@@ -1,4 +1,4 @@
-"""What happened to the vehicle that changes what its operator should do: GNSS gone, arming."""
+"""Detects changes of the vehicle that concern the operator: GNSS lost, arming."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HELD_NS = 10_000_000_000
 
 
 class VehicleEvents:
-    """Called ten times a second by one thread. Reports each change that lasts, once."""
+    """Reports each lasting change once. Called ten times a second by one thread."""
 
     def __init__(self, teller: StatusNotifier) -> None:
         self._teller = teller
@@ -30,8 +30,8 @@ class VehicleEvents:
     def look(
         self, state: VehicleState, now_ns: int, *, injecting: bool, refused: bool = False
     ) -> None:
-        """Take in the vehicle's state. injecting: positions are being sent. refused: GNSS
-        contradicts vision, so that it is not back.
+        """Process the vehicle's state. injecting: positions are being sent. refused: GNSS
+        contradicts vision, so it does not count as back.
         """
         healthy = gnss_healthy(state, now_ns)
         self._follow_gnss(healthy and not (refused and not self._gnss), now_ns, injecting=injecting)
@@ -40,7 +40,7 @@ class VehicleEvents:
         self._armed = state.armed
 
     def held(self, reason: Alert | None, now_ns: int) -> None:
-        """Why fixes that come are not sent, from the interlock; None when they are or none come.
+        """Set the interlock's reason for not sending available fixes; None without one.
 
         The shadow check needs some seconds, so a reason that passes soon is not reported.
         """

@@ -178,7 +178,7 @@ def suite(
     seed: Annotated[int, typer.Option(min=0, help="noise of fixes and embedded sensors")] = 1,
     scenarios: Annotated[Path, typer.Option(help="folder of scenario files")] = SCENARIOS,
 ) -> None:
-    """Fly every scenario and compare with what ArduPilot was measured to do; exit 1: one fails."""
+    """Fly scenarios with simulated fixes; compare with measured ArduPilot. Exit 1: one fails."""
     cases, (console, options) = load_cases(only or (), scenarios), _runner(fc, out)
     rows = run_suite(cases, options.vehicles, jobs, seed, lambda row: print_row(console, row))
     console.print(escape(suite_table(rows)))
@@ -198,7 +198,7 @@ def loop(
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
     scenarios: Annotated[Path, typer.Option(help="folder of flights")] = LOOP_SCENARIOS,
 ) -> None:
-    """Fly the whole companion through its faults, one flight after the other; exit 1: one fails."""
+    """Fly the whole companion with injected faults, one flight a time; exit 1: one fails."""
     cases, (console, options) = (
         load_loop_cases(only or (), scenarios),
         _runner(fc, out, seeds, worlds),
@@ -216,7 +216,7 @@ def follow(
     draws: Annotated[str, typer.Option(help="of car and errors: 5, or 5..7")] = "5..7",
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
-    """Fly along with a car that an operator clicks at; it is hidden twice, for two seconds."""
+    """Follow a car that an operator clicks; roofs hide it twice for two seconds."""
     _, options = _runner(fc, out, draws, worlds)
     rows = fly_follows(options, seed)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)

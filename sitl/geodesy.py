@@ -1,6 +1,6 @@
-"""ArduPilot's own flat-Earth scaling between latitude/longitude and NED metres.
+"""ArduPilot's flat-earth conversion between latitude/longitude and NED metres.
 
-It is what the EKF inverts, so positions must be scaled the same way (Location::get_distance_NE).
+The EKF inverts it, so positions must be converted the same way (Location::get_distance_NE).
 """
 
 from __future__ import annotations

@@ -76,6 +76,7 @@ def convert_command(
     from companion.convert.formats import READERS, WRITERS, MapReference
     from companion.convert.photos import Heights
 
+    _refuse_footage(source, out, to)
     refuse_input(out, "OUT", source, source / "estimates.csv", times)
     frame, separation = _frame(map_cache, origin)
     if geoid_separation is not None:
@@ -94,6 +95,17 @@ def convert_command(
     for note in notes:
         Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
     typer.echo(f"{out}: {len(poses)} poses")
+
+
+def _refuse_footage(source: Path, out: Path, to: OutputFormat) -> None:
+    """`ConfigError` where the result would replace a photo, its sidecar or a video."""
+    from companion.recorded.photo_tags import PHOTO_SUFFIXES, RAW_SUFFIXES
+    from companion.recorded.video import VIDEO_SUFFIXES
+
+    if to is OutputFormat.PHOTOS:
+        refuse_input(out, "OUT", source.parent if source.is_file() else None)
+    elif out.suffix.lower() in PHOTO_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES | {".xmp"}:
+        raise ConfigError(f"OUT {out}: a footage file's name; give a text file, as poses.txt")
 
 
 def _on_earth(separation_m: float) -> float:

@@ -1,35 +1,30 @@
-"""Poses in photos' tags: EXIF's GPS position, DJI's gimbal angles in XMP; XMP sidecars.
+"""Converts photo tags to poses, and poses to XMP sidecars.
 
-XMP stands in the JPEG itself (an APP1 segment) or beside it as NAME.xmp, which wins. Gimbal angles:
-roll, pitch (0 horizontal, -90 down), yaw from north clockwise, Rz(yaw) Ry(pitch) Rx(roll).
-
-Tags that cannot be true are no measurements: angles that are all 0, a place at 0, 0, and heights of
-one flight that are above different surfaces.
+Uses `companion.recorded.photo_tags`; a pose also needs all angles, and heights above one surface.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from companion.convert.angles import Angles, gimbal_of_pose, pose_of_gimbal
+from companion.convert.angles import gimbal_of_pose
 from companion.errors import FootageError
-from companion.recorded.photo_tags import read_photo_tags, read_xmp
+from companion.geometry import ned_from_world
+from companion.recorded.flight import Datum
+from companion.recorded.photo_tags import PhotoTags, read_photo_tags
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose
 from localizer.geometry.trajectory import StampedPose
 from localizer.plain_files import files_of
 
 _PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
 _HOME_STEP_M = 15.0  # of absolute less relative height, which drift by metres
-_RTK = {16, 34, 50}  # RtkFlag: single, float, fixed
-_DATUMS = {"rtkalt": "ellipsoidal", "gpsfusionalt": "amsl"}  # of DJI's AltitudeType
-_ANGLES = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
+_NAMES = {Datum.ELLIPSOID: "ellipsoidal", Datum.AMSL: "amsl"}
 _SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
   <rdf:Description rdf:about="" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
@@ -48,7 +43,7 @@ class Heights:
 
     @property
     def lift_m(self) -> float:
-        """What is added to a tag's height to be above the ellipsoid."""
+        """Value to add to a tag's height to obtain the ellipsoidal height, m."""
         return self.separation_m if self.datum == "amsl" else 0.0
 
 
@@ -58,8 +53,8 @@ def read_photos(
     heights: Heights | None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[StampedPose, ...]:
-    """The pose of each photo of a folder, by name, or of one photo. tell: takes what is odd about
-    the tags and does not make them wrong. `PoseFileError` if there is no photo.
+    """Poses of one photo or of a folder's photos, by name. tell: receives warnings about the tags.
+    `PoseFileError` if there is no photo.
     """
     known = _known(path, heights)
     photos = [path]
@@ -70,51 +65,54 @@ def read_photos(
         photos += [p for p in files_of(path, (".xmp",)) if p.stem not in stems]
     if not photos:
         raise PoseFileError(f"{path}: holds no photo (.jpg, .jpeg) and no sidecar (.xmp)")
-    tags = {photo.name: _xmp_tags(photo) for photo in photos}
+    tags = {photo.name: _read_tags(photo) for photo in photos}
     _require_measured(path, tags)
     _require_one_datum(path, tags, tell)
-    stated = next(iter(tags.values())).get("AltitudeType", "")
-    if _DATUMS.get(stated.lower(), known.datum) != known.datum:
-        tell(
-            f"AltitudeType {stated}: such heights are {_DATUMS[stated.lower()]}, not {known.datum}"
-        )
-    lift = known.lift_m
-    return tuple(_read_photo(photo, tags[photo.name], frame, lift) for photo in photos)
+    first = next(iter(tags.values()))
+    stated = first.xmp.get("AltitudeType", "")
+    if stated and first.altitude is not None and _NAMES[first.altitude.datum] != known.datum:
+        datum = _NAMES[first.altitude.datum]
+        tell(f"AltitudeType {stated}: such heights are {datum}, not {known.datum}")
+    return tuple(_pose(one, frame, known.lift_m) for one in tags.values())
 
 
-def _require_measured(path: Path, photos: dict[str, dict[str, str]]) -> None:
+def _read_tags(path: Path) -> PhotoTags:
+    try:
+        return read_photo_tags(path)
+    except FootageError as error:
+        raise PoseFileError(str(error)) from error
+
+
+def _require_measured(path: Path, photos: Mapping[str, PhotoTags]) -> None:
     """Raise if all angles of a photo are 0.00: no gimbal is level and north to a hundredth of a
     degree.
     """
-    zero = [
-        name
-        for name, tags in photos.items()
-        if all(k in tags for k in _ANGLES) and not any(_number(tags, k) for k in _ANGLES)
-    ]
+    zero = [name for name, tags in photos.items() if tags.has_zero_view]
     if zero:
         raise PoseFileError(
             f"{path}: the gimbal's angles are all 0 in {len(zero)} of {len(photos)} photos, first "
             f"{zero[0]}: this camera did not measure them; its direction must be given: by "
-            f"{', '.join(_ANGLES)} in NAME.xmp beside each photo, or by a pose file"
+            "GimbalRollDegree, GimbalPitchDegree, GimbalYawDegree in NAME.xmp beside each photo, "
+            "or by a pose file"
         )
 
 
 def _require_one_datum(
-    path: Path, photos: dict[str, dict[str, str]], tell: Callable[[str], None]
+    path: Path, photos: Mapping[str, PhotoTags], tell: Callable[[str], None]
 ) -> None:
     """All heights of a flight are above the same surface, as far as the tags say."""
     kinds: dict[str, list[str]] = {}
     for name, tags in photos.items():
-        rtk = "with RTK" if _number(tags, "RtkFlag") in _RTK else "without RTK"
-        kinds.setdefault(tags.get("AltitudeType", rtk), []).append(name)
+        if tags.altitude is not None:
+            kinds.setdefault(tags.altitude.datum.value, []).append(name)
     if len(kinds) > 1:
         named = ", ".join(f"{kind}: {len(n)} photos, first {n[0]}" for kind, n in kinds.items())
         raise PoseFileError(
-            f"{path}: the heights of these photos are above different surfaces ({named}): RtkAlt "
-            "is above the ellipsoid, GpsFusionAlt above the geoid; put each kind into a folder of "
-            "its own and convert it with its --heights"
+            f"{path}: the heights of these photos are above different surfaces ({named}), by their "
+            "AltitudeType and RtkFlag; put each kind into a folder of its own and convert it with "
+            "its --heights"
         )
-    flags = sorted({f for t in photos.values() if (f := _number(t, "RtkFlag")) is not None})
+    flags = sorted({f for t in photos.values() if (f := t.number("RtkFlag")) is not None})
     if len(flags) > 1:
         tell(
             f"RtkFlag {', '.join(f'{flag:.0f}' for flag in flags)}: not all photos have an RTK fix "
@@ -129,23 +127,16 @@ def _require_one_datum(
             )
 
 
-def _home_m(tags: dict[str, str]) -> float:
+def _home_m(tags: PhotoTags) -> float:
     """Height of the take-off point from the photo's tags; NaN if unknown."""
-    height, above = (_number(tags, f"{kind}Altitude") for kind in ("Absolute", "Relative"))
+    height, above = tags.number("AbsoluteAltitude"), tags.number("RelativeAltitude")
     return float("nan") if height is None or above is None else height - above
-
-
-def _number(tags: dict[str, str], name: str) -> float | None:
-    try:
-        return float(tags[name])
-    except (KeyError, ValueError):
-        return None
 
 
 def write_sidecars(
     folder: Path, poses: Sequence[StampedPose], frame: LocalFrame, heights: Heights | None
 ) -> None:
-    """``NAME.xmp`` per pose, with DJI's tags; photos themselves are never changed."""
+    """Write ``NAME.xmp`` with DJI's tags for each pose; photos are not changed."""
     lift = _known(folder, heights).lift_m
     folder.mkdir(parents=True, exist_ok=True)
     for pose in poses:
@@ -173,51 +164,21 @@ def _known(path: Path, heights: Heights | None) -> Heights:
     return heights
 
 
-def _read_photo(path: Path, tags: dict[str, str], frame: LocalFrame, lift_m: float) -> StampedPose:
-    missing = [name for name in _ANGLES if name not in tags]
-    if missing:
-        raise PoseFileError(f"{path}: its XMP lacks {', '.join(missing)}; which camera took it?")
+def _pose(tags: PhotoTags, frame: LocalFrame, lift_m: float) -> StampedPose:
+    path = tags.path
     try:
-        lat, lon, height = _xmp_position(tags) or _exif_position(path)
-        angles = Angles(*(float(tags[name]) for name in _ANGLES))
-        if not np.isfinite(angles.radians).all():
-            raise ValueError("angles must be finite")
-        if lat == lon == 0.0:
-            raise ValueError("latitude and longitude are 0: it had no GNSS fix; remove the photo")
-        position = Geodetic(lat, lon, height + lift_m)
+        said = tags.telemetry()
+        if said.view is None:
+            raise ValueError("no gimbal angles in its XMP or NAME.xmp; which camera took it?")
+        if said.position is None or tags.altitude is None:
+            raise ValueError("no position with a height in EXIF or XMP: no GNSS fix; remove it")
+        at = said.position
+        height_m = tags.altitude.value_m + lift_m
+        position = Geodetic(at.latitude_deg, at.longitude_deg, height_m)
+    except FootageError as error:
+        raise PoseFileError(str(error)) from error
     except (ValueError, GeoreferenceError) as error:
         raise PoseFileError(f"{path}: {error}") from error
-    return StampedPose(path.name, pose_of_gimbal(position, angles, frame))
-
-
-def _xmp_tags(path: Path) -> dict[str, str]:
-    """DJI's tags by name: as attributes or as elements, both occur."""
-    try:
-        tags = read_xmp(path)
-    except FootageError as error:
-        raise PoseFileError(str(error)) from error
-    if not tags:
-        sidecar = path.with_suffix(".xmp").name
-        raise PoseFileError(f"{path}: has no XMP tags, and there is no {sidecar}")
-    return tags
-
-
-def _xmp_position(tags: dict[str, str]) -> tuple[float, float, float] | None:
-    """(latitude, longitude, height) of the tags; None where a part is missing."""
-    # "GpsLongtitude" is how some of DJI's firmwares spell it.
-    longitude = tags.get("GpsLongitude", tags.get("GpsLongtitude"))
-    values = (tags.get("GpsLatitude"), longitude, tags.get("AbsoluteAltitude"))
-    if any(value is None for value in values):
-        return None
-    lat, lon, height = (float(value) for value in values if value is not None)
-    return lat, lon, height
-
-
-def _exif_position(path: Path) -> tuple[float, float, float]:
-    try:
-        position = read_photo_tags(path).exif_position
-    except FootageError as error:
-        raise PoseFileError(str(error)) from error
-    if position is None:
-        raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP")
-    return position
+    place = frame.enu_from_geodetic(at.latitude_deg, at.longitude_deg, height_m)
+    rotation = ned_from_world(frame, position).T @ said.view.ned_from_camera
+    return StampedPose(path.name, Pose(rotation, place))

@@ -1,4 +1,4 @@
-"""Whatever somebody recorded, as one `RecordedFlight`: photos, a video, telemetry beside them."""
+"""Reads any footage as a `RecordedFlight`: photos or a video, with telemetry beside them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from companion.recorded.photo_tags import (
 from companion.recorded.places_file import PLACES_SUFFIXES, read_places
 from companion.recorded.sequence import is_sequence, read_sequence
 from companion.recorded.subtitles import Subtitles, read_subtitles
-from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
+from companion.recorded.video import VIDEO_SUFFIXES, VideoFacts, extract_frames, video_facts
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import list_images
 from localizer.errors import CameraError
@@ -50,6 +50,7 @@ _VIDEO_FOCAL_PERCENT = 5.0  # a video's crop of the sensor is not told
 _KLV_FOCAL_PERCENT = 3.0
 _FOV_FOCAL_PERCENT = 5.0
 _UTC_REACH_S = 3.0  # of clocks that both claim to be UTC
+_CUT_S = 5.0  # between the ends of a video and of its subtitles, which come with every frame
 _ELSEWHERE_M = 1000.0  # between two records of one flight
 _DAY_NS = 86_400 * 10**9
 _LEAST_STEP_NS, _PAIR_NS = 500_000_000, 1_000_000_000  # between frames of a video
@@ -57,9 +58,9 @@ _LEAST_STEP_NS, _PAIR_NS = 500_000_000, 1_000_000_000  # between frames of a vid
 
 @dataclass(frozen=True)
 class FootageOptions:
-    """What the user says beside the footage. frames: at most so many are read; places, log: files
-    of telemetry; fov_deg: horizontal; fixed_pitch_deg: of a camera on the airframe, for a log
-    without a gimbal; work: folder for the frames of a video; name: of a sequence in PiLoT's set.
+    """The user's options. frames: largest number; places, log: files of telemetry; fov_deg:
+    horizontal; fixed_pitch_deg: of a camera on the airframe, for a log without a gimbal; work:
+    folder for a video's frames; name: of a sequence in PiLoT's data set.
     """
 
     work: Path
@@ -75,7 +76,7 @@ class FootageOptions:
 def read_footage(
     path: Path, options: FootageOptions, progress: Progress = lambda _done, _total: None
 ) -> RecordedFlight:
-    """Read photos or a video with all telemetry that is in them or beside them.
+    """Read photos or a video with all telemetry in them or beside them.
 
     `FootageError` says what is missing and which option gives it.
     """
@@ -448,6 +449,8 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
             "as they are stored"
         )
     subtitles = _subtitles(path)
+    if subtitles is not None:
+        notes += _doubts(subtitles, facts)
     track, focal_35mm, klv_fov = _video_track(path, subtitles, notes)
     width, height = extracted[0].width, extracted[0].height
     camera = _video_camera(path, width, height, options, focal_35mm, klv_fov)
@@ -493,6 +496,22 @@ def _beside(path: Path, suffixes: frozenset[str]) -> Path | None:
 def _subtitles(path: Path) -> Subtitles | None:
     file = _beside(path, frozenset({".srt"}))
     return read_subtitles(file) if file is not None else None
+
+
+def _doubts(subtitles: Subtitles, facts: VideoFacts) -> list[str]:
+    """Whether they are of this video, and of all of it."""
+    doubts = []
+    if subtitles.day and facts.day and abs((subtitles.day - facts.day).days) > 1:
+        doubts.append(
+            f"the subtitles are of {subtitles.day}, the video says {facts.day}: are they of "
+            "another flight? Their positions are used"
+        )
+    if abs(subtitles.last_s - facts.duration_s) > _CUT_S:
+        doubts.append(
+            f"the subtitles end at {subtitles.last_s:.0f} s, the video at {facts.duration_s:.0f} "
+            "s: is one of them cut? If the begin is missing, all positions are of another time"
+        )
+    return doubts
 
 
 def _video_track(

@@ -1,7 +1,7 @@
-"""What a photo says about itself: EXIF and XMP of DJI, Autel, Parrot, Skydio and senseFly.
+"""Reads photo tags: EXIF and XMP of DJI, Autel, Parrot, Skydio and senseFly.
 
-XMP stands in the JPEG (an APP1 segment) or beside it as NAME.xmp, which takes precedence. Angles
-become those of `companion.recorded.flight`; each maker's convention stands in `_VIEWS`.
+XMP is in the JPEG (an APP1 segment) or beside it as NAME.xmp, which takes precedence. Angles are
+converted to those of `companion.recorded.flight`; `_VIEWS` has each maker's convention.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ class PhotoTags:
 
     @property
     def maker(self) -> str:
-        """Lower case; empty if not said."""
+        """Camera maker in lower case; empty if unknown."""
         return str(self.exif.get("Make") or self.xmp.get("Make") or "").strip("\x00 ").lower()
 
     @property
     def model(self) -> str:
-        """As the maker writes it; empty if not said."""
+        """Camera model; empty if unknown."""
         return str(self.exif.get("Model") or self.xmp.get("Model") or "").strip("\x00 ")
 
     def number(self, *names: str) -> float | None:
-        """The first of these XMP tags that is a finite number; fractions like 35/10 are read."""
+        """First of these XMP tags that is a finite number or a fraction such as 35/10."""
         for name in names:
             value = _number(self.xmp.get(name))
             if value is not None:
@@ -72,13 +72,13 @@ class PhotoTags:
         return None
 
     def exif_number(self, name: str) -> float | None:
-        """An EXIF number; None if it is missing, not finite or 0, which means unknown there."""
+        """An EXIF number; None if it is missing, not finite or 0 (unknown)."""
         value = _number(self.exif.get(name))
         return value if value else None
 
     @property
     def time_ns(self) -> int | None:
-        """Nanoseconds since 1970 on the photo's own clock, whose time zone is not known."""
+        """Nanoseconds since 1970 on the photo's clock, of unknown time zone."""
         text = str(self.exif.get("DateTimeOriginal") or self.exif.get("DateTime") or "")
         try:
             day = datetime.strptime(text.strip("\x00 "), "%Y:%m:%d %H:%M:%S")
@@ -91,18 +91,18 @@ class PhotoTags:
 
     @property
     def was_turned(self) -> bool:
-        """Whether another program turned the pixels: its tags are of the image before that."""
+        """Whether another program rotated the image, so that its tags do not fit."""
         width, height = self.exif_number("ExifImageWidth"), self.exif_number("ExifImageHeight")
         if width is None or height is None or width == height or self.width == self.height:
             return False
         return (width > height) != (self.width > self.height)
 
     def telemetry(self) -> Telemetry:
-        """Position, view and direction, as far as the tags say them."""
+        """Position and direction, as far as the tags have them."""
         return Telemetry(self.time_ns, self._position(), self.view(), self._course())
 
     def view(self) -> RecordedView | None:
-        """The measured view, by the first maker's convention whose tags are there."""
+        """The measured camera direction, by the first maker's convention that fits."""
         for names, convert in _VIEWS:
             angles = [self.number(name) for name in names]
             values = [a for a in angles if a is not None]
@@ -115,7 +115,7 @@ class PhotoTags:
 
     @property
     def has_zero_view(self) -> bool:
-        """Whether there are angles, and all of them are exactly zero: they were not measured."""
+        """Whether all angles are exactly zero, so that they were not measured."""
         return self.view() is None and any(
             all(self.number(name) == 0.0 for name in names) for names, _ in _VIEWS
         )
@@ -145,15 +145,6 @@ class PhotoTags:
         return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
 
     @property
-    def exif_position(self) -> tuple[float, float, float] | None:
-        """Latitude, longitude and altitude of EXIF; None where one of them is missing."""
-        latitude, longitude = self._exif_place
-        height = self._exif_altitude
-        if latitude is None or longitude is None or height is None:
-            return None
-        return latitude, longitude, height
-
-    @property
     def _exif_place(self) -> tuple[float | None, float | None]:
         gps, tag = self.gps, ExifTags.GPS
         latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef) == "S")
@@ -166,20 +157,20 @@ class PhotoTags:
         if relative is not None:
             sigma = math.hypot(_BAROMETER_M, _BAROMETER_SHARE * relative)
             heights.append(Height(relative, Datum.TAKEOFF, sigma))
-        absolute = self.number("AbsoluteAltitude")
+        return [*heights, self.altitude] if self.altitude is not None else heights
+
+    @property
+    def altitude(self) -> Height | None:
+        """The absolute height; AltitudeType, else the RTK fix, says what it is above."""
+        value = self.number("AbsoluteAltitude")
+        if value is None:
+            value = self._exif_altitude
+            return None if value is None else Height(value, Datum.AMSL, _GNSS_HEIGHT_M)
         kind = self.xmp.get("AltitudeType", "").lower()
         fixed = self.number("RtkFlag") in (16.0, 34.0, 50.0)
-        if absolute is not None and (kind == "rtkalt" or fixed):
-            heights.append(Height(absolute, Datum.ELLIPSOID, _RTK_M))
-        elif absolute is not None:
-            heights.append(Height(absolute, Datum.AMSL, _ABSOLUTE_M))
-        else:
-            heights += self._exif_height()
-        return heights
-
-    def _exif_height(self) -> list[Height]:
-        value = self._exif_altitude
-        return [] if value is None else [Height(value, Datum.AMSL, _GNSS_HEIGHT_M)]
+        if kind == "rtkalt" or (fixed and kind != "gpsfusionalt"):
+            return Height(value, Datum.ELLIPSOID, _RTK_M)
+        return Height(value, Datum.AMSL, _ABSOLUTE_M)
 
     @property
     def _exif_altitude(self) -> float | None:
@@ -211,7 +202,7 @@ _VIEWS: tuple[tuple[tuple[str, str, str], Convert], ...] = (
 
 
 def looking_down(heading_deg: float | None) -> RecordedView:
-    """The view that is assumed where none was measured: straight down, the top of the image ahead.
+    """The assumed direction without a measurement: straight down, top of the image ahead.
 
     heading_deg: of the aircraft, None if unknown.
     """
@@ -220,7 +211,9 @@ def looking_down(heading_deg: float | None) -> RecordedView:
 
 
 def read_photo_tags(path: Path) -> PhotoTags:
-    """The tags of a photo. `FootageError` where it is no image."""
+    """Tags of a photo, or of a sidecar alone; `FootageError` if the file is no image."""
+    if path.suffix.lower() == ".xmp":
+        return PhotoTags(path, 0, 0, xmp=_read_xmp(path))
     try:
         with Image.open(path) as image:
             exif = image.getexif()
@@ -231,10 +224,10 @@ def read_photo_tags(path: Path) -> PhotoTags:
             width, height = image.size
     except (OSError, ValueError, SyntaxError) as error:
         raise FootageError(f"{path}: not an image that can be read: {error}") from error
-    return PhotoTags(path, width, height, base | more, gps, read_xmp(path))
+    return PhotoTags(path, width, height, base | more, gps, _read_xmp(path))
 
 
-def read_xmp(path: Path) -> dict[str, str]:
+def _read_xmp(path: Path) -> dict[str, str]:
     """XMP tags by name, attributes and elements alike; empty where there are none. `FootageError`
     if the file cannot be read.
     """

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from companion.recorded.flight import (
 )
 from localizer.plain_files import plain_bytes
 
+_DATE = re.compile(r"\b(20\d\d)[-.](\d\d)[-.](\d\d)\s+\d\d:\d\d:\d\d")
 _CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _PAIR = re.compile(r"([A-Za-z_]+)\s*:\s*(-?\d+(?:\.\d+)?)")
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -39,14 +41,18 @@ _TILT_DEG, _HEADING_DEG = 2.0, 6.0
 
 @dataclass(frozen=True)
 class Subtitles:
-    """What a file says. samples: dated from the video's begin, ns; focal_35mm: of the lens."""
+    """Telemetry of a file. samples: time from the video's start, ns; focal_35mm: of the lens; day:
+    of the recording by the camera's clock; last_s: start of the last subtitle.
+    """
 
     samples: tuple[Telemetry, ...]
     focal_35mm: float | None = None
+    day: date | None = None
+    last_s: float = 0.0
 
 
 def read_subtitles(path: Path) -> Subtitles:
-    """Telemetry of a .SRT file. `FootageError` where it holds none."""
+    """Read telemetry of a .SRT file; `FootageError` without any."""
     try:
         text = plain_bytes(path).decode("utf-8-sig", "replace")
     except OSError as error:
@@ -66,7 +72,15 @@ def read_subtitles(path: Path) -> Subtitles:
             f"{path}: {len(cues)} subtitles, none with a position: subtitles without telemetry, or "
             "of a kind that is not known"
         )
-    return Subtitles(tuple(_once(samples)), focal)
+    return Subtitles(tuple(_once(samples)), focal, _day(text), (samples[-1].time_ns or 0) / 1e9)
+
+
+def _day(text: str) -> date | None:
+    found = _DATE.search(text)
+    try:
+        return date(*map(int, found.groups())) if found is not None else None
+    except ValueError:
+        return None
 
 
 def _telemetry(body: str, pairs: dict[str, float], time_ns: int) -> Telemetry:

@@ -1,10 +1,11 @@
-"""Images out of a video file, with their times from its first frame."""
+"""Extracts images from a video file, with their times from its first frame."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 
 import av
@@ -21,12 +22,13 @@ VIDEO_SUFFIXES = frozenset(
 )  # fmt: skip
 _RATE_HZ = 30.0  # of a file that has no times, and no rate in its headers
 _LARGEST_PX = 1920  # of an image's width: registration works on less
+_NO_CLOCK_YEAR = 2000  # of a camera whose clock was never set: 1904 or 1970
 _QUALITY_SUFFIX = ".jpg"
 
 
 @dataclass(frozen=True)
 class ExtractedFrame:
-    """An image that was written. time_ns: from the video's first frame."""
+    """An extracted image file. time_ns: from the video's first frame."""
 
     path: Path
     time_ns: int
@@ -36,9 +38,9 @@ class ExtractedFrame:
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """What a video file says. width, height: of its frames; has_dji_track: whether it holds DJI's
-    own telemetry (protobuf, a layout for each model); assumed: about its times, empty if it has
-    some.
+    """Properties of a video file. width, height: of its frames; has_dji_track: whether it has DJI's
+    own telemetry (protobuf, different for each model); assumed: about its times, empty if it has
+    some; day: of the recording, UTC, None if unknown.
     """
 
     width: int
@@ -47,10 +49,11 @@ class VideoFacts:
     rotation_deg: int
     has_dji_track: bool
     assumed: str
+    day: date | None = None
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Size, duration and orientation. `FootageError` where it is no video."""
+    """Size, duration and orientation; `FootageError` if the file is no video."""
     try:
         with av.open(str(path)) as container:
             stream = video_stream(container, str(path))
@@ -63,9 +66,19 @@ def video_facts(path: Path) -> VideoFacts:
             assumed = "" if frame.pts is not None else _assumed(path, stream)
             said = container.duration
             duration_s = said / av.time_base if said else _length_s(path)
-            return VideoFacts(frame.width, frame.height, duration_s, rotation, has_track, assumed)
+            day = _day(container.metadata.get("creation_time", ""))
+            size = frame.width, frame.height
+            return VideoFacts(*size, duration_s, rotation, has_track, assumed, day)
     except av.error.FFmpegError as error:
         raise FootageError(f"{path}: not a video, or damaged: {error}") from error
+
+
+def _day(text: str) -> date | None:
+    try:
+        day = date.fromisoformat(text[:10])
+    except ValueError:
+        return None
+    return day if day.year > _NO_CLOCK_YEAR else None
 
 
 def _assumed(path: Path, stream: av.VideoStream) -> str:
@@ -91,7 +104,7 @@ def _length_s(path: Path) -> float:
 def extract_frames(
     path: Path, folder: Path, times_ns: list[int], progress: Callable[[int, int], None]
 ) -> list[ExtractedFrame]:
-    """Write the frames nearest after each of the ascending times, at most `_LARGEST_PX` wide.
+    """Write the first frame at or after each of the ascending times, at most `_LARGEST_PX` wide.
     `FootageError` if no frame can be decoded.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,27 +2,45 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from companion.config import parse_config
+from companion.errors import ReportError
 from companion.preflight.map_pin import map_hash
 from companion.setup.write import deployment_text, write_deployment
 from companion.trial.result import Trial
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, euler_from_matrix, matrix_from_euler, so3_exp
 
+_SEAL = "# Unchanged since then, as long as this is the SHA-256 of the lines below: "
 _SOURCE, _CONNECTION = "udp://0.0.0.0:5600", "serial:/dev/ttyTHS1:921600"
 
 
 def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
-    """Write the file; what the footage does not tell stands in it as a note to check."""
+    """Write the file; values that the footage does not give are marked for checking."""
     settings = _settings(trial, map_cache)
     config = parse_config(settings, str(path))
-    write_deployment(deployment_text(config, _notes(trial), "companion try"), path, overwrite=True)
+    text = deployment_text(config, _notes(trial), "companion try")
+    refuse_edited(path)
+    write_deployment(f"{_SEAL}{_digest(text)}\n{text}", path, overwrite=True)
     return path
+
+
+def refuse_edited(path: Path) -> None:
+    """`ReportError` for a file there that somebody has changed since it was written."""
+    if not path.exists():
+        return
+    first, _, rest = path.read_text(encoding="utf-8", errors="replace").partition("\n")
+    if first != _SEAL + _digest(rest):
+        raise ReportError(f"{path}: was changed by hand; give another folder as --report")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
@@ -36,8 +54,8 @@ def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
 def footage_settings(
     map_cache: Path, camera: Camera, mount_deg: Array, *, fixed: bool
 ) -> dict[str, Any]:
-    """A deployment's settings. mount_deg: (3,) roll, pitch, yaw of the camera on its gimbal, or,
-    fixed, on the airframe.
+    """A deployment's settings. mount_deg: (3,) roll, pitch, yaw of the camera on its gimbal, or on
+    the airframe if `fixed`.
     """
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     angles = {name: round(float(a), 2) for name, a in zip(names, mount_deg, strict=True)}

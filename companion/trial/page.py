@@ -1,4 +1,4 @@
-"""The report of a trial: one HTML page, its figures as JSON, and the positions as files."""
+"""Report of a trial: an HTML page, figures as JSON, positions as files."""
 
 from __future__ import annotations
 
@@ -197,6 +197,12 @@ def _estimates(trial: Trial) -> ReportTable:
         note += " Over this map focal length and height cannot be separated; the given one is kept."
     elif abs(found.focal_percent) < 3.0 * found.focal_sigma_percent:
         note += " The focal length is kept as given: it differs by less than three sigmas."
+    if bad:
+        note += (
+            f" Red: by more than {_TILT_DEG:.0f} deg ({3 * _TILT_DEG:.0f} about the axis), "
+            f"{_FOCAL_PERCENT:.0f} % or {_SHIFT_M:.0f} m. deployment.yaml holds the angles and "
+            "the focal length that were found."
+        )
     return ReportTable(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)
 
 

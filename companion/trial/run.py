@@ -1,4 +1,4 @@
-"""One trial: localize with telemetry, estimate what is wrong with it, again, and without places."""
+"""Runs a trial: localize with telemetry, estimate corrections, repeat, search."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.offline.localize import sensors_of
 from companion.recorded.flight import RecordedFlight
 from companion.trial.estimate import Tools, estimate
 from companion.trial.localize import FrameLocalizer, Localized
-from companion.trial.priors import FramePrior, priors_of
+from companion.trial.priors import FlightPriors, FramePrior, priors_of
 from companion.trial.reasons import reasons
 from companion.trial.result import Trial
 from localizer.config import LocalizerConfig
@@ -34,12 +34,13 @@ Stage = Callable[[str], AbstractContextManager[Count]]
 # it bends the focal length of a near-nadir flight by 1 %. Pixels finer than the map's imagery err
 # more again: over a satellite mosaic the gimbal's bias is 1.5 degrees off then.
 _MEASURED_WIDTH = 640
+_MOST_PLACED = 40  # frames that are searched about their position: each takes about ten seconds
 _AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
 
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """width: of the working image, pixels; searches: frames that are searched without a place."""
+    """width: of the working image, pixels; searches: number of frames searched without position."""
 
     width: int = 320
     searches: int = 20
@@ -51,7 +52,7 @@ def run_trial(
     options: TrialOptions | None = None,
     stage: Stage = lambda _what: nullcontext(lambda _done, _total: None),
 ) -> Trial:
-    """Localize the footage over the map. stage: given what is done now, it counts it.
+    """Localize the footage over the map. stage: context manager for the progress of a step.
 
     Errors of the map and of images that cannot be used are named ones.
     """
@@ -60,7 +61,8 @@ def run_trial(
     with ExitStack() as opened:
         stack = MapStack(map_cache, config)
         opened.callback(stack.close)
-        known, kind = priors_of(flight, stack.cache), map_kind(stack.cache)
+        flight, known = sampled(flight, priors_of(flight, stack.cache))
+        kind = map_kind(stack.cache)
         search = _LazyRelocalizer(stack.cache, config, opened)
         first_loader = FrameLocalizer(
             build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
@@ -85,6 +87,26 @@ def run_trial(
     why = reasons(flight.frames, priors, second, found, kind)
     notes = (*flight.notes, *known.notes, *_map_notes(kind, flight))
     return Trial(flight, priors, first, second, searched, found, why, notes)
+
+
+def sampled(flight: RecordedFlight, known: FlightPriors) -> tuple[RecordedFlight, FlightPriors]:
+    """Of frames that a search has to place at most forty, spread over the flight; a note says so.
+    All frames of which registration can start are kept.
+    """
+    slow = [k for k, p in enumerate(known.priors) if p.pose is not None and not p.is_complete]
+    if len(slow) <= _MOST_PLACED:
+        return flight, known
+    spread = np.linspace(0, len(slow) - 1, _MOST_PLACED).round().astype(int)
+    left_out = set(slow) - {slow[int(k)] for k in spread}
+    kept = [k for k in range(len(known.priors)) if k not in left_out]
+    note = (
+        f"{len(slow)} frames lack a heading or a usable height and would each be searched about "
+        f"their position: {_MOST_PLACED} of them, spread over the flight, stand for all"
+    )
+    return (
+        replace(flight, frames=tuple(flight.frames[k] for k in kept)),
+        replace(known, priors=tuple(known.priors[k] for k in kept), notes=(*known.notes, note)),
+    )
 
 
 def _known_to(config: LocalizerConfig, priors: tuple[FramePrior, ...]) -> LocalizerConfig:

@@ -160,5 +160,5 @@ class AlertId(str, enum.Enum):
 
     @property
     def words(self) -> str:
-        """For a table."""
+        """The identifier as a phrase, for tables."""
         return self.value.replace("_", " ")

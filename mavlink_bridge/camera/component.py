@@ -72,7 +72,7 @@ class _ClickRate:
 
 
 class CameraComponent:
-    """One link's view of the camera. All methods run in that link's owner thread."""
+    """The camera component on one link; all methods run in the link's owner thread."""
 
     def __init__(
         self,

@@ -49,8 +49,8 @@ class _Place:
 
 
 class LookAt:
-    """Target of the gimbal. Safe to use from any thread; `due` and `answered` are called in the
-    flight controller's.
+    """The gimbal's target. Thread-safe; `due` and `answered` are called in the flight controller's
+    thread.
 
     report: tells the operator.
     """

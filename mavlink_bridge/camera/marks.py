@@ -23,8 +23,8 @@ class TargetMark:
 
 
 class Marks:
-    """Selects the next marker to send. Of ended targets only the newest 256 are remembered, because
-    a detector names targets without end.
+    """Selects the next marker to send. Of ended targets only the newest 256 are kept, because a
+    detector may name any number of targets.
     """
 
     def __init__(self, sigma_m: float) -> None:

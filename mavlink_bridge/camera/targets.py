@@ -87,7 +87,7 @@ def tracking_geo_status(
 def image_captured(
     report: TargetReport, geoid_separation_m: float, index: int, uptime_ms: int, utc_us: int
 ) -> Any:
-    """CAMERA_IMAGE_CAPTURED (263) at the target's place: QGroundControl marks it on its map.
+    """CAMERA_IMAGE_CAPTURED (263) at the target's position: QGroundControl marks it on its map.
 
     index: counts these messages. There is no picture: the file's address is empty.
     """
@@ -108,7 +108,7 @@ def image_captured(
 
 
 def is_confirmed(report: TargetReport, sigma_m: float) -> bool:
-    """Whether the target is seen, known to `sigma_m`, and probably on this surface."""
+    """Whether it is detected now, with at most sigma_m, and probably on this surface."""
     accuracy = report.h_accuracy_m
     is_known = accuracy is not None and accuracy <= sigma_m
     return is_known and not report.coasting and report.elsewhere < _ELSEWHERE

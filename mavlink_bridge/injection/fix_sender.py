@@ -58,7 +58,7 @@ class PositionCommand:
             self._accepted_ns = now_ns
 
     def flows(self, now_ns: int) -> bool:
-        """Whether the command is accepted, so that each fix is sent."""
+        """Whether the autopilot accepts the command, so that each fix is sent."""
         return bool(self._fuses) and now_ns - self._accepted_ns < _ANSWERED_NS
 
     def asks(self, state: VehicleState, now_ns: int) -> bool:

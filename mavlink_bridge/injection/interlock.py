@@ -1,8 +1,8 @@
 """The shadow interlock: vision must agree with GNSS before its positions are injected.
 
-The EKF follows a map that lies 20 m off without a warning. So while GNSS is there, nothing is sent
-before the shadow check has passed. Without GNSS from the start (an indoor vehicle, a restart
-without GNSS) nothing can be compared: injection then begins with an alert.
+The EKF accepts a map with a 20 m offset without a warning. While there is GNSS, nothing is sent
+before the shadow check has passed. Without GNSS from the start (an indoor vehicle, a restart)
+nothing can be compared; injection then begins with an alert.
 """
 
 from __future__ import annotations

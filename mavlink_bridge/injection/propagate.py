@@ -1,7 +1,6 @@
 """Propagates fixes in time with a constant-velocity Kalman filter of the fixes.
 
-The autopilot's own velocity is not used: what is injected must not contain what the injection
-itself produced, or the EKF would be told its own opinion.
+The autopilot's velocity is not used, because it may result from the injected positions.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """State that a restarted process reads from a small file, and the age limit of that state.
 
-A companion that is killed under denial and comes back with its gate closed would leave the vehicle
-without a position: LAND. One that had seen its map 20 m beside GNSS and comes back once that is
-gone would inject it unproven. A file each says so, and is renewed while it holds.
+Without it, a companion that is killed while it injects would restart with injection disabled, and
+the vehicle would lose its position and land. One whose shadow check had failed would inject after
+GNSS is lost. The file is renewed while its state holds.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _STOP_S = 2.0
 
 
 class RestartMemory:
-    """A state for the process that replaces one that was killed. Reads once; writes in its own
-    thread, so that a disk that hangs stalls no other thread.
+    """State for the process that replaces a killed one. Reads once; writes in its own thread, so
+    that a hanging disk blocks no other thread.
 
     about: what it holds of, empty where that is always the same; what was kept of another counts
     for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the
@@ -140,8 +140,8 @@ class InjectionEnableMemory:
         self._memory = memory
 
     def recall(self) -> tuple[bool, float] | None:
-        """Whether a channel (else a command) enabled injection, and the state's age, s; None if it
-        was disabled or the file cannot be trusted.
+        """Whether an RC channel (True) or a command (False) enabled injection, and the state's age,
+        s; None if injection was disabled or the file cannot be trusted.
         """
         found = self._memory.recall()
         if found is None or found[0].get("open") is not True:

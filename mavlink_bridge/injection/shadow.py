@@ -1,7 +1,7 @@
-"""Shadow mode's score: would vision have been good enough to fly on?
+"""The shadow check: would vision have been accurate enough to fly on? While GNSS is healthy, every
+fix is compared with the autopilot's global position at the fix's exposure time.
 
-While GNSS is healthy, every fix is compared with the autopilot's own global position at the fix's
-exposure time. The score is a go or a no-go with reasons that an operator can act on.
+The result is ready or not ready, with reasons.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class ShadowScore:
 
 
 def gnss_healthy(state: VehicleState, now_ns: int) -> bool:
-    """Whether the receiver reports a 3D fix, now."""
+    """Whether the receiver reports a 3D fix now."""
     fresh = now_ns - state.gps_time_ns < _GNSS_FRESH_NS
     return fresh and state.gps_fix_type >= _MINIMUM_FIX
 

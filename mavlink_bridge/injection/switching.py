@@ -1,10 +1,9 @@
-"""Decides when to change the EKF's source set: soon away from bad GNSS, late back to GNSS.
+"""Decides when to change the EKF's source set: quickly away from bad GNSS, slowly back.
 
-Measured: switched before GNSS goes the vehicle moves 1.2 m at most; a jammed receiver without a
-switch ends in LAND after 4.6 s with up to 87 m of error.
-
-Where GNSS and vision contradict each other, the EKF has the third vote: its inertial navigation
-refuses a receiver that jumps, and stays with one from which a wrong map differs.
+Measured: if the set is changed before GNSS fails, the vehicle moves at most 1.2 m; with a jammed
+receiver and no change, ArduPilot lands after 4.6 s with up to 87 m of error. If GNSS and vision
+contradict each other, the EKF decides: its inertial navigation rejects a receiver that jumps, and
+keeps one from which a wrong map differs.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
-"""Checks vision's yaw against the autopilot's, because ArduPilot does not.
+"""Checks vision's yaw against the autopilot's and the gyros', because ArduPilot does not.
 
-Measured: a vision frame rotated by 5 deg costs 25 m with no warning, and a 30 deg wrong yaw is
-accepted with EK3_SRC1_YAW = 6. Measured as well: the EKF's own yaw steps by up to 8 deg when it is
-aligned again after take-off, and wanders by 6 deg in hover on ODOMETRY, while vision is right;
-withholding vision then ended in LAND. So the first fixes pass when their yaw agrees with the
-autopilot's, and later ones when they turned since the fixes before as the gyros did: the
-autopilot's yaw may drift and step, a vision frame that turns does so against the gyros. Agreement
-with the autopilot does not excuse that: a frame that turned by 5 deg came to lie within 3 deg of an
-EKF yaw that was off by 2 deg.
+Measured: a vision frame rotated by 5 deg causes 25 m of error without a warning; a yaw error of 30
+deg is accepted with EK3_SRC1_YAW = 6. The EKF's own yaw is no reference: it steps by up to 8 deg
+after take-off and drifts by 6 deg in hover on ODOMETRY. So the first fixes must agree with the
+autopilot's yaw, and later ones must turn as the gyros do. Agreement with the autopilot does not
+excuse a turn against the gyros: a frame rotated by 5 deg came within 3 deg of an EKF yaw that was 2
+deg wrong.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""One MAVLink link: transports, framing, signing, clocks, the tlog."""
+"""One MAVLink link: transports, framing, signing, clocks, .tlog."""

@@ -1,8 +1,8 @@
-"""Clocks: our monotonic clock, UTC that cannot jump, and the flight controller's boot time.
+"""Clocks: CLOCK_MONOTONIC, UTC that cannot jump, and the flight controller's boot time.
 
-The bridge lives on CLOCK_MONOTONIC. The flight controller stamps with the time since its boot; the
-offset between both is measured by TIMESYNC (the middle of the fastest round trip) and, until that
-has answered, bounded by the smallest lag seen in stamped messages.
+The bridge uses CLOCK_MONOTONIC. The flight controller's time stamps count from its boot. TIMESYNC
+measures the offset (midpoint of the fastest round trip); before its first answer the offset is
+bounded by the smallest lag of stamped messages.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def monotonic_ns() -> int:
 
 
 def boot_id() -> str:
-    """Of this computer's present run: CLOCK_MONOTONIC restarts with each. Empty: not known."""
+    """Id of this computer's boot, with which CLOCK_MONOTONIC restarts; empty if unknown."""
     try:
         return _BOOT.read_text(encoding="ascii").strip()
     except OSError:
@@ -46,7 +46,7 @@ def boot_id() -> str:
 
 
 class SteadyUtc:
-    """UTC that follows the monotonic clock from one reading of the wall clock.
+    """UTC that cannot jump: it follows CLOCK_MONOTONIC from one reading of the wall clock.
 
     A step of the wall clock (NTP, GNSS that comes back) must not appear inside a flight's stamps.
     """
@@ -56,16 +56,16 @@ class SteadyUtc:
         self._offset_ns = (time.time_ns() if utc_ns is None else utc_ns) - mono
 
     def utc_ns(self, time_ns: int) -> int:
-        """UTC nanoseconds since 1970 of a monotonic time."""
+        """UTC (ns since 1970) of a CLOCK_MONOTONIC time."""
         return time_ns + self._offset_ns
 
     @property
     def is_set(self) -> bool:
-        """Whether the wall clock was set: without a battery or network it begins in the past."""
+        """Whether the wall clock is set; without a battery or network it starts in the past."""
         return self.utc_ns(monotonic_ns()) >= _NOT_BEFORE_UNIX_S * 1_000_000_000
 
     def gps_week_ms(self, time_ns: int) -> tuple[int, int]:
-        """GPS week and milliseconds of the week of a monotonic time; (0, 0) if nobody knows it.
+        """GPS week and milliseconds of the week; (0, 0) if the clock is not set.
 
         ArduPilot takes week 0 for no time; any other sets its clock.
         """
@@ -77,7 +77,7 @@ class SteadyUtc:
 
 @cache
 def process_utc() -> SteadyUtc:
-    """What all records of this process are dated by: one offset holds from the first to the last.
+    """The UTC clock of all records of this process, with one constant offset.
 
     A computer without a battery begins in the past and its clock steps once it meets the network; a
     .tlog dated by that clock would tell a message's time apart from its picture's by the step.
@@ -86,7 +86,7 @@ def process_utc() -> SteadyUtc:
 
 
 def utc_us() -> int:
-    """UTC by `process_utc`, microseconds since 1970; for records."""
+    """Current UTC by `process_utc`, microseconds since 1970; for records."""
     return process_utc().utc_ns(monotonic_ns()) // 1000
 
 
@@ -130,7 +130,7 @@ class _StampRun:
 
 
 class BootClock:
-    """Maps the flight controller's boot time to CLOCK_MONOTONIC; times in ns.
+    """Converts the flight controller's boot time to CLOCK_MONOTONIC; times in ns.
 
     ``monotonic = middle + (boot - boot of that middle) / rate``, from the fastest round trip of
     30 s. Two answers whose round trips cannot both be true show that the clock stepped, or that it
@@ -161,18 +161,18 @@ class BootClock:
 
     @property
     def offset_ns(self) -> int | None:
-        """``monotonic - boot`` at the last measurement, None before anything was heard."""
+        """``monotonic - boot`` at the last measurement; None before the first."""
         return None if self._anchor is None else self._anchor[0] - self._anchor[1]
 
     @property
     def doubts(self) -> bool:
-        """Whether the stamp that came last is of another time than the one that is known: of a
-        stranger, or the first of a new time.
+        """Whether the last time stamp does not fit the known offset: it is from another sender, or
+        the first after a reboot.
         """
         return bool(self._behind) or bool(self._ahead)
 
     def observe(self, boot_ns: int, received_ns: int) -> bool:
-        """A stamped message arrived; True if it shows that the flight controller rebooted."""
+        """Process the boot time of a message; True if the flight controller rebooted."""
         rebooted = self._ran_back(boot_ns, received_ns)
         if self._behind:
             return False  # an old frame that came late, or the first ones after a reboot
@@ -193,7 +193,7 @@ class BootClock:
         return rebooted
 
     def timesync(self, boot_ns: int, sent_ns: int, received_ns: int) -> bool:
-        """A TIMESYNC answer: tc1 = boot_ns to our ts1 = sent_ns; True if it shows a reboot."""
+        """Process a TIMESYNC answer (tc1 = boot_ns, ts1 = sent_ns); True after a reboot."""
         round_trip = received_ns - sent_ns
         if not 0 <= round_trip <= _MAX_ROUND_TRIP_NS or self._contradicts(boot_ns, received_ns):
             return False

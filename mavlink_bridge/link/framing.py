@@ -1,8 +1,8 @@
-"""MAVLink frames out of a byte stream, and messages out of frames.
+"""Extracts MAVLink frames from a byte stream and decodes them.
 
-pymavlink's own stream parser drops every byte that a corrupted length field claims, and with it
-the good frames inside; here a frame must pass its checksum before its bytes are consumed, so that
-damage costs only the damaged frame. Frames of messages nobody asked for are not decoded.
+pymavlink's parser drops all bytes that a corrupted length field claims, and the good frames among
+them. Here a frame must pass its checksum before its bytes are consumed, so only the damaged frame
+is lost. Frames of messages that nobody requested are not decoded.
 https://mavlink.io/en/guide/serialization.html
 """
 
@@ -30,7 +30,7 @@ _NEW_STREAM_SLACK = 60 * 100_000  # a new signing stream may lag by one minute (
 
 @dataclass
 class FramingCounters:
-    """What a stream contained."""
+    """Counters of one stream."""
 
     messages: int = 0
     skipped_messages: int = 0
@@ -43,7 +43,7 @@ class FramingCounters:
 
 
 class VerifyingMavlink(mavlink.MAVLink):
-    """pymavlink's codec with the signature verified before its time stamp is believed.
+    """pymavlink's codec, changed to verify the signature before it uses the time stamp.
 
     pymavlink stores the time stamp of a frame before checking its signature, so one forged frame
     from the future would shut out the real sender.
@@ -54,7 +54,7 @@ class VerifyingMavlink(mavlink.MAVLink):
     window: ReplayWindow | None = None
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Whether the frame is signed with our key and newer than its stream."""
+        """Whether the frame is signed with our key and newer than the last of its stream."""
         digest = hashlib.sha256(self.signing.secret_key + bytes(msgbuf[:-6])).digest()[:6]
         if digest != bytes(msgbuf[-6:]):
             return False
@@ -75,7 +75,7 @@ class VerifyingMavlink(mavlink.MAVLink):
 
 
 class FrameReader:
-    """Turns bytes, in fragments of any size, into decoded messages.
+    """Decodes MAVLink messages from byte fragments of any size.
 
     wanted: message ids to decode; None decodes all of the dialect. `raw` frames of the last `feed`
     are kept for a recorder. window: of the key's streams; what it has seen before is refused.
@@ -104,26 +104,26 @@ class FrameReader:
 
     @property
     def signing_timestamp(self) -> int:
-        """The newest time stamp of a frame signed with our key, 10 us ticks; 0 without a key."""
+        """The newest time stamp of a correctly signed frame, 10 us ticks; 0 without a key."""
         return int(self._codec.signing.timestamp) if self._signed else 0
 
     def reset(self) -> None:
-        """Forget a half-received frame (the transport was reopened); signing streams are kept."""
+        """Drop an incomplete frame (the transport was reopened); signing streams are kept."""
         self._buffer.clear()
         self._sequences.clear()
 
     @property
     def waiting(self) -> int:
-        """Bytes of frames that are not complete yet."""
+        """Bytes of incomplete frames."""
         return len(self._buffer)
 
     @property
     def sources(self) -> int:
-        """How many (system, component) pairs are followed for their sequence numbers."""
+        """Number of (system, component) pairs whose sequence numbers are tracked."""
         return len(self._sequences)
 
     def feed(self, data: bytes, raw: deque[bytes] | None = None) -> list[Any]:
-        """Messages completed by `data`; their frames are appended to `raw` when given."""
+        """Messages completed by `data`; their raw frames are appended to `raw` if given."""
         buffer = self._buffer
         buffer += data
         messages: list[Any] = []

@@ -1,7 +1,7 @@
 """One MAVLink link: one endpoint, one owner thread, bounded queues, reconnection, counters.
 
-Everything that touches the transport, the parser and the packers happens in the owner thread; a
-handler's callbacks run there too. `send` may be called from anywhere.
+The owner thread alone uses transport, parser and packers, and calls the handler. `send` may be
+called from any thread.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MAX_READS = 64
 
 
 class LinkHandler(Protocol):
-    """What a link calls, always in its owner thread."""
+    """Callbacks of a link, always called in its owner thread."""
 
     def on_open(self, link: Link) -> None:
         """The transport was (re)opened."""
@@ -48,7 +48,7 @@ class LinkHandler(Protocol):
         """A message arrived; time_ns is when its bytes were read."""
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Do what is due and return when to be called next (CLOCK_MONOTONIC ns).
+        """Do what is due; return when to be called next (CLOCK_MONOTONIC ns).
 
         It is called while the transport is closed, too: what is sent then is dropped and counted.
         """
@@ -56,7 +56,7 @@ class LinkHandler(Protocol):
 
 @dataclass
 class LinkCounters:
-    """What a link did."""
+    """Counters of one link."""
 
     opened: int = 0
     open_failures: int = 0
@@ -71,8 +71,8 @@ class LinkCounters:
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """Settings of a link besides its endpoint. name: of its thread and its counters. wanted: ids of
-    messages, None for all. opener: of its transport. recorder: of what passes.
+    """Settings of a link besides its endpoint. name: of thread and counters. wanted: ids of
+    messages to decode, None: all. opener: opens the transport. recorder: records all frames.
 
     signing_key: 32 bytes, None without signing; window: what outlives a restart of the time stamps
     that signed messages had. timeout_s: silence after which a stream (TCP, serial) is reopened.
@@ -95,7 +95,7 @@ class LinkOptions:
 
 
 class Link:
-    """A MAVLink 2 link that stays up.
+    """A MAVLink 2 link that reconnects by itself.
 
     Above 200 lines: one thread owns transport, parser, packers and what is unsent, and the order in
     which its loop serves them keeps positions first on a slow port.
@@ -141,13 +141,13 @@ class Link:
 
     @property
     def last_tick_ns(self) -> int:
-        """When the owner thread began its newest turn, CLOCK_MONOTONIC; now while it opens."""
+        """Start of the owner thread's newest cycle, CLOCK_MONOTONIC; now while it opens."""
         last_tick_ns = self._turn_ns
         return monotonic_ns() if last_tick_ns is None else last_tick_ns
 
     @property
     def congested(self) -> bool:
-        """Whether so much waits for a slow port that only positions should be added.
+        """Whether the send queue of a slow port is so long that only positions should be added.
 
         To be asked in the owner thread.
         """
@@ -155,19 +155,17 @@ class Link:
 
     @property
     def stranger(self) -> str:
-        """UDP: the newest sender other than the peer, whose datagrams are dropped; or empty."""
+        """UDP: newest sender whose datagrams are dropped because it is not the peer; or empty."""
         transport = self._transport
         return transport.stranger if isinstance(transport, UdpTransport) else ""
 
     def keep_peer(self) -> None:
-        """UDP: hear and answer only who sent the message that is being handled."""
+        """UDP: accept and answer only the sender of the message that is being handled."""
         if isinstance(self._transport, UdpTransport):
             self._transport.keep_peer()
 
     def start(self) -> None:
-        """Start the owner thread; the first connection attempt happens in it. `BridgeStateError` if
-        it was started before.
-        """
+        """Start the owner thread, which connects. `BridgeStateError` after a first start."""
         if self._thread is not None:
             raise BridgeStateError(f"{self.name}: already started; make a new link")
         self._thread = threading.Thread(target=self._run, name=f"mavlink-{self.name}", daemon=True)
@@ -206,7 +204,7 @@ class Link:
         return {**mine, **asdict(self._reader.counters)}
 
     def waiting(self) -> dict[str, int]:
-        """Messages of other threads, and bytes in and out, that wait here."""
+        """Lengths of the queues: messages of other threads, bytes received and to send."""
         return {
             "outbox": len(self._outbox),
             "unsent": len(self._unsent),

@@ -1,8 +1,7 @@
-"""Replay windows of signed links that outlive a restart: how far each stream's time stamps were.
+"""Replay protection of signed links that survives a restart: the newest time stamps, in a file.
 
-Signing refuses a frame that is not newer than its stream. Kept in memory alone, that ends with the
-process: a recorded "injection on" would be taken again after a restart, and with a computer whose
-clock is not set, a month later.
+Signing rejects a frame that is not newer than the last of its stream. If the stamps were in memory
+only, a recorded command such as "injection on" would be accepted again after a restart.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Stream = tuple[int, int, int]
 
 
 class ReplayWindow:
-    """The newest time stamps of a link's streams, in a file of mode 0600.
+    """Stores the newest time stamps of a link's streams in a file of mode 0600.
 
     What is written is 2 s ahead of what was seen, so that a second's messages need one write and
     none of them can be repeated after a kill. After a start our own stamps begin beyond it, and a
@@ -46,12 +45,12 @@ class ReplayWindow:
 
     @property
     def newest(self) -> int:
-        """The newest stamp that may have been seen, 10 us ticks; 0 for none."""
+        """The newest time stamp that may have been accepted, 10 us ticks; 0 for none."""
         with self._lock:
             return max(self._leases.values(), default=0)
 
     def note(self, stream: Stream, stamp: int) -> None:
-        """A frame of a stream was taken; never blocks on the disk."""
+        """A frame of a stream was accepted; never blocks on the disk."""
         with self._lock:
             if stamp + _LEASE // 2 <= self._leases.get(stream, 0):
                 return
@@ -59,7 +58,7 @@ class ReplayWindow:
         self._due.set()
 
     def close(self) -> None:
-        """Write what is left and end; at most about two seconds on a disk that does not respond."""
+        """Write the last state and end; waits at most about two seconds for a disk that hangs."""
         self._closing = True
         self._due.set()
         self._thread.join(2.0)

@@ -19,7 +19,7 @@ _LONGEST_TEXT = 1024
 
 
 def load_key(path: Path) -> bytes:
-    """The 32-byte key of a file of 64 hexadecimal digits that only its owner can read.
+    """Read the 32-byte key from a file of 64 hexadecimal digits that only its owner can read.
     `SigningKeyError` for every other file.
     """
     try:
@@ -46,7 +46,7 @@ def load_key(path: Path) -> bytes:
 
 
 def create_key(path: Path) -> bytes:
-    """Write a new random key to a file that only its owner can read, and return it."""
+    """Write a new random key to a file of mode 0600, and return it."""
     key = os.urandom(32)
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
@@ -64,7 +64,7 @@ def signing_timestamp(unix_time_s: float | None = None) -> int:
 
 
 def enable(mav: Any, key: bytes, link_id: int) -> None:
-    """Make a pymavlink `MAVLink` sign what it packs and refuse what is not signed with `key`."""
+    """Make a pymavlink `MAVLink` sign what it sends and reject frames not signed with `key`."""
     mav.signing.secret_key = key
     mav.signing.link_id = link_id
     mav.signing.timestamp = signing_timestamp()

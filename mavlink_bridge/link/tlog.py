@@ -1,6 +1,7 @@
-"""Raw .tlog, written and read: each frame behind its UTC time, as every MAVLink ground tool has it.
+"""Writes and reads .tlog files: each raw frame after its UTC time, as MAVLink ground tools use
+them.
 
-Writing has a thread of its own: a memory card that stalls for a second must not delay an injection.
+A thread writes the file, so that a slow memory card does not delay an injection.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ _DISK_FAULTS = (
 
 
 def is_disk_fault(error: OSError) -> bool:
-    """Whether the disk is full or failing, as one may become in flight. Then a start, which may be
-    a restart in the air, goes on without a record; a wrong path or right is an error.
+    """Whether an error means that the disk is full or failing. A start, which may be a restart in
+    the air, then continues without a record. A wrong path or missing permission is an error.
     """
     return error.errno in _DISK_FAULTS
 
 
 class RecordFile(Protocol):
-    """A file that is written to without a buffer."""
+    """An unbuffered file."""
 
     def write(self, data: bytes | bytearray, /) -> int:
-        """Append; how much of it was taken. Raises OSError."""
+        """Append; returns the number of bytes written. Raises OSError."""
 
     def close(self) -> None:
         """Close it."""
@@ -106,7 +107,7 @@ class TlogRecorder:
         self._waiting.append((time_us, frame))
 
     def close(self) -> None:
-        """Write what waits and close the file; a disk that does not respond is left behind."""
+        """Write the queue and close the file; a disk that hangs is not waited for."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(_CLOSE_S)
@@ -162,7 +163,7 @@ class TlogRecorder:
 
 
 def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
-    """(UTC in ns, message) of every frame of a .tlog, in its order; damaged frames are left out.
+    """Yield (UTC ns, message) of every frame of a .tlog in file order; damaged frames are skipped.
 
     Raises `TlogError` where the file cannot be read or holds something else.
     """

@@ -1,7 +1,7 @@
-"""Byte transports under a MAVLink link: UDP in and out, TCP client and server, serial.
+"""Byte transports of a MAVLink link: UDP in and out, TCP client and server, serial.
 
-All are non-blocking once open and selectable by file descriptor. `read` returns b"" when nothing
-is there and raises OSError when the other side is gone; `write` returns how many bytes it took.
+All are non-blocking and can be polled by file descriptor. `read` returns b"" if nothing has arrived
+and raises OSError if the other side is gone; `write` returns the number of bytes accepted.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Endpoint:
 
 
 def parse_sender(text: str) -> tuple[str, int | None]:
-    """ADDRESS or ADDRESS:PORT (IPv4) whose datagrams are taken; EndpointError if it is neither."""
+    """Parse ADDRESS or ADDRESS:PORT (IPv4) of an accepted sender; else `EndpointError`."""
     host, _, port = text.partition(":")
     try:
         address = str(ipaddress.IPv4Address(host))
@@ -85,25 +85,24 @@ class Transport(Protocol):
 
     @property
     def stream(self) -> bool:
-        """Whether an end of it can be seen (TCP, serial), unlike UDP's."""
+        """Whether the transport notices a lost connection (TCP, serial); UDP does not."""
 
     def fileno(self) -> int:
-        """Descriptor for select."""
+        """File descriptor for poll."""
 
     def read(self) -> bytes:
         """What has arrived, b"" if nothing; OSError when the other side is gone."""
 
     def write(self, data: bytes) -> int:
-        """Send; number of bytes taken (0 when there is nobody to send to, or no room)."""
+        """Send; returns the number of bytes accepted (0 without a peer or room)."""
 
     def close(self) -> None:
         """Close it."""
 
 
 class UdpTransport:
-    """A UDP socket. With `remote` None it listens and answers whoever spoke last, until
-    `keep_peer` chose one: from then on that one alone is heard and answered. With a `remote` that
-    one alone is from the start.
+    """A UDP socket. With `remote`, only that peer is accepted. Without it, every sender is accepted
+    and the last one answered, until `keep_peer` selects one.
 
     The peer may come back from another port of its host (a restart) once it was silent for 3 s;
     from another host never, unless `follow_hosts_after` says after which silence.
@@ -142,15 +141,15 @@ class UdpTransport:
         return self._socket.fileno()
 
     def hear_only(self, host: str, port: int | None) -> None:
-        """Whoever else speaks is a stranger. port: None for any of the host's."""
+        """Accept this sender only. port: None for any port of the host."""
         self._only = (host, port)
 
     def follow_hosts_after(self, silence_s: float) -> None:
-        """Another host may become the peer after so long a silence of the present one."""
+        """Accept another host as the peer once this one was silent for silence_s."""
         self._other_host_s = silence_s
 
     def read(self) -> bytes:
-        """One datagram of the peer, or while there is none of anyone; b"" if nothing waits."""
+        """One datagram of the peer, or of anyone while there is no peer; b"" if none waits."""
         for _ in range(_MAX_REFUSED):
             try:
                 data, sender = self._socket.recvfrom(_READ_SIZE)
@@ -169,7 +168,7 @@ class UdpTransport:
         return data
 
     def keep_peer(self) -> None:
-        """The sender of what was read last is the one to hear and to answer from now on."""
+        """Make the sender of the last datagram the only accepted peer."""
         if self._learn:
             self._remote = self._peer = self._sender
             self._heard_s = time.monotonic()
@@ -188,7 +187,7 @@ class UdpTransport:
         return silent_s >= patience_s
 
     def write(self, data: bytes) -> int:
-        """One datagram to the peer: its bytes; 0 where there is no peer or the socket refuses."""
+        """Send one datagram to the peer; 0 without a peer or if the socket refuses."""
         if self._remote is None:
             return 0
         try:
@@ -282,7 +281,7 @@ def _accept(endpoint: Endpoint) -> TcpTransport:
 
 
 def open_transport(endpoint: Endpoint) -> Transport:
-    """Open the endpoint; OSError if that fails now and is worth trying again."""
+    """Open the endpoint; OSError if that fails now and a retry may succeed."""
     where = (endpoint.address, endpoint.number)
     if endpoint.kind == "udpin":
         return UdpTransport(where, None)

@@ -8,7 +8,7 @@ import threading
 
 
 class WakePipe:
-    """Any thread wakes and closes; the woken one polls and reads `read_end`.
+    """Wakes a polling thread from any thread; the polling thread reads `read_end`.
 
     read_end, write_end: descriptors that do not block; void once it is closed.
     """

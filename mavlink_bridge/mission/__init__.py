@@ -1,1 +1,1 @@
-"""What a mission's items mean: the places that are flown to, and where the camera looks."""
+"""Interprets mission items: flown positions and camera direction."""

@@ -1,4 +1,4 @@
-"""What a mission's commands change: the way, the view, or neither. Any other is not known here."""
+"""Classifies mission commands: they change the path, the camera, or neither. Others are unknown."""
 
 from __future__ import annotations
 

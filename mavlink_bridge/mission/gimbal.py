@@ -1,4 +1,4 @@
-"""Where a mission's commands point the camera, as ArduPilot's AP_Mount and PX4 read them."""
+"""Camera direction that a mission commands, as ArduPilot's AP_Mount and PX4 interpret it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GIMBAL_COMMANDS = frozenset(
 
 @dataclass(frozen=True)
 class RegionOfInterest:
-    """A place that the camera looks at."""
+    """A position that the camera points at."""
 
     latitude_deg: float
     longitude_deg: float
@@ -38,8 +38,8 @@ class RegionOfInterest:
 
 @dataclass(frozen=True)
 class GimbalTarget:
-    """pitch_deg: above the horizon, None where the mission does not say; yaw_deg: to the right of
-    the vehicle's heading, or of north where `from_north`; roi: instead of both.
+    """Camera direction. pitch_deg: above the horizon, None if not commanded; yaw_deg: clockwise
+    from the vehicle's heading, or from north if `from_north`; roi: replaces both.
     """
 
     pitch_deg: float | None = None
@@ -51,7 +51,7 @@ class GimbalTarget:
 def gimbal_after(
     item: MissionItem, before: GimbalTarget, vehicle: MissionVehicle
 ) -> tuple[GimbalTarget, str]:
-    """The target after one of `GIMBAL_COMMANDS`, and why it is not known (empty where it is).
+    """Camera direction after one of `GIMBAL_COMMANDS`, and why it is unknown (empty if known).
 
     Angles that are not set leave the target as it is.
     """

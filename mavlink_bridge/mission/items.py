@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 
 class HeightAbove(Enum):
-    """What an item's altitude is above."""
+    """Reference of an item's altitude."""
 
     HOME = "home"
     SEA = "mean sea level"
@@ -52,8 +52,8 @@ _WINGED = frozenset((1, *range(19, 26)))  # an aeroplane, VTOLs
 
 @dataclass(frozen=True)
 class MissionVehicle:
-    """What a mission is for, as far as its file says. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE;
-    has_rally_points: to the nearest of which it may return, instead of home.
+    """Vehicle that a mission is for, as its file says. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE;
+    has_rally_points: it may return to a rally point instead of home.
     """
 
     autopilot: int | None = None
@@ -62,22 +62,22 @@ class MissionVehicle:
 
     @property
     def is_px4(self) -> bool:
-        """PX4 reads some items otherwise than ArduPilot."""
+        """Whether it is PX4, which interprets some items differently."""
         return self.autopilot == _PX4
 
     @property
     def is_ardupilot(self) -> bool:
-        """ArduPilot, of any kind."""
+        """Whether it is ArduPilot, any vehicle type."""
         return self.autopilot == _ARDUPILOT
 
     @property
     def is_multirotor(self) -> bool:
-        """It hovers, and has no wings."""
+        """Whether it hovers and has no wings."""
         return self.kind in _MULTIROTORS
 
     @property
     def has_wings(self) -> bool:
-        """An aeroplane, or a VTOL."""
+        """Whether it is an aeroplane or a VTOL."""
         return self.kind in _WINGED
 
 
@@ -86,8 +86,8 @@ UNKNOWN_VEHICLE = MissionVehicle()
 
 @dataclass(frozen=True)
 class MissionItem:
-    """One item. number: as DO_JUMP names it, home is 0; command: MAV_CMD; frame: MAV_FRAME;
-    parameters: param1 to param7, NaN where they are not set; latitude and longitude in degrees.
+    """One mission item. number: as used by DO_JUMP, home is 0; command: MAV_CMD; frame: MAV_FRAME;
+    parameters: param1 to param7, NaN if not set; latitude and longitude in degrees.
     """
 
     number: int
@@ -97,26 +97,26 @@ class MissionItem:
 
     @property
     def place(self) -> tuple[float, float] | None:
-        """(latitude, longitude), degrees; None where 0, 0 or NaN stand for the present position."""
+        """(latitude, longitude), degrees; None if 0, 0 or NaN means the present position."""
         latitude, longitude = self.parameters[4:6]
         unset = (math.isnan(latitude) and math.isnan(longitude)) or (latitude, longitude) == (0, 0)
         return None if unset else (latitude, longitude)
 
     @property
     def altitude_m(self) -> float | None:
-        """None where 0 or NaN stand for the present altitude (ArduCopter's loc_from_cmd)."""
+        """Altitude; None if 0 or NaN means the present one (ArduCopter's loc_from_cmd)."""
         altitude = self.parameters[6]
         return None if math.isnan(altitude) or altitude == 0 else altitude
 
     @property
     def named(self) -> str:
-        """Its MAVLink name and number."""
+        """MAVLink name and number of the item."""
         return f"{command_name(self.command)} (item {self.number})"
 
 
 @dataclass(frozen=True)
 class LoiterCircle:
-    """Flown about a place. radius_m: negative against the clock; inward: the nose to the centre."""
+    """radius_m: negative is counter-clockwise; inward: the nose points to the centre."""
 
     radius_m: float
     rounds: int = 1
@@ -125,18 +125,18 @@ class LoiterCircle:
 
 @dataclass(frozen=True)
 class UnreadItem:
-    """What a ground station expands into items only when it uploads them. name: the file's."""
+    """A complex item, which a ground station expands only on upload. name: as in the file."""
 
     number: int
     name: str
 
     @property
     def named(self) -> str:
-        """Its name and number."""
+        """Name and number of the item."""
         return f"{self.name} (item {self.number})"
 
 
 def command_name(command: int) -> str:
-    """As MAVLink calls a command."""
+    """MAVLink name of a command number."""
     entry = mavlink.enums["MAV_CMD"].get(command)
     return f"MAV_CMD {command}" if entry is None else str(entry.name)

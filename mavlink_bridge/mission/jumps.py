@@ -1,4 +1,4 @@
-"""DO_JUMP and DO_JUMP_TAG, counted as AP_Mission counts them, up to a number of rounds."""
+"""Follows DO_JUMP and DO_JUMP_TAG as AP_Mission does, up to a number of repetitions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FOREVER = -1
 
 
 class Jumps:
-    """Where a mission goes on after each of its jumps. notes: what is counted otherwise."""
+    """Counts jumps. notes: differences from the flight, such as a limited number of repetitions."""
 
     def __init__(self, items: Sequence[MissionItem | UnreadItem]) -> None:
         self._items = items
@@ -26,8 +26,8 @@ class Jumps:
         self.notes: dict[str, None] = {}
 
     def following(self, item: MissionItem, index: int, commands: int) -> int | None:
-        """The index after the jump at `index`; None where the mission ends with it. commands: that
-        were carried out so far.
+        """Index of the item after the jump at `index`; None if the mission ends. commands: number
+        executed so far.
         """
         last, jumps = self._in_a_row
         self._in_a_row = (commands, jumps + 1 if last == commands else 1)

@@ -14,7 +14,7 @@ _WINGED_M, _PX4_M, _COPTER_M = 60.0, 80.0, 10.0
 
 
 def circle_of(item: MissionItem, vehicle: MissionVehicle) -> tuple[LoiterCircle | None, list[str]]:
-    """The circle, None where the vehicle hovers or flies on; notes on it, as sentences.
+    """The circle of a loiter item, None if the vehicle hovers or flies on; and notes as sentences.
 
     A multirotor of ArduPilot circles for LOITER_TURNS only, PX4's never. A vehicle of unknown kind
     may have wings.

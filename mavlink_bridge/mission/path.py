@@ -1,7 +1,7 @@
-"""The way that a mission's items are flown, as ArduPilot's AP_Mission and its modes read them.
+"""Flight path of a mission's items, as ArduPilot's AP_Mission and its modes execute them.
 
-One reading for every use: the forecast (`plan`), `map fetch --mission`, the rehearsal, the doctor.
-What cannot be followed without flying it is named (`NotJudged`), never left out silently.
+Used by the forecast (`plan`), `map fetch --mission`, the rehearsal and the doctor. Items whose
+effect cannot be known before the flight are listed as `NotJudged`.
 """
 
 from __future__ import annotations
@@ -44,10 +44,9 @@ _ENDS = (*LANDINGS, mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
 
 @dataclass(frozen=True)
 class MissionPlace:
-    """A place that is flown to. name: the waypoint's number among the waypoints, "home" or
-    "take-off"; item: its number in the mission; gimbal, speed_m_s: on the way there (None: not
-    said); after_gap: how the vehicle gets there is not known; curved: by a spline; circle: flown
-    about it on arrival.
+    """A position on the flight path. name: number among the waypoints, "home" or "take-off"; item:
+    number in the mission; gimbal, speed_m_s: on the leg to it (None: not commanded); after_gap: the
+    path to it is unknown; curved: by a spline; circle: flown about it on arrival.
     """
 
     name: str
@@ -64,20 +63,19 @@ class MissionPlace:
 
     @property
     def pitch_deg(self) -> float | None:
-        """Of the gimbal, if said."""
+        """Gimbal pitch, None if not commanded."""
         return self.gimbal.pitch_deg
 
     @property
     def is_waypoint(self) -> bool:
-        """Whether an item of the mission names it."""
+        """Whether it is from an item of the mission, not home or take-off."""
         return self.name.isdecimal()
 
 
 @dataclass(frozen=True)
 class NotJudged:
-    """What cannot be followed before the flight. text: its MAVLink name, number and reason;
-    gimbal_only: it matters to a camera on a
-    gimbal only; flies: it moves the vehicle.
+    """An item whose effect is unknown before the flight. text: its MAVLink name, number and reason;
+    gimbal_only: it affects a gimbal camera only; flies: it moves the vehicle.
     """
 
     text: str
@@ -87,7 +85,7 @@ class NotJudged:
 
 @dataclass(frozen=True)
 class PlannedMission:
-    """A mission as it is flown.
+    """A mission as it will be flown.
 
     home: (latitude, longitude) degrees, if known; path: the places in the order in which they are
     flown to, from home or the take-off on, returns to home among them; takeoff_height_m: above
@@ -105,17 +103,17 @@ class PlannedMission:
 
     @property
     def waypoints(self) -> tuple[MissionPlace, ...]:
-        """The places without home and take-off."""
+        """The positions without home and take-off."""
         return tuple(place for place in self.path if place.is_waypoint)
 
     @property
     def launch(self) -> MissionPlace | None:
-        """Where it begins, over home or the take-off; None where nothing says it."""
+        """Start of the path, above home or the take-off; None if unknown."""
         return self.path[0] if self.path and self.path[0].item == 0 else None
 
     @property
     def returns(self) -> bool:
-        """Whether it ends with a return to home."""
+        """Whether the mission ends with a return to home."""
         return bool(self.waypoints) and self.path[-1].name == "home"
 
 
@@ -125,7 +123,7 @@ def fly(
     vehicle: MissionVehicle = UNKNOWN_VEHICLE,
     speed_m_s: float | None = None,
 ) -> PlannedMission:
-    """Follow a mission's items, home not among them. speed_m_s: where it does not say.
+    """Compute the flight path of a mission's items (without home). speed_m_s: default speed.
 
     MissionError for a place that is none on Earth, or in a frame without global coordinates.
     """

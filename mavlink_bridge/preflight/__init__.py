@@ -1,1 +1,1 @@
-"""Before the flight: parameters, mission, the examination."""
+"""Checks before the flight: parameters, mission, link, clock."""

@@ -1,4 +1,4 @@
-"""A short conversation with the autopilot on a link of its own: parameters, missions."""
+"""A temporary connection to the autopilot, to read parameters or missions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _Self = TypeVar("_Self", bound="VehicleClient")
 
 
 class VehicleClient:
-    """Finds the autopilot and keeps its link awake. A context manager.
+    """Finds the autopilot and keeps its link active by heartbeats. A context manager.
 
     Raises `ConnectionSilentError` when no heartbeat comes. Subclasses take their messages in
     `take`, which is called under the lock of `wait_for`.
@@ -73,22 +73,22 @@ class VehicleClient:
         self._link.stop()
 
     def take(self, message: Any) -> None:
-        """One message of the autopilot, other than its heartbeat."""
+        """Process a message of the autopilot, other than its heartbeat."""
         raise NotImplementedError
 
     def ask(self, message: Any) -> None:
-        """Send as the companion."""
+        """Send a message as the companion."""
         self._link.send(message, self.config.companion_component)
 
     def wait_for(self, predicate: Callable[[], bool], timeout_s: float) -> bool:
-        """Whether the predicate came true in time."""
+        """Wait until the predicate holds; False after the timeout."""
         with self._changed:
             return self._changed.wait_for(predicate, timeout_s)
 
     # --- link handler ---------------------------------------------------------------------------
 
     def on_open(self, link: Link) -> None:
-        """Nothing to say before a heartbeat."""
+        """Nothing is sent before a heartbeat is received."""
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
         """The autopilot's heartbeat, or an answer of it."""
@@ -113,7 +113,7 @@ class VehicleClient:
                 self._changed.notify_all()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Heartbeat, so that the autopilot answers on this link."""
+        """Send a heartbeat, so that the autopilot answers on this link."""
         if link.system_id == 0 and (link.endpoint.kind == "udpout" or self.config.signing):
             link.system_id = _FIRST_GUESS
         if link.system_id and now_ns >= self._next_heartbeat_ns:

@@ -1,4 +1,4 @@
-"""What must be right before a flight: parameters for the chosen injection, link, clock, streams."""
+"""Checks before a flight: parameters for the configured injection, link, clock, streams."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
 
 @dataclass(frozen=True)
 class DoctorFinding:
-    """One line of the table. fix: the value to write, None where writing cannot help."""
+    """Result of one check. fix: parameter value to write, None if none would help."""
 
     name: str
     found: str
@@ -55,8 +55,8 @@ class DoctorFinding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All lines; a flight may begin when none that is required fails. state: what the vehicle said
-    of itself meanwhile, None where it was not asked.
+    """Results of all checks; the vehicle is fit to fly if no required one fails. state: the
+    vehicle's state meanwhile, None if it was not contacted.
     """
 
     findings: tuple[DoctorFinding, ...]
@@ -64,19 +64,19 @@ class Diagnosis:
 
     @property
     def ok(self) -> bool:
-        """Whether every required line holds."""
+        """Whether every required check passed."""
         return all(f.ok for f in self.findings if f.required)
 
     @property
     def exit_code(self) -> int:
-        """For scripts: 0 good, 1 advice, 2 not fit to fly."""
+        """0: all passed, 1: advice, 2: not fit to fly."""
         if not self.ok:
             return 2
         return 0 if all(f.ok for f in self.findings) else 1
 
     @property
     def fixable(self) -> tuple[DoctorFinding, ...]:
-        """The lines that writing a parameter puts right."""
+        """The failed checks that writing a parameter corrects."""
         return tuple(f for f in self.findings if not f.ok and f.fix is not None)
 
 
@@ -84,7 +84,7 @@ class Diagnosis:
 
 
 def check_parameters(rules: Iterable[ParameterRule], read: Read) -> list[DoctorFinding]:
-    """Compare each rule with what the flight controller says."""
+    """Compare the flight controller's parameters with each rule. read: returns a parameter."""
     findings = []
     for rule in rules:
         name, value = rule.names[0], None
@@ -107,7 +107,7 @@ def check_parameters(rules: Iterable[ParameterRule], read: Read) -> list[DoctorF
 
 
 def check_failsafes(config: BridgeConfig, read: Read, *, px4: bool = False) -> list[DoctorFinding]:
-    """What the autopilot does once vision ends: advice, which is never written."""
+    """Check the autopilot's failsafes for the end of vision: advice only, never written."""
     lines = px4_failsafes(config, read) if px4 else failsafes(config, read)
     return [
         DoctorFinding(line.name, line.found, line.needed, line.why, line.ok, required=False)
@@ -131,7 +131,7 @@ class _Measurement:
 
 
 def check_link(config: BridgeConfig) -> tuple[list[DoctorFinding], VehicleState]:
-    """Connect in shadow mode for a few seconds and measure identity, clock and streams."""
+    """Connect in shadow mode for some seconds; check identity, clock and streams."""
     quiet = config.model_copy(update={"mode": "shadow", "tlog": None})
     with Bridge(quiet, 0.0) as bridge:
         if not sleep_until(lambda: bridge.state().connected, _CONNECT_S, step_s=0.05):
@@ -263,7 +263,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Docto
 
 
 def check_computer_clock(config: BridgeConfig) -> list[DoctorFinding]:
-    """A computer without a battery clock wakes up in the past; some links care."""
+    """Check this computer's clock, which is wrong after a start without a battery."""
     if config.injection.message != "gps_input" and not (config.signing or config.ground_signing):
         return []
     utc = SteadyUtc()
@@ -273,7 +273,7 @@ def check_computer_clock(config: BridgeConfig) -> list[DoctorFinding]:
 
 
 def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -> Diagnosis:
-    """Connect, measure the link, read the parameters and judge. say: takes what is done now."""
+    """Run all checks on the vehicle. say: receives each step as text."""
     findings, state = check_link(config)
     findings += check_computer_clock(config)
     if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
@@ -315,7 +315,7 @@ def _source_switch_of_px4(config: BridgeConfig) -> list[DoctorFinding]:
 
 
 def repair(config: BridgeConfig, findings: Iterable[DoctorFinding]) -> bool:
-    """Write what `DoctorFinding.fix` says, in order; True if a reboot is needed for it to count.
+    """Write the value of each `DoctorFinding.fix` in order; True if a reboot is needed.
 
     The order matters: VISO_TYPE brings the other VISO parameters into being.
     """

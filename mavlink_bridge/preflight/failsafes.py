@@ -1,8 +1,7 @@
-"""What the autopilot does once vision ends: told before the flight, and never written.
+"""Checks the autopilot's failsafe parameters for the end of vision; never writes them.
 
-The vehicle's failsafes are its pilot's decision. Values are those of the parameters' own
-descriptions; ArduCopter's times were measured in SITL (docs/explanation/integrity.md), PX4 was not
-flown.
+The failsafes are the pilot's decision. ArduCopter's times were measured in SITL
+(docs/explanation/integrity.md); PX4 was not flown.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ _COPTER_LANDS = {
 
 @dataclass(frozen=True)
 class Failsafe:
-    """One line of the doctor's table, which is advice: what is set, what should be, and why."""
+    """Result of one failsafe check: value found, recommended value, and why."""
 
     name: str
     found: str
@@ -74,7 +73,7 @@ PARAMETERS = (*(wanted.name for wanted in _WANTED), "FENCE_TYPE", "FENCE_ACTION"
 
 
 def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
-    """What is set; a parameter that the vehicle does not have gives no line."""
+    """Check ArduPilot's failsafe parameters; missing ones are skipped."""
     if config.mode == "off":
         return []
     lines = [*_listed(_WANTED, read), *_fence(read)]
@@ -88,7 +87,7 @@ def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
 
 
 def px4_failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
-    """The same of PX4 (1.15 and later)."""
+    """Check PX4's failsafe parameters (1.15 and later)."""
     if config.mode == "off":
         return []
     lines = _listed(_PX4_WANTED, read)

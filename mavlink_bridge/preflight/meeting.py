@@ -1,4 +1,4 @@
-"""Who is there: the first autopilot that is heard on a connection."""
+"""Detects the first autopilot on a connection."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FIRMWARES = {
 
 @dataclass(frozen=True)
 class MetAutopilot:
-    """An autopilot's MAVLink system id, and its firmware's name."""
+    """MAVLink system id and firmware of a detected autopilot."""
 
     system_id: int
     firmware: str
@@ -32,7 +32,7 @@ class _Greeting(VehicleClient):
 
 
 def meet(config: BridgeConfig) -> MetAutopilot:
-    """The autopilot at `config.connection`; ConnectionSilentError where none is heard."""
+    """Detect the autopilot at `config.connection`; `ConnectionSilentError` without one."""
     with _Greeting(config, "meeting", ()) as client:
         number = client.autopilot
         return MetAutopilot(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))

@@ -38,9 +38,7 @@ class MissionDownloader(VehicleClient):
         self._refusal: int | None = None
 
     def download(self) -> list[MissionWaypoint]:
-        """Home and the places of the mission in the order in which they are flown to; MissionError
-        when it is not handed over.
-        """
+        """Home and the mission's positions in flight order; else `MissionError`."""
         self._count, self._refusal = None, None
         self._items.clear()
         self._repeat(
@@ -74,7 +72,7 @@ class MissionDownloader(VehicleClient):
             raise MissionError(f"the flight controller did not give {what} of its mission ({why})")
 
     def take(self, message: Any) -> None:
-        """MISSION_COUNT, MISSION_ITEM_INT or a refusal; other mission types are not ours."""
+        """Process MISSION_COUNT, MISSION_ITEM_INT or a refusal; other mission types are ignored."""
         if getattr(message, "mission_type", 0) != mavlink.MAV_MISSION_TYPE_MISSION:
             return
         kind = message.get_type()
@@ -101,6 +99,6 @@ def _is_local(message: Any) -> bool:
 
 
 def download_mission(config: BridgeConfig) -> list[MissionWaypoint]:
-    """The places of the mission that the flight controller at `config.connection` holds."""
+    """Download the mission's positions from the flight controller at `config.connection`."""
     with MissionDownloader(config) as client:
         return client.download()

@@ -28,8 +28,8 @@ _INTEGER_FORMATS = {
 
 
 def decode_value(value: float, kind: int, *, bytewise: bool) -> float:
-    """The number in PARAM_VALUE: PX4 puts an integer's bytes into the float, ArduPilot casts. kind:
-    MAV_PARAM_TYPE; bytewise: as PX4 does.
+    """The value in PARAM_VALUE. kind: MAV_PARAM_TYPE; bytewise: PX4 copies an integer's bytes into
+    the float field, ArduPilot converts the number.
     """
     if bytewise and kind in _INTEGER_FORMATS:
         return float(struct.unpack(_INTEGER_FORMATS[kind], struct.pack("<f", value))[0])
@@ -52,7 +52,7 @@ class ParameterClient(VehicleClient):
         self._values: dict[str, tuple[float, int]] = {}
 
     def read(self, name: str) -> float | None:
-        """The parameter's value; None when the flight controller does not know it."""
+        """The parameter's value; None if the flight controller has no such parameter."""
         self._values.pop(name, None)
         request = mavlink.MAVLink_param_request_read_message(
             self.system, self.component, name.encode("ascii"), -1
@@ -64,8 +64,8 @@ class ParameterClient(VehicleClient):
         return None
 
     def read_known(self, names: Collection[str]) -> dict[str, float]:
-        """The values of those parameters that the flight controller knows, asked for all at once:
-        one that is missing costs no more time than all of them.
+        """Values of those parameters that exist, requested together, so that all missing ones cost
+        one timeout.
         """
         for name in names:
             self._values.pop(name, None)
@@ -78,8 +78,8 @@ class ParameterClient(VehicleClient):
         return {name: self._values[name][0] for name in names if name in self._values}
 
     def write(self, name: str, value: float) -> None:
-        """Set a parameter and check what the flight controller made of it. `ParameterError` if it
-        has no such parameter or did not take the value.
+        """Set a parameter and verify it. `ParameterError` if it does not exist or the value is not
+        accepted.
         """
         if self.read(name) is None:
             raise ParameterError(f"{name}: the flight controller has no such parameter")

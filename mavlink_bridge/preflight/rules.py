@@ -1,7 +1,7 @@
-"""What the flight controller's parameters must be for the chosen injection.
+"""Required flight-controller parameters for the configured injection.
 
-Every rule for ArduPilot is a refusal or an error that was measured (messages.md); those for PX4
-are from its documentation.
+Each ArduPilot rule comes from a refusal or error that was measured (messages.md); PX4's are from
+its documentation.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class ParameterRule:
 
     @property
     def needed(self) -> str:
-        """For the table."""
+        """The allowed values as text."""
         if self.bits:
             return f"bits {self.bits:#x} set"
         if math.isfinite(self.minimum):
@@ -52,7 +52,7 @@ class ParameterRule:
         return " or ".join(f"{value:.7g}" for value in self.allowed)
 
     def holds(self, value: float) -> bool:
-        """Whether a value satisfies it; one that is not finite satisfies none."""
+        """Whether a value satisfies the rule; NaN and infinity do not."""
         if not math.isfinite(value):
             return False
         if self.bits:
@@ -62,14 +62,14 @@ class ParameterRule:
         return any(abs(value - allowed) <= self.tolerance for allowed in self.allowed)
 
     def fix(self, value: float) -> float:
-        """What to write over a value that does not hold."""
+        """The value to write instead of a wrong one."""
         if self.bits:
             return float((int(value) if math.isfinite(value) else 0) | self.bits)
         return self.minimum if math.isfinite(self.minimum) else self.allowed[0]
 
 
 def find_source_set(config: BridgeConfig, read: Read) -> int:
-    """The EK3 source set that takes the injection: the one that does already, or should."""
+    """The EK3 source set that uses the injected positions, or that should."""
     if config.switch.enabled:
         return config.switch.vision_set
     if config.injection.message == "external_position_estimate":
@@ -84,7 +84,7 @@ def find_source_set(config: BridgeConfig, read: Read) -> int:
 
 
 def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[ParameterRule]:
-    """What ArduPilot needs for the configured injection in a source set."""
+    """Rules for ArduPilot with the configured injection in a source set."""
     common = [
         ParameterRule(("AHRS_EKF_TYPE",), (3.0,), "only EKF3 has external navigation sources"),
         ParameterRule(
@@ -99,7 +99,7 @@ def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[ParameterRule
 
 
 def arming_rules(config: BridgeConfig, source_set: int, read: Read) -> list[ParameterRule]:
-    """What lets a vehicle take off on GNSS while VISO_TYPE is set and no vision flows yet.
+    """Rules for arming on GNSS while VISO_TYPE is set and no vision arrives yet.
 
     ArduPilot refuses to arm then ('VisOdom: not healthy'), so in shadow mode always. A vehicle that
     takes off on vision (source set 1) keeps the check. ARMING_CHECK names the checks to do,
@@ -238,8 +238,8 @@ def _horizon_rules(delay_ms: float) -> list[ParameterRule]:
 
 
 def missing_feature(config: BridgeConfig, read: Read, *, px4: bool) -> tuple[str, str] | None:
-    """The parameter by whose absence firmware was built without what the injection needs, and the
-    build option that brings it; None where it is there.
+    """A parameter whose absence shows that the firmware was built without a required feature, and
+    the build option that adds it; None if nothing is missing.
 
     Boards with 1 MB of flash come without it. No capability flag of MAVLink tells.
     """
@@ -261,7 +261,7 @@ def missing_feature(config: BridgeConfig, read: Read, *, px4: bool) -> tuple[str
 
 
 def gnss_rules(read: Read) -> list[ParameterRule]:
-    """ArduPilot with GNSS and vision: what lets it use GNSS by itself while vision is selected."""
+    """Rules for ArduPilot with GNSS and vision: GNSS must not be fused while vision is selected."""
     if not (read("GPS1_TYPE") or read("GPS_TYPE")):
         return []
     rules = []
@@ -278,7 +278,7 @@ def gnss_rules(read: Read) -> list[ParameterRule]:
 
 
 def px4_rules(config: BridgeConfig, read: Read) -> list[ParameterRule]:
-    """What PX4 needs; from its documentation and parameter definitions, not flown here."""
+    """Rules for PX4, from its documentation; not flown here."""
     injection = config.injection
     horizon = ParameterRule(
         ("EKF2_DELAY_MAX",),

@@ -1,4 +1,4 @@
-"""Giving the flight controller the key that its links are signed with (SETUP_SIGNING, 256)."""
+"""Sends the MAVLink signing key to the flight controller (SETUP_SIGNING, 256)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _KeyGiver(VehicleClient):
 
 
 def install_key(connection: str, key_file: Path) -> bool:
-    """Give the autopilot the key of a file; whether its heartbeat comes signed with it then.
+    """Send the key of a file to the autopilot; True if its heartbeat is then signed with it.
 
     False on ArduPilot's USB port, which stays unsigned, and where another key was in force before.
     Raises `BridgeStateError` when the vehicle is armed (ArduPilot would ignore the key).

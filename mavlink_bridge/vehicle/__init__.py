@@ -1,1 +1,1 @@
-"""What the vehicle says, on our clock, and what it is asked for."""
+"""The vehicle's telemetry on our clock, and requests to the vehicle."""

@@ -1,4 +1,4 @@
-"""Short histories of what the vehicle reported, read at any time in between."""
+"""Short histories of telemetry with interpolation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_S
 
 
 class TimedValue(Protocol):
-    """What was reported for a time."""
+    """A value with a time."""
 
     @property
     def time_ns(self) -> int:
@@ -37,7 +37,7 @@ _Sample = TypeVar("_Sample", bound=TimedValue)
 
 @dataclass(frozen=True)
 class VectorSample:
-    """Numbers that were reported for a time."""
+    """Numbers reported for a time."""
 
     time_ns: int
     values: tuple[float, ...]
@@ -45,7 +45,8 @@ class VectorSample:
 
 @dataclass(frozen=True)
 class GimbalSample:
-    """One gimbal message: gimbal to the horizon frame that points to north or to the nose.
+    """One gimbal message: attitude to the horizontal frame that points north (earth_frame) or to
+    the nose.
 
     earth_frame: yaw is from true north, else from the vehicle's heading. device: component and
     gimbal_device_id that it is of.
@@ -61,12 +62,12 @@ class GimbalSample:
 def attitude(
     time_ns: int, q: quat.Quaternion, rates: quat.Vector, gyro_heading_rad: float = 0.0
 ) -> Attitude:
-    """An `Attitude` from its quaternion."""
+    """Make an `Attitude` from a quaternion (body to NED)."""
     return Attitude(time_ns, *quat.to_euler(q), q, rates, gyro_heading_rad)
 
 
 def heading_rate(sample: Attitude) -> float:
-    """Rate of the heading, rad/s, from body rates and tilt (aerospace Euler kinematics)."""
+    """Rate of the heading, rad/s, from body rates and attitude."""
     _, q, r = sample.rates
     cos_pitch = max(math.cos(sample.pitch_rad), 0.1)
     return (q * math.sin(sample.roll_rad) + r * math.cos(sample.roll_rad)) / cos_pitch
@@ -81,13 +82,13 @@ def _around(samples: Sequence[_Sample], time_ns: int) -> tuple[_Sample, _Sample,
 
 
 class VectorBuffer:
-    """Positions and the like, linear between samples."""
+    """History of vectors such as positions, with linear interpolation."""
 
     def __init__(self) -> None:
         self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Empty the buffer."""
         self._samples.clear()
 
     def add(self, time_ns: int, values: tuple[float, ...]) -> None:
@@ -110,7 +111,7 @@ class VectorBuffer:
 
 
 class PlaceBuffer(VectorBuffer):
-    """Latitude, longitude (degrees) and altitude: across the date line the short way."""
+    """History of latitude, longitude (degrees) and altitude; interpolates across the date line."""
 
     def _between(self, a: tuple[float, ...], b: tuple[float, ...], t: float) -> tuple[float, ...]:
         near = a[1] + wrap_degrees(b[1] - a[1])
@@ -119,19 +120,19 @@ class PlaceBuffer(VectorBuffer):
 
 
 class ZoomBuffer:
-    """Zoom levels of one camera, per cent of its range: of the component that spoke first."""
+    """Zoom levels (per cent of the range) of the camera that first reported one."""
 
     def __init__(self) -> None:
         self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
         self._component: int | None = None
 
     def clear(self) -> None:
-        """Forget all."""
+        """Empty the buffer."""
         self._samples.clear()
         self._component = None
 
     def add(self, time_ns: int, component: int, level: float) -> None:
-        """Append. level: NaN where the camera does not know it."""
+        """Append a level; NaN if the camera does not know it."""
         if self._component is None:
             self._component = component
         newer = not self._samples or time_ns > self._samples[-1].time_ns
@@ -139,8 +140,8 @@ class ZoomBuffer:
             self._samples.append(VectorSample(time_ns, (level,)))
 
     def at(self, time_ns: int, hold_s: float) -> float | None:
-        """The level at a time, linear between reports. The newest one holds for so long, or only
-        until the next is due while the levels change: then nobody knows where the lens is.
+        """The level at a time, linear between reports. The newest one is valid for hold_s, or while
+        the level changes only until the next report is due.
         """
         samples = list(self._samples)
         if not samples or time_ns < samples[0].time_ns:
@@ -160,13 +161,13 @@ class ZoomBuffer:
 
 
 class AttitudeBuffer:
-    """The last attitudes, spherical between samples."""
+    """History of attitudes with spherical interpolation."""
 
     def __init__(self) -> None:
         self._samples: deque[Attitude] = deque(maxlen=_LENGTH)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Empty the buffer."""
         self._samples.clear()
 
     def add(self, sample: Attitude) -> None:
@@ -209,13 +210,13 @@ class AttitudeBuffer:
 
 
 class InertialBuffer:
-    """The last samples of the IMU, in the order of their times."""
+    """History of IMU samples in time order."""
 
     def __init__(self) -> None:
         self._samples: deque[InertialSample] = deque(maxlen=_LENGTH)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Empty the buffer."""
         self._samples.clear()
 
     def add(self, sample: InertialSample) -> None:
@@ -230,7 +231,7 @@ class InertialBuffer:
 
 
 class GimbalBuffer:
-    """The last gimbal attitudes of the best source that speaks, and of one gimbal only.
+    """History of one gimbal's attitude, from the best source available.
 
     The first gimbal that is heard is followed as long as it speaks: the angles of two, mixed, are
     those of none. device: the (component, gimbal_device_id) to follow instead, 0 for any. others:
@@ -244,15 +245,15 @@ class GimbalBuffer:
 
     @property
     def device(self) -> tuple[int, int] | None:
-        """Whose angles are used; None before the first."""
+        """Component and device id of the gimbal that is used; None before the first."""
         return self._samples[-1].device if self._samples else None
 
     def clear(self) -> None:
-        """Forget all."""
+        """Empty the buffer."""
         self._samples.clear()
 
     def add(self, sample: GimbalSample) -> None:
-        """Append, unless a better source, or the gimbal that is followed, spoke of late."""
+        """Append, unless a better source or the selected gimbal reported recently."""
         if not self._is_wanted(sample.device):
             self._note(sample.device)
             return
@@ -284,7 +285,7 @@ class GimbalBuffer:
         return all(wanted in (0, given) for wanted, given in pairs)
 
     def at(self, time_ns: int) -> GimbalSample | None:
-        """Interpolated sample; the newest is held for 0.5 s (a gimbal moves slowly)."""
+        """Interpolated attitude; the newest is valid for 0.5 s."""
         samples = list(self._samples)
         if not samples or time_ns < samples[0].time_ns:
             return None

@@ -1,8 +1,7 @@
-"""A line to the operator from a process that has no bridge: over the links that another one left.
+"""Sends an alert to the operator after the flight process has died, over its links.
 
-The flight process died, so its ports are free. The link is opened, the autopilot's next message
-says where it is and which system it is, the line goes out, and the link is closed again before the
-restarted process wants it.
+Each link is opened, the autopilot's next message gives its address and system id, the alert is
+sent, and the link is closed before the restarted process needs it.
 """
 
 from __future__ import annotations
@@ -69,9 +68,9 @@ class _Speaker:
 
 
 def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float = 0.8) -> bool:
-    """Send an alert on every link of the bridge; whether one of them opened within `timeout_s`,
-    which all links share, not whether anybody received it. For the supervisor. `SigningKeyError`
-    for an unusable key file.
+    """Send an alert on every link of the bridge. True if at least one opened within `timeout_s`
+    (for all links together); whether anybody received it is unknown. For the supervisor.
+    `SigningKeyError` for an unusable key file.
     """
     message = status_text(alert)
     spoken = []

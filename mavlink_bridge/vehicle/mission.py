@@ -1,4 +1,4 @@
-"""The mission that the flight controller holds, for those who show it.
+"""Reads the mission from the flight controller, for display.
 
 https://mavlink.io/en/services/mission.html
 """
@@ -27,7 +27,7 @@ _TRIES = 5
 
 @dataclass(frozen=True)
 class MissionWaypoint:
-    """A place that the mission flies to. number: of the item; 0 is home in ArduPilot."""
+    """A position of the mission. number: of the item; 0 is home in ArduPilot."""
 
     number: int
     latitude_deg: float
@@ -35,8 +35,8 @@ class MissionWaypoint:
 
 
 def place_of(item: Any) -> MissionWaypoint | None:
-    """Where a MISSION_ITEM_INT is flown to; None for other commands, and where 0, 0 or the unset
-    value mean the place where the vehicle is. MissionError for what is no place on Earth.
+    """Position of a MISSION_ITEM_INT; None for other commands and if the item means the present
+    position. `MissionError` for impossible coordinates.
     """
     flown = item.seq == 0 or item.command in FLOWN_TO
     if not flown or item.frame not in FRAMES or (item.x, item.y) in _HERE:
@@ -50,7 +50,7 @@ def place_of(item: Any) -> MissionWaypoint | None:
 
 
 def item_of(message: Any) -> MissionItem:
-    """A MISSION_ITEM_INT as an item: a command with a place has it in 1e-7 degrees."""
+    """Convert a MISSION_ITEM_INT to a `MissionItem` (degrees instead of 1e-7 degrees)."""
     x, y = float(message.x), float(message.y)
     if (message.x, message.y) in _HERE:
         x = y = 0.0
@@ -61,7 +61,7 @@ def item_of(message: Any) -> MissionItem:
 
 
 class MissionWatch:
-    """Reads the mission once somebody wants to show it, and again when it may be another.
+    """Downloads the mission when it is first wanted, and again when it may have changed.
 
     ArduPilot does not tell that a mission was changed: the number of items is asked for every ten
     seconds, and all of it is read again when that number or the mode changes, or the vehicle arms
@@ -82,12 +82,12 @@ class MissionWatch:
         self._due_ns = 0
 
     def reset(self) -> None:
-        """Another vehicle, or the same one after a reboot."""
+        """Another vehicle, or a reboot: forget the mission."""
         self._known = self._reading = self._item = None
         self._due_ns = self._tries = 0
 
     def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Ask for what is due."""
+        """Send the request that is due."""
         if not self.wanted:
             return
         flown_as = (state.armed, state.custom_mode)
@@ -105,7 +105,7 @@ class MissionWatch:
         self._ask(link, now_ns)
 
     def on_message(self, link: Link, message: Any, now_ns: int) -> None:
-        """MISSION_COUNT, MISSION_ITEM_INT or MISSION_ACK of the vehicle."""
+        """Process MISSION_COUNT, MISSION_ITEM_INT or MISSION_ACK of the vehicle."""
         to = (message.target_system, message.target_component)
         if not self.wanted or to != (link.system_id, self._component):
             return  # another station's conversation

@@ -1,7 +1,7 @@
-"""The EKF origin and the flat-earth scalings that the flight controllers invert.
+"""The EKF origin and the firmwares' flat-earth conversions.
 
-Positions are sent as NED metres from the EKF origin, and the flight controller turns them back to
-latitude and longitude by its own approximation; using a better one here would only add its error.
+Positions are sent as NED metres from the EKF origin. The flight controller converts them back by
+its own approximation, so the same one must be used here.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _longitude_scale(latitude_deg: float) -> float:
 
 
 def wrap_degrees(angle: float) -> float:
-    """The same longitude from -180 up to 180."""
+    """The longitude in [-180, 180)."""
     return (angle + 180.0) % 360.0 - 180.0
 
 
@@ -74,7 +74,7 @@ def north_east(
 def offset(
     origin_lat: float, origin_lon: float, north_m: float, east_m: float
 ) -> tuple[float, float]:
-    """(latitude, longitude) degrees of a point; inverse of `north_east` in ArduPilot's scaling."""
+    """(latitude, longitude) at a north and east offset; inverse of ArduPilot's `north_east`."""
     latitude = origin_lat + north_m / METRES_PER_DEGREE
     scale = _longitude_scale((origin_lat + latitude) / 2.0)
     return latitude, wrap_degrees(origin_lon + east_m / (METRES_PER_DEGREE * scale))
@@ -109,7 +109,7 @@ def _distance_m(a: Origin, b: Origin) -> float:
 
 
 class OriginKeeper:
-    """Reads the vehicle's origin, and sets the configured one only when there is none.
+    """Reads the vehicle's EKF origin, and sets the configured one only if there is none.
 
     A second origin is silently ignored by ArduPilot, so what GPS_GLOBAL_ORIGIN says is the truth,
     whatever was sent.
@@ -130,7 +130,7 @@ class OriginKeeper:
         self.moved_m = None
 
     def on_origin(self, message: Any, *, armed: bool) -> Alert | None:
-        """GPS_GLOBAL_ORIGIN; returns an alert when it is news.
+        """Process GPS_GLOBAL_ORIGIN; returns an alert if the origin is new or changed.
 
         armed: an origin that is known is kept then. No EKF moves its origin in flight, and who
         forged one would drag every position by its distance.
@@ -159,7 +159,7 @@ class OriginKeeper:
         return alert(AlertId.ORIGIN_KNOWN)
 
     def tick(self, now_ns: int, system_id: int, ask: Callable[[int], None]) -> Any | None:
-        """Ask for the origin (`ask(49)`), seldom once it is known; SET_GPS_GLOBAL_ORIGIN if due."""
+        """Request the origin by `ask(49)`; returns SET_GPS_GLOBAL_ORIGIN if it is due."""
         if now_ns < self._next_ns:
             return None
         if self.origin is not None:

@@ -1,4 +1,4 @@
-"""The EKF origin on the link: asked for, read, and set where the vehicle has none."""
+"""Requests, reads and, if the vehicle has none, sets the EKF origin over the link."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class OriginExchange:
 
     @property
     def origin(self) -> Origin | None:
-        """The EKF's origin; None while it is not known."""
+        """The EKF's origin; None while unknown."""
         return self._keeper.origin
 
     def on_message(self, message: Any, time_ns: int) -> None:
-        """GPS_GLOBAL_ORIGIN (49) came. The same alert is reported once in ten seconds."""
+        """Process GPS_GLOBAL_ORIGIN (49). The same alert is reported at most every 10 s."""
         armed = self._tracker.snapshot(time_ns).armed
         news = self._keeper.on_origin(message, armed=armed)
         moved_m = self._keeper.moved_m
@@ -58,12 +58,12 @@ class OriginExchange:
             self._teller.report(news)
 
     def forget(self) -> None:
-        """Nothing is sent relative to an origin that may be another one by now."""
+        """Drop the origin, because it may have changed; nothing relative to it is sent."""
         self._keeper.reset()
         self._tracker.set_origin(None)
 
     def tick(self, link: Link, now_ns: int, *, may_set: bool) -> None:
-        """Ask when it is due. may_set: whether the configured one may be sent."""
+        """Send the request that is due. may_set: whether the configured origin may be sent."""
 
         def ask(wanted: int) -> None:
             self._commander.send(link, mavlink.MAV_CMD_REQUEST_MESSAGE, wanted)

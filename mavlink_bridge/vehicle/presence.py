@@ -1,4 +1,4 @@
-"""Reports that the flight controller is found, lost or back; the first link to notice does."""
+"""Reports that the flight controller is found, lost or back, once for all links."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NEWS = {
 
 
 class VehicleWatch:
-    """Every link calls `check` with each tick: the flight controller's own may be reconnecting.
+    """Reports found and lost vehicles. Every link calls `check` at each tick.
 
     report: tell the operator. first: called after the first of these alerts.
     clock: CLOCK_MONOTONIC, ns.
@@ -40,7 +40,7 @@ class VehicleWatch:
         self._known = "nothing"
 
     def check(self, state: VehicleState) -> None:
-        """Report what changed since the last call."""
+        """Report changes since the last call."""
         now_ns = self._clock()
         with self._lock:
             before, self._begun_ns = self._known, self._begun_ns or now_ns
@@ -58,14 +58,14 @@ class VehicleWatch:
 
 
 class DuplicateSystemIdMonitor:
-    """Detects two vehicles with the same ids on one link: boot time runs back repeatedly."""
+    """Detects two vehicles with the same ids on one link: the boot time decreases repeatedly."""
 
     def __init__(self) -> None:
         self._begun_ns = 0
         self._count = 0
 
     def two(self, now_ns: int, ran_back: int) -> bool:
-        """Whether there are two. ran_back: how often boot time ran back so far."""
+        """Whether there are two. ran_back: how often the boot time has decreased so far."""
         many = ran_back - self._count >= _TWIN_SWITCHES
         if many or now_ns - self._begun_ns >= _TWIN_WINDOW_NS:
             self._begun_ns, self._count = now_ns, ran_back

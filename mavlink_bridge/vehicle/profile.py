@@ -1,6 +1,6 @@
-"""Firmware profiles: what each autopilot makes of the messages it is sent.
+"""Firmware profiles: how each autopilot interprets the injected messages.
 
-Measured or read from source; see messages.md for the table and where each entry comes from.
+Measured or read from source; messages.md has the table and the sources.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Version = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class FirmwareProfile:
-    """How to speak to one firmware.
+    """How one firmware interprets the injected messages.
 
     covariance: how it turns the message's diagonal into an error (see `covariance_entry`).
     max_delay_ms: age beyond which a measurement cannot be fused any more.
@@ -90,7 +90,7 @@ GENERIC = FirmwareProfile(
 
 
 def autopilot_name(autopilot: int) -> str:
-    """ "ardupilot", "px4" or "unknown" of a heartbeat's MAV_AUTOPILOT."""
+    """ "ardupilot", "px4" or "unknown" for a MAV_AUTOPILOT."""
     return {
         mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
         mavlink.MAV_AUTOPILOT_PX4: "px4",
@@ -107,7 +107,7 @@ def decode_version(flight_sw_version: int) -> Version:
 
 
 def select_profile(autopilot: str, version: Version | None) -> FirmwareProfile:
-    """The profile of a firmware; an unknown one gets `GENERIC` (``known`` is False)."""
+    """The profile of a firmware; `GENERIC` (``known`` is False) for an unknown one."""
     if autopilot == "ardupilot":
         if version is None or (4, 5, 0) <= version < (4, 8, 0):
             return ARDUPILOT
@@ -118,7 +118,7 @@ def select_profile(autopilot: str, version: Version | None) -> FirmwareProfile:
 
 
 def covariance_entry(error: float, formula: CovarianceFormula) -> float:
-    """What to write into each of three diagonal entries so that the firmware reads `error`.
+    """Diagonal entry that the firmware reads as the 1-sigma error `error`.
 
     cbrt: ``error = cbrt(3 c^2)`` (ArduPilot 4.5-4.7, GCS_Common.cpp). sqrt: ``error = sqrt(3 c)``
     (pull request 32084). variance: ``c = error^2``, as MAVLink defines it (PX4).

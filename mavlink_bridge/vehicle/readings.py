@@ -1,4 +1,4 @@
-"""What each of the vehicle's messages says, in the bridge's units and frames."""
+"""Converts the vehicle's messages to the bridge's units and frames."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _GONE_NS = 3_000_000_000  # of an autopilot or a sensor: then another may take i
 
 
 def is_autopilot(message: Any) -> bool:
-    """Whether it is an autopilot's heartbeat: no ground station's, camera's or companion's."""
+    """Whether a heartbeat is from an autopilot, not from a ground station, camera or companion."""
     return bool(
         message.get_type() == "HEARTBEAT"
         and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -55,7 +55,7 @@ def is_autopilot(message: Any) -> bool:
 
 
 def gimbal_in_earth_frame(flags: int) -> bool:
-    """Whether GIMBAL_DEVICE_ATTITUDE_STATUS gives yaw from north: YAW_IN_* first, then YAW_LOCK."""
+    """Whether GIMBAL_DEVICE_ATTITUDE_STATUS gives yaw from north, by YAW_IN_* or else YAW_LOCK."""
     if flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME:
         return False
     if flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME:
@@ -64,9 +64,7 @@ def gimbal_in_earth_frame(flags: int) -> bool:
 
 
 class Arming:
-    """Whether the vehicle is armed, by its heartbeats. turns: how often one said the other thing
-    than the one before.
-    """
+    """Armed state by the heartbeats. turns: number of changes between consecutive heartbeats."""
 
     def __init__(self) -> None:
         self.turns = 0
@@ -74,8 +72,8 @@ class Arming:
         self._armed_ns = 0  # when it last said so
 
     def heard(self, said: bool, time_ns: int) -> bool:
-        """Disarmed is believed once nothing else was heard for `_DISARMED_NS`: a forged heartbeat
-        between the autopilot's own would open in flight what is shut while armed.
+        """Process a heartbeat's armed flag; returns the state. Disarmed needs `_DISARMED_NS`
+        without an armed heartbeat, so that a forged one unlocks nothing in flight.
         """
         self.turns += said != self._said
         self._said = said
@@ -86,7 +84,7 @@ class Arming:
 
 
 class VehicleReadings:
-    """The newest of everything and buffers of what is interpolated; the tracker's lock guards it.
+    """Newest values and interpolation buffers of the telemetry; the tracker's lock guards it.
 
     globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin. gimbal:
     component and device whose angles count, 0 for any. impostors: messages of the vehicle's ids
@@ -109,15 +107,15 @@ class VehicleReadings:
         self._ranger: int | None = None  # id of the sensor whose distances count
 
     def take(self, message: Any, time_ns: int) -> None:
-        """One of MESSAGES_IN. Raises ValueError where no sensor says that, or no rotation."""
+        """Process one of MESSAGES_IN. Raises ValueError for impossible values."""
         _HANDLERS[message.get_type()](self, message, time_ns)
 
     def set_origin(self, origin: Origin | None) -> None:
-        """What the origin keeper read."""
+        """Set the EKF origin."""
         self.state = replace(self.state, origin=origin)
 
     def forget(self) -> None:
-        """What was dated by the clock before a reboot, and the origin, are void."""
+        """Drop the origin and all data with time stamps from before a reboot."""
         for buffer in (
             self.attitudes,
             self.gimbals,
@@ -324,7 +322,7 @@ class VehicleReadings:
 
 
 def boot_time_ns(message: Any) -> int | None:
-    """The sender's boot time in a message; None where it has none (or another clock's)."""
+    """The sender's boot time in a message; None if it has none."""
     boot_ms = getattr(message, "time_boot_ms", None)
     if boot_ms is not None:
         return int(boot_ms) * 1_000_000
@@ -339,7 +337,7 @@ def _known(value: float) -> float | None:
 
 
 def check_place(latitude_e7: int, longitude_e7: int) -> None:
-    """ValueError where 1e-7 degrees are no place on Earth."""
+    """ValueError for impossible coordinates in 1e-7 degrees."""
     if abs(latitude_e7) > 900_000_000 or abs(longitude_e7) > 1_800_000_000:
         raise ValueError(f"no place on Earth: {latitude_e7}, {longitude_e7}")
 

@@ -1,7 +1,6 @@
-"""What the vehicle's receiver and gyros err by: one value for each quantity, with its source.
+"""Error model of the vehicle's GNSS receiver and gyros: one value for each quantity, with source.
 
-`localizer/sensors/error_model.py` has what the localizer uses; the two packages know nothing of
-each other, and no quantity stands in both.
+`localizer/sensors/error_model.py` has the localizer's values; no quantity is in both.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ class VehicleSensorErrors:
     gyro_drift_radps: float = math.radians(0.25)
 
     def gnss_sigma_m(self, claimed_m: float | None, most_m: float) -> float:
-        """Of a receiver's claim, m; most_m: a larger claim would hide an error in itself."""
+        """GNSS sigma (m) of a stated accuracy, at most most_m."""
         said = self.gnss_m if claimed_m is None else claimed_m
         return min(max(said, self.gnss_least_m), most_m)
 

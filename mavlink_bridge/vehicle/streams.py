@@ -1,4 +1,4 @@
-"""Which messages the flight controller is asked to stream, and asking again for what is missing."""
+"""Selects the messages that the flight controller must stream, and requests missing ones."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _OPTIONAL_EVERY = 30  # looks, a minute: an autopilot that boots hears no questi
 
 @dataclass(frozen=True)
 class Stream:
-    """A message to be streamed. optional: a firmware may not know it; then it is asked seldom until
-    it comes.
+    """A message to be streamed. optional: the firmware may not have it; it is then requested
+    rarely.
 
     unless: not asked for while that message comes.
     """
@@ -35,7 +35,7 @@ class Stream:
 
 
 def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
-    """The streams a configuration needs from a firmware."""
+    """The streams that a configuration needs from a firmware."""
     estimator = "ESTIMATOR_STATUS" if autopilot == "px4" else "EKF_STATUS_REPORT"
     streams = [
         Stream("ATTITUDE", config.attitude_rate_hz),
@@ -60,7 +60,7 @@ def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
 
 
 class StreamKeeper:
-    """Asks for each stream until it comes, and again when it stops."""
+    """Finds streams that have not started or have stopped."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -80,7 +80,7 @@ class StreamKeeper:
         self.counts[name] += 1
 
     def due(self, streams: tuple[Stream, ...], now_ns: int) -> list[Stream]:
-        """The streams to ask for now."""
+        """The streams to request now."""
         if now_ns < self._next_ns:
             return []
         self._next_ns = now_ns + _CHECK_EVERY_NS

@@ -1,4 +1,4 @@
-"""TIMESYNC (111): the flight controller's questions answered, ours asked once in a while."""
+"""TIMESYNC (111): answers the flight controller's requests and sends ours."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _UNANSWERED_NS = 15_000_000_000
 
 
 class TimeSync:
-    """Asks for the vehicle's clock at 1 Hz and gives each answer to the tracker; one thread.
+    """Requests the vehicle's clock at 1 Hz and passes each answer to the tracker; one thread.
 
     Reports when the answers stop.
     """
@@ -42,12 +42,12 @@ class TimeSync:
         self._asking_ns = self._turn_ns = 0
 
     def reset(self) -> None:
-        """The link was opened: what was asked before it is not answered any more."""
+        """The link was opened: ignore answers to earlier requests."""
         self._next_ns = 0
         self._sent.clear()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> bool:
-        """A question or an answer; True when the vehicle's clock tells of a reboot."""
+        """Process a request or an answer; True if the vehicle's clock shows a reboot."""
         if message.tc1 == 0:
             if link.congested:
                 return False  # as if lost: a flood of questions costs no position its place
@@ -58,7 +58,7 @@ class TimeSync:
         return sent_ns is not None and self._tracker.timesync(message.tc1, sent_ns, time_ns)
 
     def tick(self, link: Link, now_ns: int) -> None:
-        """Ask when it is due. Not called while the vehicle is not heard."""
+        """Send the request that is due. Not called without a heartbeat of the vehicle."""
         if now_ns - self._turn_ns > _PERIOD_NS:
             self._asking_ns = now_ns  # after a silence, for which nobody owes an answer
         self._turn_ns = now_ns
@@ -78,5 +78,5 @@ class TimeSync:
             self._teller.tell("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of everything that waits here."""
+        """Number of unanswered requests."""
         return {"timesync": len(self._sent)}

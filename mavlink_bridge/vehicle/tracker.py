@@ -1,4 +1,4 @@
-"""What the vehicle says: state, attitude and gimbal, on our clock and interpolated to any time."""
+"""Tracks the vehicle's telemetry on our clock: state, attitude and gimbal, with interpolation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _OLD_NS = 2_000_000_000
 
 
 class VehicleTracker:
-    """Follows one vehicle's messages. `handle` runs in the link's thread, the rest anywhere.
+    """Processes one vehicle's messages. `handle` runs in the link's thread; other methods in any.
 
     gimbal: component and gimbal_device_id whose angles count, 0 for any.
     """
@@ -51,7 +51,7 @@ class VehicleTracker:
         self.ignored = 0
 
     def snapshot(self, now_ns: int) -> VehicleState:
-        """The state now."""
+        """The state at a time."""
         with self._lock:
             heartbeat_ns = self._readings.heartbeat_ns
             age_ns = None if heartbeat_ns is None else now_ns - heartbeat_ns
@@ -66,13 +66,13 @@ class VehicleTracker:
 
     @property
     def other_gimbals(self) -> tuple[tuple[int, int], ...]:
-        """Gimbals that are heard besides the one whose angles are used: (component, device)."""
+        """Gimbals that also send but are not used: (component, device)."""
         with self._lock:
             return () if self._fixed else tuple(sorted(self._readings.gimbals.others))
 
     @property
     def impostors(self) -> int:
-        """Messages of the vehicle's ids that were of another make or firmware."""
+        """Number of messages with the vehicle's ids but of another vehicle type or firmware."""
         with self._lock:
             return self._readings.impostors
 
@@ -82,7 +82,7 @@ class VehicleTracker:
             return self._readings.attitudes.at(time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude at a time: gimbal (or body, if fixed) and mounting, to NED."""
+        """The camera's attitude to NED at a time: gimbal (or body, if fixed) and mounting."""
         with self._lock:
             body = self._readings.attitudes.at(time_ns)
             sample = None if self._fixed else self._readings.gimbals.at(time_ns)
@@ -117,17 +117,17 @@ class VehicleTracker:
             return self._readings.locals.at(time_ns)
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """What the IMU read after a time, oldest first; at most the last 10 s."""
+        """IMU samples after a time, oldest first; at most the last 10 s."""
         with self._lock:
             return self._readings.inertial.since(time_ns)
 
     def set_origin(self, origin: Origin | None) -> None:
-        """What the origin keeper read."""
+        """Set the EKF origin."""
         with self._lock:
             self._readings.set_origin(origin)
 
     def accepts(self, message: Any) -> bool:
-        """Whether the message is from the vehicle's autopilot; the first heartbeat decides."""
+        """Whether it is from the vehicle's autopilot; the first heartbeat selects it."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         state = self._readings.state
         if state.system_id is not None:
@@ -138,7 +138,7 @@ class VehicleTracker:
         return is_autopilot(message) and self._wanted_id in (None, system)
 
     def handle(self, message: Any, received_ns: int) -> bool:
-        """Take in one accepted message; True if it shows that the flight controller rebooted."""
+        """Process one accepted message; True if it shows that the flight controller rebooted."""
         rebooted = False
         stamp_ns = received_ns
         boot_ns = boot_time_ns(message)
@@ -162,7 +162,7 @@ class VehicleTracker:
         return rebooted
 
     def timesync(self, boot_ns: int, sent_ns: int, received_ns: int) -> bool:
-        """Take in a TIMESYNC answer; True if it shows that the flight controller rebooted."""
+        """Process a TIMESYNC answer; True if it shows that the flight controller rebooted."""
         rebooted = self.clock.timesync(boot_ns, sent_ns, received_ns)
         if rebooted:
             self._forget()

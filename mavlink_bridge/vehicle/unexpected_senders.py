@@ -39,7 +39,7 @@ class UnexpectedSenderMonitor:
         self._lies = (0, 0)  # of TIMESYNC likewise
 
     def on_message(self, link: Link, message: Any) -> None:
-        """A message that is not the vehicle's; only its heartbeat says who it is from."""
+        """Process a message that is not the vehicle's; only heartbeats identify the sender."""
         if message.get_type() != "HEARTBEAT" or not link.system_id:
             return
         system, component = message.get_srcSystem(), message.get_srcComponent()
@@ -56,7 +56,7 @@ class UnexpectedSenderMonitor:
             tell("others", alert(AlertId.AUTOPILOT_IGNORED, system=system, used=used))
 
     def check(self, link: Link, now_ns: int) -> None:
-        """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
+        """Detect other hosts, and two vehicles with the same ids."""
         if link.stranger:
             ignored = alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
             self._teller.tell("foreign", ignored)

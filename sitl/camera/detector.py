@@ -1,7 +1,7 @@
-"""The operator's eye, simulated: pixels of known targets in each frame, sent as detections.
+"""A simulated object detector: sends the pixel positions of known targets in each frame.
 
-It knows the truth and reports only what a viewer could see: in the picture and not hidden behind
-something nearer. It errs as detectors do (`DetectorErrors`).
+It reports only targets that are inside the image and not occluded, with the errors of
+`DetectorErrors`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from localizer.types import Float32
 
 
 class Observed(Protocol):
-    """Something whose place is known at any time: a `movers.Mover` or a `FixedPoint`."""
+    """A target whose true position is known at any time: a `movers.Mover` or a `FixedPoint`."""
 
     @property
     def name(self) -> str:
-        """What the detections call it."""
+        """The label of its detections."""
 
     def position_at(self, time_ns: int) -> Array:
         """(3,) world metres at a time on CLOCK_MONOTONIC."""
@@ -45,10 +45,10 @@ class FixedPoint:
 
 @dataclass(frozen=True)
 class DetectorErrors:
-    """noise_px: of a pixel, per axis. Shares of what is seen, each frame: missed; false, a
-    detection of nothing, anywhere in the picture, under a name of its own; swapped, two targets
-    under each other's names. box_centre: what moves is reported at the middle of its box, not
-    where it stands.
+    """Errors of the simulated detector. noise_px: 1 sigma per axis. missed, false, swapped: shares
+    of the visible targets in each frame that are not reported, are added at a random pixel, or
+    exchange their names. box_centre: a moving target is reported at the centre of its box instead
+    of its ground point.
     """
 
     noise_px: float = 1.0
@@ -65,8 +65,8 @@ _DEPTH_TOLERANCE = 0.02  # of the distance; a target lies on a surface that is d
 
 @dataclass(frozen=True)
 class DetectorView:
-    """A frame as the detector is given it. depth: (H, W) of the distorted picture; pose_of_row:
-    world_from_camera while a row is exposed.
+    """Truth of one frame for the detector. depth: (H, W) m, in the distorted image; pose_of_row:
+    world_from_camera at the exposure of an image row.
     """
 
     time_ns: int
@@ -75,7 +75,7 @@ class DetectorView:
 
 
 class Detector:
-    """Sends detections of `targets` to `address` ("host:port")."""
+    """Sends detections of `targets` as UDP datagrams to `address` ("host:port")."""
 
     def __init__(
         self,
@@ -94,8 +94,8 @@ class Detector:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def observe(self, view: DetectorView, stamp_ns: int | None = None) -> list[Detection]:
-        """Send and return what is reported of a frame. stamp_ns: of the frame in the stream, which
-        the detections carry; none: its true time.
+        """Detect the targets in one frame, send the detections and return them. stamp_ns: time
+        stamp of the frame in the video stream, used for the detections; None: the true time.
         """
         stamp_ns = view.time_ns if stamp_ns is None else stamp_ns
         seen = [d for t in self._targets if (d := self._detected(t, view, stamp_ns)) is not None]

@@ -1,6 +1,4 @@
-"""A lens and its shutter for a renderer that draws ideal pinholes at one instant: render more,
-then bend.
-"""
+"""Lens distortion and rolling shutter: an ideal pinhole image is rendered and then warped."""
 
 from __future__ import annotations
 
@@ -35,8 +33,8 @@ class RenderedLens:
 
     @classmethod
     def of(cls, camera: Camera, supersample: float = 1.0, is_rolling: bool = False) -> RenderedLens:
-        """Chooses the smallest pinhole of the camera's scale, times `supersample`, that covers all
-        its rays, with a margin where the shutter rolls.
+        """Choose the smallest pinhole camera that covers all rays of `camera`. supersample:
+        resolution factor. is_rolling: adds a margin for the rolling shutter.
         """
         v, u = np.mgrid[: camera.height, : camera.width]
         rays = camera.rays(np.stack([u, v], axis=-1) + 0.5)
@@ -55,19 +53,19 @@ class RenderedLens:
         return cls(camera, pinhole, flat, (coordinates.astype(np.int16), weights.astype(np.uint16)))
 
     def distort(self, image: Image) -> Image:
-        """The camera's image (H, W, 3) of the pinhole's."""
+        """Warp an image (H, W, 3) of the pinhole to the distorted camera."""
         return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_LINEAR))
 
     def distort_depth(self, depth: Float32) -> Float32:
-        """The camera's depth (H, W) of the pinhole's: nearest, because depths do not mix."""
+        """Warp a depth image (H, W) of the pinhole to the distorted camera (nearest neighbour)."""
         return np.asarray(cv2.remap(depth, self.maps[0], None, cv2.INTER_NEAREST))
 
     def roll(self, image: Image, depth: Float32, middle_from_row: Array) -> tuple[Image, Float32]:
-        """The camera's image and depth where every row is exposed at its own time.
+        """Warp image and depth for a rolling shutter.
 
-        middle_from_row: (H, 3, 4), the camera at each row's time to the camera of the rendered
-        instant. The depth of a pixel's ray is taken where the still picture has that pixel: the
-        motion during a readout is a few pixels, so only silhouettes are off, by less.
+        middle_from_row: (H, 3, 4), from the camera at each row's time to the camera at the rendered
+        time. The depth is taken at the unwarped pixel: the motion during a readout is a few pixels,
+        so only silhouettes have an error.
         """
         still = self.distort_depth(depth)
         p = self.pinhole
@@ -80,9 +78,10 @@ class RenderedLens:
 
 
 def row_motion(middle: Pose, pose_of_row: Callable[[float], Pose], height: int) -> Array:
-    """(H, 3, 4): from the camera at each row's time to the camera at the middle one.
+    """Rigid transforms (H, 3, 4) from the camera at each row's exposure time to the camera at the
+    middle row's, for a rolling shutter.
 
-    Asked for every few rows and interpolated: the motion between is small.
+    pose_of_row: world_from_camera of a row; called for every few rows and interpolated.
     """
     rows = np.arange(height)
     known = np.append(np.arange(0, height - 1, _ROWS_APART), height - 1)

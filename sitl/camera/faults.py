@@ -1,4 +1,4 @@
-"""Faults of the picture on its way to the companion: covered, blinded, frozen, or stamped wrong."""
+"""Video faults of the simulation: covered or blinded lens, frozen video, wrong time stamps."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _BLINDED_LEVEL, _BLINDED_NOISE = 205.0, 3.0  # inside a cloud: bright, even, nex
 
 @dataclass(frozen=True)
 class PictureFault:
-    """What is wrong with the pictures from now on.
+    """A video fault that lasts until the next one.
 
-    covered: a lens cap. blinded: cloud or fog that shows nothing. frozen: the last picture again
-    and again under fresh stamps, encoded anew each time, as a hung sensor does. stamped_late: by
-    `seconds` after the true exposure. late: sent so late, and stamped when it is sent, as by a
-    camera that does not know of its own latency. silent: nothing is sent.
+    covered: a lens cap. blinded: cloud or fog. frozen: the last frame is repeated with new time
+    stamps, encoded anew. stamped_late: the time stamp is `seconds` after the exposure. late: sent
+    `seconds` late and stamped when sent, as by a camera that ignores its own latency. silent:
+    nothing is sent.
     """
 
     kind: PictureFaultKind
@@ -30,7 +30,7 @@ class PictureFault:
 
 
 class FaultyLens:
-    """Applies the fault that stands, if any, to picture after picture."""
+    """Applies the current video fault, if any, to each frame."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 23])
@@ -39,15 +39,15 @@ class FaultyLens:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no picture is sent at all."""
+        """Whether no frame is sent at all."""
         return self._fault is not None and self._fault.kind == "silent"
 
     def set(self, fault: PictureFault | None) -> None:
-        """The fault from the next picture on; None ends it."""
+        """Set the fault from the next frame on; None ends it."""
         self._fault = fault
 
     def picture(self, image: Image) -> Image:
-        """What is sent instead of `image` (H, W, 3) uint8."""
+        """The frame that is sent instead of `image` (H, W, 3) uint8."""
         kind = self._fault.kind if self._fault is not None else None
         if kind == "frozen" and self._last is not None:
             return self._last
@@ -59,12 +59,12 @@ class FaultyLens:
         return image
 
     def stamp(self, exposure_ns: int) -> int:
-        """The time that the picture is stamped with."""
+        """The time stamp to send for a frame that was exposed at `exposure_ns`."""
         return exposure_ns + self._ns_of("stamped_late", "late")
 
     @property
     def delay_ns(self) -> int:
-        """How long a picture waits before it is sent."""
+        """Time for which a frame is delayed before it is sent."""
         return self._ns_of("late")
 
     def _ns_of(self, *kinds: PictureFaultKind) -> int:

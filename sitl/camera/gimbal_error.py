@@ -1,6 +1,6 @@
-"""What a gimbal does not report of itself: its alignment on the vehicle, and its horizon's wander.
+"""Errors of the gimbal's reported angles: misalignment and a slowly varying attitude error.
 
-A simulated gimbal that points exactly where it says would hand the localizer its attitude for free.
+Without them, the simulation would give the localizer a perfect attitude.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ _WANDER_TIME_S = 6.0
 
 
 class GimbalError:
-    """Turns reported angles into true ones: a constant and a first-order Gauss-Markov process.
+    """Converts reported gimbal angles to true ones: adds a constant and a first-order Gauss-Markov
+    process.
 
-    fault_rad: a gross error of (roll, pitch, yaw) on top of what every gimbal has.
+    fault_rad: an additional gross error (roll, pitch, yaw).
     """
 
     def __init__(self, seed: int, fault_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:

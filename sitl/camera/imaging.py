@@ -1,7 +1,7 @@
-"""`synth.appearance.model` at video rate: the same model, fused into two passes over the image.
+"""`synth.appearance.model` at video rate: the same image model in two passes over the image.
 
-The general function costs as much as rendering does; the world camera shares two cores with the
-companion it tests. What few live scenes need (lamps, rain, snow) is left to that function.
+The general function is as slow as rendering, and the world camera shares two cores with the
+companion under test. Lamps, rain and snow are left to the general function.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _GAIN = (0.5, 3.0)
 
 
 class Sensor:
-    """Applies one appearance to frame after frame; the motion blur changes, and the gain where it
-    is automatic: it follows the last picture's brightness, and noise grows with it.
+    """Applies exposure, noise, blur and weather to rendered frames, one after another. With
+    auto_exposure, the gain follows the last frame's brightness, and the noise grows with it.
     """
 
     def __init__(self, appearance: Appearance, seed: int = 0, auto_exposure: bool = False) -> None:
@@ -43,7 +43,7 @@ class Sensor:
         self._noise = self._rng.standard_normal(_NOISE_SIZE, dtype=np.float32)
 
     def apply(self, rgb: Image, depth: Float32, blur_px: float, blur_deg: float) -> Image:
-        """The picture (H, W, 3) of a rendered one; depth (H, W) in metres, 0 for sky."""
+        """The camera's image (H, W, 3) of a rendered one; depth: (H, W) m, 0 for sky."""
         a = replace(self._appearance, motion_blur_px=blur_px, motion_blur_deg=blur_deg)
         if not self._auto:
             return self._developed(rgb, depth, a)
@@ -81,7 +81,7 @@ class Sensor:
 
 
 def line_kernel(length_px: float, angle_deg: float) -> Float32:
-    """Blur kernel of a straight motion, anti-aliased, centred, summing to one."""
+    """Blur kernel (K, K) of a straight motion, anti-aliased, centred, with sum 1."""
     half = int(np.ceil(length_px / 2)) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     t = np.linspace(-0.5, 0.5, 65) * length_px

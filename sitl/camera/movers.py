@@ -1,4 +1,4 @@
-"""Cars and people that move through the world: pure functions of time, so that truth is known."""
+"""Moving cars and people of the simulated world. Their positions are pure functions of time."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _TURN_M = 2.5  # half the length over which a direction is taken: objects turn s
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """An object that goes round a closed path at constant speed.
+    """An object that moves round a closed path at constant speed.
 
-    path: (N, 3) world metres on the ground, the last point joins the first. phase_m: place on the
-    path at `epoch_ns` (CLOCK_MONOTONIC). mesh: x forward, y left, z up, origin on the ground.
+    path: (N, 3) world metres on the ground. phase_m: position on the path at `epoch_ns`
+    (CLOCK_MONOTONIC). mesh: x forward, y left, z up, origin on the ground.
     """
 
     name: str
@@ -44,14 +44,14 @@ class Mover:
         return self.speed_mps * self._direction(self._travelled(time_ns))
 
     def pose_at(self, time_ns: int) -> Pose:
-        """world_from_object: upright, x along the way."""
+        """world_from_object at a time: upright, x in the direction of motion."""
         s = self._travelled(time_ns)
         x, y = self._direction(s)[:2]
         c, n = np.array([x, y]) / max(np.hypot(x, y), 1e-9)
         return Pose(np.array([[c, -n, 0.0], [n, c, 0.0], [0.0, 0.0, 1.0]]), self._point(s))
 
     def placed_at(self, time_ns: int) -> TileMesh:
-        """The mesh where it is at a time."""
+        """The object's mesh in world coordinates at a time."""
         return self.mesh.placed(self.pose_at(time_ns))
 
     def _travelled(self, time_ns: int) -> float:
@@ -68,8 +68,8 @@ class Mover:
 
 
 def there_and_back(lane: ArrayLike, out_m: float, back_m: float) -> Array:
-    """Closed path (2 N, 3) from an open lane (N, 3): along it, `out_m` to its right, and back,
-    `back_m` to the right of that way.
+    """Closed path (2 N, 3) from an open lane (N, 3): forward with an offset of `out_m` to the right
+    of the lane, then back with an offset of `back_m` to the right of that direction.
     """
     lane = np.asarray(lane, dtype=np.float64)
     return np.vstack([_parallel(lane, out_m), _parallel(lane[::-1], back_m)])
@@ -87,7 +87,7 @@ def _parallel(line: Array, offset_m: float) -> Array:
 
 @dataclass(frozen=True)
 class Crowd:
-    """Movers of one kind: their names begin with `prefix`, their speeds are between two."""
+    """A kind of moving objects. prefix: of their names; speeds_mps: lowest and highest."""
 
     prefix: str
     meshes: Sequence[TileMesh]
@@ -101,7 +101,7 @@ def spread(
     rng: np.random.Generator,
     epoch_ns: int = 0,
 ) -> tuple[Mover, ...]:
-    """`count` movers on closed paths drawn by length; meshes, speeds and places drawn at random."""
+    """`count` objects with random path, start position, mesh and speed."""
     lengths = np.array(
         [np.linalg.norm(np.diff(np.vstack([p, p[:1]]), axis=0), axis=1).sum() for p in paths]
     )

@@ -1,4 +1,4 @@
-"""What tells the world camera where the vehicle is."""
+"""Sends the vehicle's true pose to the world camera's process."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def truth_feed(
     gimbal_error: GimbalError,
     map_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Iterator[None]:
-    """Tells the world camera where the vehicle is, 50 times a second, on a thread.
+    """Context manager: a thread sends the vehicle's true pose to the world camera at 50 Hz.
 
-    map_shift_m: how far east, north and up of its true place the map shows what is on the ground.
+    map_shift_m: offset of the map from the world (east, north, up).
     """
     shift = np.array(map_shift_m)
     stop = threading.Event()
@@ -74,6 +74,6 @@ def _truth_sample(pilot: Pilot, cache: TileCache) -> TruthSample | None:
 
 
 def enu(place: Location, cache: TileCache) -> Any:
-    """A place (AMSL) in the map's ENU, (3,) metres."""
+    """ENU coordinates (3,) m in the map's frame of a geodetic position (altitude AMSL)."""
     height = place.altitude_m + cache.manifest.geoid_separation_m
     return cache.frame.enu_from_geodetic(place.latitude_deg, place.longitude_deg, height)

@@ -1,7 +1,7 @@
-"""The world camera as a process of its own: true poses in by a pipe, H.264 out by UDP.
+"""The world camera in its own process: receives true poses by a pipe and sends H.264 by UDP.
 
-It shares nothing with the companion but the network, so that the companion receives it as it would
-a real camera, and so that rendering for the simulation does not hold the companion's interpreter.
+The companion receives the stream as from a real camera, and rendering does not take the interpreter
+lock of the companion.
 """
 
 from __future__ import annotations
@@ -47,12 +47,11 @@ _MAX_BEHIND = 2  # frame periods after which exposures are skipped instead of ma
 
 @dataclass(frozen=True)
 class WorldCameraConfig:
-    """Everything the process needs; it is pickled to it.
+    """Configuration of the world camera's process, pickled to it.
 
-    cache: tiles of the live world. origin: of the map's ENU frame, in which truth samples and
-    movers are given. log: where the true pose of every frame is written. threads: of the
-    rasteriser. targets: what a `Detector` watches and reports to the address `detections`.
-    realism, detector_errors: what camera and detector have of a real one.
+    cache: tiles of the live world. origin: of the map's ENU frame, used for true poses and moving
+    objects. log: file for the true pose of every frame. threads: of the rasteriser. targets:
+    reported by the `Detector` to the address `detections`.
     """
 
     cache: Path
@@ -77,8 +76,8 @@ class WorldCameraConfig:
 
 @dataclass(frozen=True)
 class CameraStatistics:
-    """What the process did. skipped: exposures left out because it was behind or paused. lost:
-    datagrams of the stream.
+    """Counters of the world camera. skipped: exposures left out because the process was late or
+    paused; lost: datagrams of the stream dropped on purpose.
     """
 
     frames: int
@@ -88,7 +87,7 @@ class CameraStatistics:
 
 
 class WorldCameraProcess:
-    """The parent's handle. `send` truth samples at 20 Hz or more, in order of time."""
+    """Controls the world camera's process. `send` needs true poses in order, at 20 Hz or more."""
 
     def __init__(
         self,
@@ -116,27 +115,27 @@ class WorldCameraProcess:
         self._receive()
 
     def send(self, sample: TruthSample) -> None:
-        """Tells where the vehicle was; raises `WorldCameraError` when the process has died."""
+        """Send a true pose of the vehicle. Raises `WorldCameraError` if the process has died."""
         self._send(sample)
 
     def pause(self) -> None:
-        """Stops sending pictures, as a camera whose link is cut."""
+        """Stop sending frames, as if the camera's link were cut."""
         self._send("pause")
 
     def resume(self) -> None:
-        """Takes up sending again."""
+        """Send frames again."""
         self._send("resume")
 
     def fault(self, fault: PictureFault | None) -> None:
-        """From now on the pictures have this fault; None ends it."""
+        """Apply a video fault from now on; None ends it."""
         self._send(fault)
 
     def zoom(self, zooming: Zooming) -> None:
-        """From now on the lens does this."""
+        """Change the focal length as given."""
         self._send(zooming)
 
     def stop(self) -> None:
-        """Ends the process; `statistics` holds what it did. Harmless when it is not running."""
+        """End the process; `statistics` then holds its counters. Harmless if it is not running."""
         if self._process.pid is None:
             return
         try:

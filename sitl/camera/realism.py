@@ -1,4 +1,4 @@
-"""What a real camera on a real aircraft adds: rolling shutter, vibration, rough time stamps."""
+"""Imperfections of a real camera: rolling shutter, vibration, inaccurate time stamps."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ _WAVES = 3
 
 @dataclass(frozen=True)
 class CameraRealism:
-    """The defaults are a perfect camera.
+    """Imperfections of the simulated camera; the defaults are a perfect one.
 
-    readout_ms: from the first row's exposure to the last one's. vibration_deg: root mean square of
-    the camera's shaking, per axis. auto_exposure: the gain follows the picture's brightness.
-    supersample: pixels that are rendered per pixel and axis. packet_loss: share of datagrams that
-    do not arrive. stamp_offset_ms, stamp_jitter_ms: of the pictures' time stamps (constant, and
-    the standard deviation from picture to picture).
+    readout_ms: from the first row's exposure to the last one's. vibration_deg: RMS per axis.
+    auto_exposure: the gain follows the image's brightness. supersample: rendered pixels per pixel
+    and axis. packet_loss: share of lost datagrams. stamp_offset_ms, stamp_jitter_ms: error of the
+    time stamps, constant and standard deviation.
     """
 
     readout_ms: float = 0.0
@@ -34,7 +33,7 @@ class CameraRealism:
 
 
 class Vibration:
-    """Small rotations of the camera about its own axes, a pure function of time."""
+    """Random small rotations of the camera about its own axes, a pure function of time."""
 
     def __init__(self, rms_deg: float, seed: int) -> None:
         rng = np.random.default_rng([seed, 29])
@@ -43,7 +42,7 @@ class Vibration:
         self._phase = rng.uniform(0, 2 * np.pi, (3, _WAVES))
 
     def shaken(self, pose: Pose, time_ns: int) -> Pose:
-        """world_from_camera with the shaking of that moment."""
+        """world_from_camera with the vibration at a time."""
         if self._rms == 0:
             return pose
         waves = np.sin(self._omega * (time_ns * 1e-9) + self._phase).sum(axis=1)
@@ -52,7 +51,7 @@ class Vibration:
 
 
 class ShakenTrack:
-    """A camera's way with its vibration, asked like a `PoseTrack`."""
+    """A camera trajectory with vibration, with the interface of `PoseTrack`."""
 
     def __init__(self, track: PoseTrack, vibration: Vibration) -> None:
         self._track, self._vibration = track, vibration
@@ -64,7 +63,7 @@ class ShakenTrack:
 
 
 class CameraClock:
-    """The time stamps that a camera writes."""
+    """Makes the time stamps of the simulated camera, with its offset and jitter."""
 
     def __init__(self, realism: CameraRealism, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 31])
@@ -73,7 +72,7 @@ class CameraClock:
         self._last_ns = -(2**62)
 
     def of(self, exposure_ns: int) -> int:
-        """The stamp of a picture that was exposed then; stamps never run backwards."""
+        """The time stamp of a frame exposed at `exposure_ns`; time stamps never decrease."""
         noise = self._jitter_ns * float(self._rng.standard_normal()) if self._jitter_ns else 0.0
         stamp = exposure_ns + round(self._offset_ns + noise)
         self._last_ns = max(stamp, self._last_ns + 1)

@@ -20,7 +20,7 @@ _DATAGRAM = 1316  # bytes: seven TS packets, what fits an Ethernet frame
 
 
 class LossyLink:
-    """A file that FFmpeg writes to: datagrams to ``udp://host:port``, some of which are lost."""
+    """Output of FFmpeg: sends datagrams to ``udp://host:port`` and drops a random share."""
 
     def __init__(self, url: str, loss: float, seed: int = 0) -> None:
         parts = urlsplit(url)
@@ -34,11 +34,11 @@ class LossyLink:
 
     @property
     def lost(self) -> int:
-        """Datagrams that were not sent."""
+        """Number of dropped datagrams."""
         return self._lost
 
     def write(self, data: bytes) -> int:
-        """Send the bytes, whole TS packets, in datagrams."""
+        """Send bytes (whole TS packets) in datagrams."""
         for start in range(0, len(data), _DATAGRAM):
             if self._rng.random() < self._loss:
                 self._lost += 1
@@ -52,12 +52,11 @@ class LossyLink:
 
 
 class VideoSender:
-    """Encodes and sends frames as they come.
+    """Encodes frames as H.264 and sends them as MPEG-TS over UDP.
 
-    misp: stamp each picture with its exposure time (MISB ST 0604); without it the presentation
-    times are all that a receiver has. link: what the stream goes over instead of the url, to lose
-    packets on. Every key frame (one a second) carries the headers, so that a
-    receiver may join at any time.
+    misp: add the exposure time of each frame (MISB ST 0604); otherwise the receiver has only
+    presentation times. link: output that loses packets, instead of the url. Every key frame (one a
+    second) carries the headers, so that a receiver can join at any time.
     """
 
     def __init__(
@@ -97,14 +96,13 @@ class VideoSender:
 
     @property
     def sent_bytes(self) -> int:
-        """Size of all pictures sent, without the transport's overhead."""
+        """Encoded bytes sent, without the transport's overhead."""
         return self._bytes
 
     def send(self, image: Image, exposure_ns: int, stamped_ns: int | None = None) -> None:
-        """Sends an RGB image (H, W, 3) uint8 exposed at `exposure_ns` on CLOCK_MONOTONIC.
+        """Send an RGB image (H, W, 3) uint8 exposed at `exposure_ns` (CLOCK_MONOTONIC).
 
-        stamped_ns: what a camera with a wrong clock says instead; the presentation time, of the
-        encoder's own clock, stays right.
+        stamped_ns: exposure time stated by a camera with a wrong clock.
         """
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         picture = picture.reformat(format="yuv420p")

@@ -1,4 +1,4 @@
-"""Cars and people of a generated world that are not in its map."""
+"""Moving cars and people of a generated world; the map does not contain them."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def traffic(
     seed: int = 0,
     epoch_ns: int = 0,
 ) -> tuple[Mover, ...]:
-    """Movers ``car0``... and ``person0``... on the world's main roads and pavements.
+    """Place moving cars (names ``car0``...) and people (``person0``...) on the world's main roads
+    and pavements.
 
-    frame: the map's ENU, in which they are given. The same arguments give the same traffic, so the
-    truth of every object is known at every time. cars, people: how many.
+    frame: the map's ENU, of all positions. The same arguments give the same traffic.
     """
     if not world.roads:  # a map of the user's has none that are known
         return ()

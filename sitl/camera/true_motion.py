@@ -1,4 +1,4 @@
-"""The true motion of the vehicle and its camera, as samples that can be interpolated."""
+"""True motion of the vehicle and its camera: samples and their interpolation."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, so3_exp
 
 @dataclass(frozen=True)
 class TruthSample:
-    """Where the vehicle truly is at a time on CLOCK_MONOTONIC.
+    """True state of the vehicle at a time (CLOCK_MONOTONIC).
 
-    position: (3,) metres in the map's ENU; body: quaternion (w, x, y, z), FRD to NED; gimbal: the
-    camera's true angles.
+    position: (3,) m, map ENU; body: quaternion (w, x, y, z), FRD to NED; gimbal: the camera's true
+    angles.
     """
 
     time_ns: int
@@ -34,7 +34,7 @@ class TruthSample:
 
 
 def camera_pose(sample: TruthSample, frame: LocalFrame, mount: Mount) -> Pose:
-    """The camera's true pose world_from_camera; `frame` is the map's."""
+    """The camera's true pose world_from_camera from the vehicle's. frame: the map's ENU."""
     to_ned = ned_from_world(frame, frame.position(sample.position))
     body = matrix_from_quaternion(sample.body)
     attitude = camera_attitude(body, sample.gimbal, mount)
@@ -42,7 +42,7 @@ def camera_pose(sample: TruthSample, frame: LocalFrame, mount: Mount) -> Pose:
 
 
 class PoseTrack:
-    """Camera poses in time order, interpolated between samples; forgets all but the newest."""
+    """Camera poses in time order with interpolation. Only the newest `keep` samples are kept."""
 
     def __init__(self, samples: Iterable[tuple[int, Pose]] = (), keep: int | None = 2000) -> None:
         self._samples: deque[tuple[int, Pose]] = deque(maxlen=keep)
@@ -60,7 +60,7 @@ class PoseTrack:
         return self._samples[-1][0] if self._samples else None
 
     def at(self, time_ns: int) -> Pose | None:
-        """Position on a line, rotation on a great circle; None outside the samples."""
+        """world_from_camera at a time, interpolated; None outside the samples."""
         if not self._samples or not self._samples[0][0] <= time_ns <= self._samples[-1][0]:
             return None
         later = self._samples[-1]

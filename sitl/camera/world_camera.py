@@ -1,7 +1,7 @@
-"""What the simulated aircraft's camera sees, rendered from its true pose.
+"""Renders the view of the simulated aircraft's camera from its true pose.
 
-`WorldCamera` makes one picture; `sitl.camera.process` streams pictures from a process of its own,
-`sitl.demo.sequence` writes them as an evaluation sequence.
+`WorldCamera` renders one frame. `sitl.camera.process` streams frames; `sitl.demo.sequence` writes
+them as an evaluation sequence.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ HAZY_AFTERNOON = Appearance(
 
 @dataclass(frozen=True)
 class Exposure:
-    """One picture and its truth. image: (H, W, 3) uint8, distorted, with all of the appearance;
-    depth: (H, W), metres along the optical axis, distorted alike. world_from_camera: of the middle
-    row's exposure at time_ns; pose_of_row: of any row's.
+    """A rendered frame and its truth. image: (H, W, 3) uint8, distorted, with noise, blur and
+    weather; depth: (H, W) m along the optical axis, distorted likewise. world_from_camera: at
+    time_ns, the exposure of the middle row; pose_of_row: of any row.
     """
 
     image: Image
@@ -62,12 +62,10 @@ class Exposure:
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What moves before a `WorldCamera`, and how it exposes.
+    """Moving objects and imperfections of a `WorldCamera`.
 
-    scene_from_world: from the map's ENU, in which poses and movers are given, to that of the
-    renderer's own cache (the two caches may have different origins). shutter_s: the motion during
-    it blurs the picture. seed: of the sensor's noise and the vibration. realism: what a real camera
-    adds.
+    scene_from_world: from the map's ENU, of poses and movers, to the ENU of the renderer's own
+    cache. shutter_s: exposure time, for the motion blur. seed: of noise and vibration.
     """
 
     movers: tuple[Mover, ...] = ()
@@ -78,7 +76,7 @@ class CameraOptions:
 
 
 class WorldCamera:
-    """Renders the live world as a real camera would show it."""
+    """Renders the live world (which may differ from the map) as a real camera would see it."""
 
     def __init__(
         self,
@@ -100,7 +98,7 @@ class WorldCamera:
         self._shutter_ns = round(options.shutter_s * 1e9)
 
     def expose(self, time_ns: int, track: PoseTrack) -> Exposure | None:
-        """The picture at a time; None where the track has no pose."""
+        """Render the frame at a time; None if `track` has no pose at that time."""
         shaken = ShakenTrack(track, self._vibration)
         pose = shaken.at(time_ns)
         if pose is None:
@@ -140,7 +138,7 @@ class WorldCamera:
 
 
 def centre_flow(before: Pose, after: Pose, camera: Camera, depth_m: float) -> Array:
-    """Pixels (2,) that what is seen at the image's centre moves between two camera poses."""
+    """Motion (2,) px of the image centre's point, at distance depth_m, between two poses."""
     point = before.apply(np.array([0.0, 0.0, depth_m]))
     start, _ = camera.project(before.inverse.apply(point))
     end, _ = camera.project(after.inverse.apply(point))

@@ -1,4 +1,4 @@
-"""A lens that zooms in flight: what it does to the picture, and the level that it reports.
+"""A zoom lens: its effect on the image, and the zoom level that the camera reports.
 
 Its focal length rises evenly with the level, which no table of a few points has exactly.
 """
@@ -27,7 +27,7 @@ _PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class Zooming:
-    """A change of the focal length, as a multiple of the shortest; CLOCK_MONOTONIC, ns."""
+    """A change of the focal length (multiples of the shortest) between two times."""
 
     before: float
     after: float
@@ -35,31 +35,31 @@ class Zooming:
     end_ns: int
 
     def at(self, time_ns: int) -> float:
-        """The multiple at a time."""
+        """Focal length at a time, as a multiple of the shortest."""
         span = [self.begin_ns, max(self.end_ns, self.begin_ns + 1)]
         return float(np.interp(time_ns, span, [self.before, self.after]))
 
 
 def level_of(factor: float) -> float:
-    """What CAMERA_SETTINGS says at a focal length, per cent of the range. factor: that focal
-    length, divided by the shortest one.
+    """Zoom level (per cent of the range) that CAMERA_SETTINGS reports at a focal length. factor:
+    focal length divided by the shortest one.
     """
     return 100.0 * (factor - 1.0) / (MOST - 1.0)
 
 
 class ZoomLens:
-    """Makes the picture of a longer lens from that of the shortest: its middle, as large."""
+    """Simulates a longer focal length: crops the middle of the image and enlarges it."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._zooming: Zooming | None = None
 
     def set(self, zooming: Zooming) -> None:
-        """What it does from now on."""
+        """Set the change of the focal length."""
         self._zooming = zooming
 
     def picture(self, image: Image, time_ns: int) -> Image:
-        """(H, W, 3) uint8 of an exposure; about the principal point, distortion and all."""
+        """The zoomed image (H, W, 3) uint8 of an exposure, enlarged about the principal point."""
         factor = 1.0 if self._zooming is None else self._zooming.at(time_ns)
         if factor == 1.0:
             return image
@@ -71,7 +71,7 @@ class ZoomLens:
 
 
 class ReportingCamera:
-    """A camera component of the vehicle that says its zoom level ten times a second."""
+    """A MAVLink camera component that reports its zoom level at 10 Hz."""
 
     def __init__(self, endpoint: str) -> None:
         self._link = mavutil.mavlink_connection(
@@ -83,7 +83,7 @@ class ReportingCamera:
         self._thread = threading.Thread(target=self._run, name="camera component", daemon=True)
 
     def set(self, zooming: Zooming) -> None:
-        """What it reports from now on."""
+        """Set the change of the focal length to report."""
         self._zooming = zooming
 
     def __enter__(self) -> ReportingCamera:

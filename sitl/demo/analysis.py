@@ -1,4 +1,4 @@
-"""From a flight's records to numbers: pure functions over arrays read from CSV."""
+"""Computes the errors of a flight from its records: pure functions over arrays read from CSV."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _CHI2_95 = 5.991  # of two degrees of freedom
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """Errors of every frame that the camera exposed in a span. Arrays (F,); NaN: no estimate.
+    """Pose errors of every frame exposed in a time span; arrays (F,), NaN without an estimate.
 
-    translation_m: 3-D; horizontal_m: its part in the plane, comparable with the EKF's.
-    processed: whether the localizer took the frame (or it was dropped for a newer one).
+    translation_m: 3-D; horizontal_m: comparable with the EKF's. processed: whether the localizer
+    processed the frame or dropped it for a newer one.
     """
 
     time_ns: np.ndarray
@@ -31,7 +31,7 @@ class FrameErrors:
 
 
 def frame_errors(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> FrameErrors:
-    """Match estimates to exposed frames by exposure time and measure them."""
+    """Errors of pose estimates, matched to true camera poses by exposure time."""
     inside = (truth["exposure_time_ns"] >= span_ns[0]) & (truth["exposure_time_ns"] <= span_ns[1])
     times = truth["exposure_time_ns"][inside]
     true_poses = [p for p, keep in zip(poses(truth), inside, strict=True) if keep]
@@ -51,7 +51,7 @@ def frame_errors(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -
 
 
 def localization_summary(errors: FrameErrors) -> LocalizationMetrics:
-    """The paper's columns over the frames that the localizer processed.
+    """Summarize the errors of the processed frames in the columns of the PiLoT paper.
 
     fps is localized frames per second of flight, not the throughput of the machine.
     """
@@ -73,7 +73,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Array) -> Spread:
-        """Of the finite values."""
+        """Computed from the finite values."""
         finite = np.asarray(values)[np.isfinite(values)]
         if not len(finite):
             return cls(None, None, None)
@@ -83,8 +83,8 @@ class Spread:
 def ekf_errors(
     vehicle: Columns, span_ns: tuple[int, int], shift_m: tuple[float, float, float] = (0, 0, 0)
 ) -> Array:
-    """Horizontal errors of the autopilot's position against the truth, or against where a map shows
-    the truth that is shifted east, north and up.
+    """Horizontal errors (N,) m of the EKF position against the truth. shift_m: offset of the map
+    from the world (east, north, up), added to the truth.
     """
     t = vehicle["time_ns"]
     inside = (t >= span_ns[0]) & (t <= span_ns[1])
@@ -97,8 +97,8 @@ def ekf_errors(
 
 @dataclass(frozen=True)
 class BoundFigures:
-    """How often a flight's fixes were as good as they said. inside_bound: per cent within their own
-    95 % ellipse; inside_level: per cent within their protection level; level_m: those levels.
+    """Share of fixes that were within their stated bounds. inside_bound: per cent within their 95 %
+    ellipse; inside_level: per cent within their protection level; level_m: the protection levels.
     """
 
     inside_bound: float | None
@@ -107,9 +107,10 @@ class BoundFigures:
 
 
 def bound_figures(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> BoundFigures:
-    """Of the accepted estimates in the span, by their horizontal errors; None without any. The
-    ellipse is that of the east and north sigmas that were reported. truth: in the map's ENU, m,
-    matched by exposure time. Fixes without a level do not count in inside_level.
+    """Check the horizontal errors of the accepted estimates in a time span against their stated
+    bounds: the 95 % ellipse of the reported sigmas, and the protection level.
+
+    truth: map ENU, m, matched by exposure time. None without estimates.
     """
     rows, found = _matched(truth, estimates, span_ns)
     if not len(rows):
@@ -154,7 +155,7 @@ def target_errors(
 
 
 def targets_inside(targets: Columns, truth_at: TruthAt, span_ns: tuple[int, int]) -> float | None:
-    """Per cent of the targets' fixes within their own horizontal 95 % ellipse; None without any."""
+    """Per cent of target positions within their horizontal 95 % ellipse; None without targets."""
     squared = []
     for name, truth in truth_at.items():
         rows, offsets = _target_offsets(targets, name, truth, span_ns)
@@ -186,7 +187,7 @@ def _target_offsets(
 
 
 def stage_latencies(estimates: Columns, span_ns: tuple[int, int]) -> dict[str, Spread]:
-    """Milliseconds of every stage within the span."""
+    """Latency of each processing stage within a time span, ms."""
     t = estimates["exposure_time_ns"]
     inside = (t >= span_ns[0]) & (t <= span_ns[1])
     names = [k for k in estimates if k.endswith("_ms")]

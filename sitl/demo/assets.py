@@ -1,7 +1,7 @@
-"""What a flight needs on disk: the world as surveyed and as it is today, and the caches of both.
+"""Files of a simulated flight: map cache (survey) and live cache (what the camera sees).
 
-By default what is flown over is another visit than the survey, with what changes between two visits
-and with a survey's own errors. The ideal world differs from its map by light, season and cars only.
+By default the live world has changed since the survey, and the survey has errors. The ideal world
+differs from its map by light, season and cars only.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PAINTED = 0.8  # of the time that a world takes, its two imports being the rest
 
 @dataclass(frozen=True)
 class FlightAssets:
-    """A world on disk. map_cache: what the companion gets; live_cache: what its camera sees."""
+    """A generated world. map_cache: the companion's map; live_cache: what the camera sees."""
 
     world: WorldInfo
     map_cache: Path
@@ -47,7 +47,7 @@ def _import(folder: Path, progress: Callable[[float], None], number: int) -> Non
 
 
 def default_folder() -> Path:
-    """Where worlds are kept: PILOT_CACHE, else the user's cache folder."""
+    """Folder of generated worlds: PILOT_CACHE, otherwise the user's cache folder."""
     base = os.environ.get("PILOT_CACHE")
     if base:
         return Path(base)
@@ -63,11 +63,11 @@ def prepare(
     character: Character = "mixed",
     satellite: SatelliteMap | None = None,
 ) -> FlightAssets:
-    """Build what is missing of a world, by the importer that users use; the rest is reused.
+    """Generate the world of a seed and import it as tile caches; existing parts are reused.
 
-    ideal: the map shares geometry and fine texture with what is flown over. satellite: the map is
-    such a mosaic of the survey instead. progress: told what is
-    being done and the share of it all that is done, 0 to 1; never where nothing is missing.
+    ideal: map and live world have the same geometry and texture. satellite: the map is a satellite
+    mosaic instead. progress: called with the step and the share done, 0 to 1; not called if nothing
+    is missing.
     """
     generation = _IDEAL_GENERATION if ideal else _GENERATION
     name = f"world-{generation}-{seed}-{size_m:.0f}"

@@ -1,4 +1,4 @@
-"""The errors of one flight, drawn from what its scenario allows: the report names every one."""
+"""Draws the calibration and map errors of one flight from the ranges in its scenario."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from sitl.demo.scenario import Scenario
 
 @dataclass(frozen=True)
 class FlightErrors:
-    """What is true of the aircraft and not in its deployment.
+    """True values that differ from the deployment file.
 
-    camera: the true intrinsics. lever_arm_m: the camera's true place, body axes (the deployment
-    says zero). map_shift_m: east, north, up of its true place that the map shows the ground.
+    camera: the true intrinsics. lever_arm_m: the camera's true position, body axes (the file says
+    zero). map_shift_m: offset of the map from the world (east, north, up).
     """
 
     camera: Camera
@@ -28,8 +28,8 @@ class FlightErrors:
 
 
 def draw_errors(scenario: Scenario, seed: int) -> FlightErrors:
-    """The errors of the flight of a seed. Each has a generator of its own: switching one off does
-    not change the others.
+    """Draw the errors of a flight from its scenario's standard deviations. Each error has its own
+    random generator, so that disabling one does not change the others.
     """
     spec, nominal = scenario.errors, scenario.camera.camera()
 

@@ -42,14 +42,14 @@ class Ports:
 
 
 def free_udp_port() -> int:
-    """A port that nobody listens on now."""
+    """A free local UDP port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def free_console_port() -> int | None:
-    """8080, or another that nobody listens on; None where the extra `console` is not installed."""
+    """A free TCP port (8080 if possible); None if the extra `console` is not installed."""
     if any(importlib.util.find_spec(name) is None for name in ("starlette", "uvicorn")):
         return None
     for port in (8080, 0):
@@ -60,8 +60,8 @@ def free_console_port() -> int | None:
 
 
 def answers(port: int, companion: subprocess.Popen[bytes]) -> bool:
-    """Wait until the companion's page can be opened; False where it cannot in half a minute, or the
-    companion has ended.
+    """Wait up to 30 s until the console at `port` answers; False if it does not or the companion
+    has ended.
     """
     end_s = time.monotonic() + _CONSOLE_START_S
     while time.monotonic() < end_s and companion.poll() is None:
@@ -81,7 +81,7 @@ def write_deployment(
     vehicle: VehicleProcess,
     ports: Ports,
 ) -> Path:
-    """The deployment file of this flight: what an operator would write by hand."""
+    """Write the flight's deployment file for `companion run`, as an operator would."""
     camera = scenario.camera.camera()
     config: dict[str, Any] = {
         "map": str(assets.map_cache.resolve()),
@@ -133,9 +133,9 @@ def _known_to(scenario: Scenario) -> dict[str, float]:
 def running_companion(
     config: Path, folder: Path, *options: str, program: Sequence[str] = THIS_PROGRAM
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """``companion run`` as a process; interrupted, as an operator would, at the end.
+    """Context manager: ``companion run`` as a process; interrupted (SIGINT) at the end.
 
-    program: the words before ``run``, of an installed companion or of what starts it.
+    program: the command line before ``run``.
     """
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "160"}
     with (folder / "companion.log").open("wb") as log:

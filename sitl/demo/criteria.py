@@ -1,4 +1,4 @@
-"""What a demo flight has to reach, and whether it did."""
+"""Pass criteria of the demo flight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MAX_LATENCY_MS = 250.0  # the oldest measurement that ArduPilot fuses; VISO_DEL
 
 @dataclass(frozen=True)
 class Criterion:
-    """One target: a value that must reach (`at_least`) or stay within a limit."""
+    """A measured value and its limit. at_least: the limit is a minimum, otherwise a maximum."""
 
     name: str
     value: float | None
@@ -24,7 +24,7 @@ class Criterion:
 
     @property
     def ok(self) -> bool:
-        """Whether it holds; a value that is not known does not."""
+        """Whether the criterion is met; an unknown value (None) is not."""
         if self.value is None:
             return False
         if self.at_least:
@@ -34,10 +34,10 @@ class Criterion:
 
 @dataclass(frozen=True)
 class FlightFigures:
-    """What is judged of a flight. ekf_m: horizontal, in the map's frame; fixed_m: 3-D errors of
-    targets that stand; inside, inside_level: per cent of fixes within their own 95 % bound, and
-    within their protection level; fixed_inside: per cent of the standing targets' fixes within
-    their own 95 % bound.
+    """Measured values of a flight that are judged. ekf_m: horizontal, in the map's frame; fixed_m:
+    3-D errors of stationary targets; inside, inside_level: per cent of fixes within their 95 %
+    bound, and within their protection level; fixed_inside: per cent of stationary targets'
+    positions within their 95 % bound.
     """
 
     localizer: LocalizationMetrics
@@ -49,8 +49,8 @@ class FlightFigures:
 
 
 def judge(flight: FlightFigures, *, satellite: bool = False) -> tuple[Criterion, ...]:
-    """The criteria of a flight. satellite: over a mosaic without buildings in its heights, where
-    positions are less accurate, and what counts is that every claimed error holds.
+    """Check a flight against the pass criteria. satellite: over satellite imagery without building
+    heights, positions are less accurate; the criteria then check the stated error bounds.
     """
     m = flight.localizer
     if satellite:
@@ -75,7 +75,7 @@ def judge(flight: FlightFigures, *, satellite: bool = False) -> tuple[Criterion,
 
 
 def headline(flight: FlightFigures, home_error_m: float, denied_s: float) -> str:
-    """What was won, in one line: before anything that was missed."""
+    """One-line result of a flight for the report."""
     m, p95 = flight.localizer, flight.ekf_m.p95
     median = m.median_translation_m
     said = [f"came home on vision alone after {denied_s:.0f} s, {home_error_m:.1f} m from home"]
@@ -88,8 +88,8 @@ def headline(flight: FlightFigures, home_error_m: float, denied_s: float) -> str
 
 @dataclass(frozen=True)
 class ComputingRates:
-    """How fast a flight was computed. sent_hz, wanted_hz: the world camera's pictures a second;
-    taken: share of them that the localizer took; latency_ms: p95 from exposure to estimate.
+    """Computing speed of a flight. sent_hz, wanted_hz: real and configured frame rate; taken: share
+    of frames that the localizer processed; latency_ms: p95 from exposure to estimate.
     """
 
     sent_hz: float

@@ -1,8 +1,7 @@
-"""The demo flight: every process started, the mission flown on vision alone, records kept.
+"""Runs the demo flight: starts all processes, flies the mission without GNSS, keeps the records.
 
-Four processes, as on a real aircraft and its surroundings: the vehicle, the world camera, the
-companion (`companion run`), and this one, which plays the ground station. They share only MAVLink,
-the video stream, and detections.
+Four processes, as on a real aircraft: vehicle, world camera, companion (`companion run`), and this
+one as the ground station. They share only MAVLink, the video stream, and detections.
 """
 
 from __future__ import annotations
@@ -54,11 +53,10 @@ from sitl.vehicles.launch import (
 
 @dataclass(frozen=True)
 class DemoRecord:
-    """What a flight left behind. denied_ns: from GNSS off to the end of the mission. errors: what
-    was drawn; gimbal_alignment_deg: roll, pitch, yaw that the gimbal does not report. broken: why
-    the flight was not flown to its end, None where it was; denied_ns then ends where it broke off,
-    and begins where the companion was started if GNSS was never switched off. load: of the
-    computer, one minute's mean, at the end.
+    """Records of a flight. denied_ns: span from GNSS off to the end of the mission, or to the
+    abort. errors: calibration and map errors drawn; gimbal_alignment_deg: unreported roll, pitch,
+    yaw. broken: why the flight was aborted, otherwise None. load: mean load of the computer in the
+    last minute.
     """
 
     folder: Path
@@ -76,9 +74,9 @@ class DemoRecord:
 
 @dataclass(frozen=True)
 class Onlookers:
-    """Who watches a flight. progress: told its phase and the share of it that is done; connectable:
-    told where a ground station may connect to the vehicle ("tcp:HOST:PORT"); console: port of the
-    operator's page, if there is to be one; watchable: told its address once it can be opened.
+    """Callbacks that report a flight's progress. progress: (phase, share done); connectable:
+    address for a ground station ("tcp:HOST:PORT"); console: port of the console, if wanted;
+    watchable: its address once it answers.
     """
 
     progress: Progress = lambda _phase, _share: None
@@ -96,9 +94,9 @@ def fly(
     onlookers: Onlookers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
 ) -> DemoRecord:
-    """Fly the scenario; `folder` receives every record. program: the companion that flies.
+    """Fly a scenario without GNSS; `folder` receives all records, also of an aborted flight.
 
-    A flight that breaks off leaves its record, too: what was flown until then tells why.
+    program: command of the companion.
     """
     onlookers = onlookers or Onlookers()
     progress = onlookers.progress
@@ -164,7 +162,7 @@ def fly(
 
 
 def home_of(assets: FlightAssets) -> Location:
-    """The world's centre, on the ground, AMSL."""
+    """Home position: the centre of the world on the ground, altitude AMSL."""
     world = assets.world
     position = world.frame.position([0.0, 0.0, float(world.ground_height(0.0, 0.0))])
     altitude = position.height_m - world.geoid_separation_m
@@ -172,7 +170,7 @@ def home_of(assets: FlightAssets) -> Location:
 
 
 def vehicle_parameters(scenario: Scenario) -> dict[str, float]:
-    """The autopilot's parameters for what the companion sends."""
+    """Autopilot parameters for the injection message of the scenario."""
     delay_ms = scenario.injection_delay_ms
     if scenario.injection == "gps_input":
         injection = gps_input_parameters(delay_ms=delay_ms)
@@ -183,9 +181,7 @@ def vehicle_parameters(scenario: Scenario) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class FilmedFlight:
-    """What the world camera of a flight sees, and where it sends it. targets: what the detector
-    watches.
-    """
+    """Scene and output ports of a flight's world camera. targets: reported by the detector."""
 
     assets: FlightAssets
     scenario: Scenario
@@ -196,7 +192,7 @@ class FilmedFlight:
 
 
 def camera_config(flight: FilmedFlight, folder: Path) -> WorldCameraConfig:
-    """The world camera of a flight; its frames' true poses go to ``frames.csv`` in the folder."""
+    """Configuration of a flight's world camera; true poses go to ``frames.csv`` in `folder`."""
     assets, look = flight.assets, np.random.default_rng([flight.seed, 11])
     errors = draw_errors(flight.scenario, flight.seed)
     return WorldCameraConfig(

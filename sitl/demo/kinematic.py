@@ -1,4 +1,4 @@
-"""A scenario's path flown without dynamics: for sequences that need no vehicle."""
+"""Flies a scenario's path without dynamics, for sequences that need no vehicle."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ _ACCELERATION = 2.5  # m/s²
 
 
 def camera_path(scenario: Scenario, ground_m: float) -> Iterator[tuple[int, Pose]]:
-    """(time in ns, world_from_camera) every 20 ms along the legs; `ground_m` is home's ENU height.
+    """Camera poses (time ns, world_from_camera) every 20 ms along the scenario's legs, with a stop
+    and a turn at each corner.
 
-    The vehicle brakes to a stop at each corner, turns its nose to the next one and goes on.
+    ground_m: home's ENU height.
     """
     position = np.array([0.0, 0.0, ground_m + scenario.takeoff_height_m])
     first = scenario.legs[0]
@@ -53,7 +54,7 @@ def camera_path(scenario: Scenario, ground_m: float) -> Iterator[tuple[int, Pose
 
 
 def record_scenario(assets: FlightAssets, scenario: Scenario, seed: int, out: Path) -> int:
-    """Render the path as today's world shows itself; returns the number of frames."""
+    """Render the scenario's path as an evaluation sequence; returns the number of frames."""
     cache, live = TileCache.open(assets.map_cache), TileCache.open(assets.live_cache)
     map_from_world = cache.frame.ecef_from_enu.inverse @ assets.world.frame.ecef_from_enu
     ground_m = float(assets.world.ground_height(0.0, 0.0))

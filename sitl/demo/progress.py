@@ -1,4 +1,4 @@
-"""How far a flight or the making of its world is: a bar on a terminal, lines in a log."""
+"""Progress of a flight or of world generation: a bar on a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LogProgress:
 
 @contextmanager
 def shown_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """A progress callback (phase, share done) for what the console is."""
+    """Context manager: a progress callback (phase, share done) that prints to `console`."""
     if not console.is_terminal:
         yield LogProgress(console)
         return

@@ -1,4 +1,4 @@
-"""A flight's figures: report.json and frames_report.csv, from which its page is drawn."""
+"""Figures of a flight: writes report.json and frames_report.csv, the data of the HTML report."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class _Tables:
 
 
 def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightReport:
-    """Measure the records and write report.json and frames_report.csv into their folder."""
+    """Compute a flight's figures and write report.json and frames_report.csv to its folder."""
     folder, span = record.folder, record.denied_ns
     tables = _Tables.read(folder)
     truth, estimates, targets, vehicle = (
@@ -245,7 +245,7 @@ def _cell(value: float) -> str:
 
 
 def print_report(report: FlightReport, folder: Path) -> None:
-    """What a flight came to: its criteria, what a miss means, and warnings."""
+    """Print the criteria, causes of failures, and warnings."""
     console = Console()
     if report.broken is None:
         console.print(f"[bold green]{report.won}[/]", highlight=False)

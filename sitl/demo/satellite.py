@@ -1,7 +1,7 @@
-"""A generated world as a satellite map shows it: a mosaic seen from aside, over bare terrain.
+"""Makes a satellite map of a generated world: oblique imagery over bare-earth terrain.
 
-Roofs lean away from their feet by their height times the tangent of the viewing angle, walls show
-on one side, the imagery is blurred and its contrast equalized, and the heights hold no buildings.
+Roofs are displaced by height times the tangent of the off-nadir angle, walls show on one side, the
+imagery is blurred and equalized, and the heights contain no buildings.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def build_satellite_map(
     out: Path,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> None:
-    """A tile cache at `out` from a mosaic of the cache `seen` and the world's bare terrain, by the
-    importer that users use. progress: told the share that is done.
+    """Import a satellite mosaic of the cache `seen` over the world's bare-earth terrain as a tile
+    cache at `out`. progress: called with the share done.
     """
     cache = TileCache.open(seen)
     zone = int((world.origin.longitude_deg + 180) // 6) + 1

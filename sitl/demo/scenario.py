@@ -1,4 +1,4 @@
-"""A flight's script as data: where, what is denied when, the legs, and the camera."""
+"""Demo scenario file: mission legs, camera, errors, weather, GNSS denial."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ DEMO_SCENARIOS = Path(__file__).parents[1] / "scenarios" / "demo"
 
 
 class ScenarioError(SimulationError):
-    """A scenario file that cannot be read or does not hold."""
+    """A scenario file that cannot be read or is invalid."""
 
 
 class ScenarioLeg(StrictModel):
     """A waypoint: metres east and north of home, height above home, and the gimbal's pitch on the
-    way there (-90 looks straight down).
+    leg to it (-90 is straight down).
     """
 
     east_m: float = Field(ge=-20_000, le=20_000)
@@ -38,8 +38,8 @@ class ScenarioLeg(StrictModel):
 
 
 class ErrorSpec(StrictModel):
-    """How wrong the deployment is about the aircraft: standard deviations (`map_shift_m`: least and
-    most) from which each flight draws. The defaults are what a careful calibration leaves.
+    """Differences between deployment file and aircraft: standard deviations (map_shift_m: least and
+    most) from which each flight draws. The defaults are the residuals of a careful calibration.
     """
 
     focal_percent: float = Field(0.1, ge=0, le=5, description="of the focal length")
@@ -61,7 +61,7 @@ class ErrorSpec(StrictModel):
 
     @classmethod
     def none(cls) -> ErrorSpec:
-        """A deployment that knows the aircraft exactly, and an eye that errs by a pixel."""
+        """No calibration or map errors, and a detector noise of one pixel."""
         return cls(
             focal_percent=0, principal_px=0, distortion=0, lever_arm_m=0, stamp_offset_ms=0,
             stamp_jitter_ms=0, readout_ms=0, map_shift_m=(0.0, 0.0), map_shift_up_m=0,
@@ -77,7 +77,7 @@ class ErrorSpec(StrictModel):
 
 
 class CameraSpec(StrictModel):
-    """The world camera's video. H.264 of this chroma format takes even sizes only."""
+    """The world camera's video. Width and height must be even (H.264 4:2:0)."""
 
     width: int = Field(640, ge=64, le=4096, multiple_of=2)
     height: int = Field(480, ge=64, le=4096, multiple_of=2)
@@ -100,7 +100,7 @@ class CameraSpec(StrictModel):
         return self
 
     def camera(self) -> Camera:
-        """The calibrated model."""
+        """The calibrated camera model."""
         ideal = Camera.from_fov(self.width, self.height, self.horizontal_fov_deg)
         return Camera(
             ideal.width, ideal.height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, self.distortion,
@@ -109,8 +109,8 @@ class CameraSpec(StrictModel):
 
 
 class SatelliteMap(StrictModel):
-    """A mosaic instead of the survey: seen from `azimuth_deg` (clockwise from north) at an angle
-    from nadir, over bare terrain.
+    """A satellite mosaic over bare-earth terrain as the map: off-nadir angle, and azimuth
+    (clockwise from north) of the viewing direction.
     """
 
     off_nadir_deg: float = Field(12.0, ge=0, le=45)
@@ -120,7 +120,7 @@ class SatelliteMap(StrictModel):
 
     @property
     def name(self) -> str:
-        """Of its cache's folder."""
+        """Name of its cache folder."""
         numbers = (self.off_nadir_deg, self.azimuth_deg, self.texel_m, self.blur_px)
         return "satellite-" + "-".join(f"{number:g}" for number in numbers)
 
@@ -136,7 +136,7 @@ _LEGS = (
 
 
 class Scenario(StrictModel):
-    """One GNSS-denied flight, by default as wrong and rough as a real one (`ideal` is neither)."""
+    """A flight without GNSS. The defaults have realistic errors; `ideal` has none."""
 
     takeoff_height_m: float = Field(120.0, gt=20, le=1000)
     deny_after_s: float = Field(
@@ -162,7 +162,7 @@ class Scenario(StrictModel):
     injection_delay_ms: float = Field(220.0, ge=0, le=250, description="VISO_DELAY_MS")
 
     def ideal(self) -> Scenario:
-        """The same flight with a perfect camera and a deployment that knows it."""
+        """The same flight with a perfect camera and an exact deployment file."""
         perfect = {
             "bit_rate_kbps": 4000, "packet_loss": 0.0, "readout_ms": 0.0, "vibration_deg": 0.0,
             "auto_exposure": False, "supersample": 1.0,
@@ -172,7 +172,7 @@ class Scenario(StrictModel):
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read a scenario file; unknown keys and bad values are named. `ScenarioError` holds them."""
+    """Read a scenario file. `ScenarioError` names unknown keys and invalid values."""
     try:
         return validated(Scenario, read_settings(path, ScenarioError))
     except SettingsError as error:
@@ -180,12 +180,12 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def scenario_names() -> tuple[str, ...]:
-    """The flights that are shipped."""
+    """Names of the scenarios in the package."""
     return tuple(sorted(path.stem for path in DEMO_SCENARIOS.glob("*.yaml")))
 
 
 def named_scenario(name: str) -> Scenario:
-    """A scenario by its file's path, or a shipped one by its name; `ScenarioError` if none is."""
+    """Load a scenario by path or by its name in the package; else `ScenarioError`."""
     shipped = DEMO_SCENARIOS / f"{name}.yaml"
     if shipped.exists() and not Path(name).exists():
         return load_scenario(shipped)
@@ -197,7 +197,7 @@ def named_scenario(name: str) -> Scenario:
 
 
 def check_inside(scenario: Scenario, size_m: float) -> None:
-    """ScenarioError for a leg that leaves the world, a square of `size_m` about home."""
+    """`ScenarioError` if a leg leaves the world, a square of side `size_m` about home."""
     for number, leg in enumerate(scenario.legs):
         if not max(abs(leg.east_m), abs(leg.north_m)) <= size_m / 2:
             raise ScenarioError(

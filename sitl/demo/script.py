@@ -1,4 +1,4 @@
-"""The ground station's script of a demo flight, from arming to the return."""
+"""Scripted ground station of the demo flight, from arming to the return."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ Progress = Callable[[str, float], None]
 
 
 class FlightError(SimulationError):
-    """A flight that could not be flown to its end; says which part failed and where its log is."""
+    """A flight that was aborted; names the part that failed and its log."""
 
 
 class FlightScript:
-    """The ground station's script, from arming to the return."""
+    """Scripted ground station, from arming to the return."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class FlightScript:
         """When GNSS went off, CLOCK_MONOTONIC; None before."""
 
     def fly(self) -> tuple[int, int]:
-        """Returns the span without GNSS up to the last waypoint, CLOCK_MONOTONIC ns."""
+        """Fly the mission; returns the span without GNSS to the last waypoint (CLOCK_MONOTONIC)."""
         pilot, scenario = self._pilot, self._scenario
         self._progress("starting the companion", 0.0)
         self.await_companion()
@@ -79,7 +79,7 @@ class FlightScript:
         return begin_ns, end_ns
 
     def distance_from_home(self) -> float:
-        """How far, horizontally and in truth, the vehicle is from where it took off."""
+        """True horizontal distance of the vehicle from its take-off position, m."""
         north, east, _ = self._home.ned_of(self._pilot.record.truth.location)
         return float(np.hypot(north, east))
 
@@ -115,8 +115,8 @@ class FlightScript:
         self._pilot.land(_LANDING_TIMEOUT_S)
 
     def await_companion(self) -> None:
-        """On the ground: its first start on a machine compiles for a minute or more. `FlightError`
-        if it takes longer than allowed.
+        """Wait on the ground until the companion localizes; the first start on a machine compiles
+        for a minute or more. `FlightError` after a timeout.
         """
         started = time.monotonic()
         while self._health() is None:
@@ -151,7 +151,7 @@ class FlightScript:
 
 
 def mission(scenario: Scenario, home: Location) -> list[MissionStep]:
-    """The legs as mission items: a gimbal command and a waypoint each."""
+    """Mission items of the scenario's legs: a gimbal command and a waypoint each."""
     steps = [speed_step(scenario.speed_m_s)]
     for leg in scenario.legs:
         place = home.offset(leg.north_m, leg.east_m, 0.0)

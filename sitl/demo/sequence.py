@@ -1,4 +1,4 @@
-"""Evaluation sequences without a flight: ``images/``, ``poses.txt``, ``camera.json``."""
+"""Writes evaluation sequences without a flight: ``images/``, ``poses.txt``, ``camera.json``."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def record_sequence(
     calibrated: Camera | None = None,
     stamped: Callable[[int], int] = lambda time_ns: time_ns,
 ) -> int:
-    """Writes the pictures at the given times; returns how many (times off the track have none).
+    """Render frames at the given times and write them with their true poses; returns their number.
 
-    calibrated: what the evaluation is told of the camera, where that is not the truth. frame: the
-    ENU frame of the track. ``images/timestamps.txt`` keeps the exposure times, as `stamped` by the
-    camera.
+    Times outside the track are left out. calibrated: camera model to write, if it differs from the
+    true one. frame: ENU frame of the track. stamped: time stamp of a true time, written to
+    ``images/timestamps.txt``.
     """
     images = out / "images"
     images.mkdir(parents=True, exist_ok=True)

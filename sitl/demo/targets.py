@@ -1,4 +1,4 @@
-"""What the simulated operator watches: three fixed points along the way, and every moving car."""
+"""Targets of the demo flight: three fixed points on its path, and every moving car."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FLATNESS_M = 0.1
 def observed_targets(
     assets: FlightAssets, scenario: Scenario, movers: tuple[Mover, ...]
 ) -> tuple[Observed, ...]:
-    """Named fixed points on today's surfaces that the flight passes, and the cars; map ENU."""
+    """Named fixed points on surfaces that the flight passes, and the cars; map ENU."""
     cars = tuple(m for m in movers if m.name.startswith("car"))
     return (*_fixed_points(assets, scenario), *cars)
 

@@ -1,4 +1,4 @@
-"""The aircraft: its parts, what is true of it and what it knows, in simulated time."""
+"""The simulated aircraft: physics, sensors and autopilot, in simulated time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _GUST_CORRELATION_S = 3.0
 
 
 class Aircraft:
-    """A quadrotor at `home` (AMSL), heading `heading_deg`, and the autopilot's parts in it.
+    """A quadrotor with its autopilot. home: AMSL.
 
     Above 200 lines: commands and telemetry read all of it, as ArduPilot's do of `copter`.
     """
@@ -80,23 +80,23 @@ class Aircraft:
 
     @property
     def angular_rate(self) -> Array:
-        """What the gyros read, rad/s (3,), body axes: mean of the last tick, biases included."""
+        """Gyro measurement, rad/s (3,), body axes: mean of the last tick, with bias."""
         return self._increment[0:3] / TICK_S
 
     @property
     def specific_force(self) -> Array:
-        """What the accelerometers read, m/s² (3,), body axes: mean of the last tick."""
+        """Accelerometer measurement, m/s² (3,), body axes: mean of the last tick."""
         return self._increment[3:6] / TICK_S
 
     # --- a tick ------------------------------------------------------------------------------
 
     def begin_tick(self) -> None:
-        """What the commands of this tick need to know."""
+        """Update what commands of this tick read."""
         simulated = self.parameters["GPS1_TYPE"] in GPS_SIMULATED
         self.injection.receiver_has_fix = simulated and self.gps_has_fix
 
     def step(self) -> None:
-        """10 ms: control, physics, sensors, estimator, gimbal."""
+        """Advance by 10 ms: control, physics, sensors, estimator, gimbal."""
         self.tick += 1
         target = self.modes.update(self.time_s)
         advance(
@@ -123,7 +123,7 @@ class Aircraft:
     # --- physics and sensors -----------------------------------------------------------------
 
     def wind(self) -> Array:
-        """Mean wind (from SIM_WIND_DIR) weakened near the ground, plus first-order gusts."""
+        """Wind (3,) NED m/s: mean (SIM_WIND_*), weaker near the ground, plus first-order gusts."""
         p = self.parameters
         keep = exp(-TICK_S / _GUST_CORRELATION_S)
         self._gust *= keep
@@ -136,7 +136,7 @@ class Aircraft:
         return wind
 
     def sense(self) -> None:
-        """Read the sensors that are due, and hand the filter what they gave."""
+        """Read the sensors that are due and pass the measurements to the EKF."""
         now = self.time_ms
         if self.tick == 1:
             self.estimator.align(self.sensors.compass(self.truth))
@@ -189,7 +189,7 @@ class Aircraft:
 
     @property
     def true_location(self) -> Location:
-        """Where the vehicle really is."""
+        """True position of the vehicle."""
         return self.launch.offset(*(float(c) for c in self.truth[0:3]))
 
     @property
@@ -202,7 +202,7 @@ class Aircraft:
 
     @property
     def gps_healthy(self) -> bool:
-        """Whether fixes come at 5 Hz or nearly so."""
+        """Whether fixes arrive at about 5 Hz or more."""
         if self.parameters["GPS1_TYPE"] in GPS_SIMULATED:
             return self.gps_has_fix
         return self.injection.gps_healthy(self.time_ms)

@@ -144,7 +144,7 @@ class Parameters:
 
 
 def type_of(name: str) -> int:
-    """MAV_PARAM_TYPE of a known parameter."""
+    """MAV_PARAM_TYPE of a parameter."""
     return _DEFAULTS[name][1]
 
 

@@ -1,4 +1,4 @@
-"""The whole vehicle: the aircraft and its MAVLink, in one thread and simulated time."""
+"""The complete simulated vehicle: aircraft and MAVLink in one thread, in simulated time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MAX_LAG_S = 0.25  # of wall time behind schedule after which the schedule start
 
 
 class EmbeddedVehicle:
-    """Has an aircraft stream, answer commands, and keep time."""
+    """Runs an aircraft with its telemetry and commands in simulated time."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class EmbeddedVehicle:
                 link.set_interval(message_id, 1.0 / hertz)
 
     def run(self) -> None:
-        """Run at SIM_SPEEDUP times real time until a reboot is ordered."""
+        """Run at SIM_SPEEDUP times real time until a reboot command."""
         schedule = time.monotonic()
         while not self.aircraft.reboot_ordered:
             self.step()

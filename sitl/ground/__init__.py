@@ -1,1 +1,1 @@
-"""The scripted ground station, and what it saw."""
+"""The scripted ground station and its records."""

@@ -1,4 +1,4 @@
-"""What the autopilot answers, put aside for whoever waits for it."""
+"""Passes the autopilot's answers to the threads that wait for them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sitl.ground.vehicle_record import from_autopilot
 
 
 class Answers:
-    """Boxes of messages: one thread takes them in, any thread waits for some kinds."""
+    """Message queues by type: one thread fills them, any thread waits."""
 
     def __init__(self) -> None:
         self._boxes: list[tuple[frozenset[str], queue.SimpleQueue[Any]]] = []
 
     def take(self, message: Any) -> None:
-        """Put a message of the autopilot into the boxes that want it."""
+        """Put a message into the queues of its type."""
         if from_autopilot(message):
             for kinds, box in self._boxes:
                 if message.get_type() in kinds:
@@ -25,7 +25,7 @@ class Answers:
 
     @contextlib.contextmanager
     def expect(self, *kinds: str) -> Iterator[queue.SimpleQueue[Any]]:
-        """A box that receives the autopilot's messages of some kinds from now on."""
+        """Context manager: a queue of the autopilot's messages of these types, from now on."""
         box: queue.SimpleQueue[Any] = queue.SimpleQueue()
         entry = (frozenset(kinds), box)
         self._boxes = [*self._boxes, entry]

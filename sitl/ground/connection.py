@@ -1,4 +1,4 @@
-"""The ground station's socket: opening, sending, receiving, its heartbeat."""
+"""Ground station socket: connect, send, receive, heartbeat."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ SYSTEM, COMPONENT = 255, 190  # of the ground station
 
 
 def silence(link: Any) -> None:
-    """A vehicle that closes its end is not printed, nor connected to again: who uses the link
-    notices, and says it in words of its own.
-    """
+    """Keep pymavlink from printing and reconnecting when the vehicle closes a TCP link."""
     link.handle_eof = link.handle_disconnect = lambda: None
 
 
@@ -34,7 +32,7 @@ class Connection:
         self._send_lock = threading.Lock()
 
     def open(self, deadline: float, alive: Callable[[], None]) -> None:
-        """Connect, trying again until time.monotonic() is the deadline. `PilotError` after it."""
+        """Connect, retrying until `deadline` (time.monotonic()); `PilotError` after it."""
         while self._link is None:
             alive()
             try:
@@ -55,13 +53,13 @@ class Connection:
         silence(self._link)
 
     def shut_down(self) -> None:
-        """End what the receiving thread waits for."""
+        """Wake and end the receiving thread."""
         if self._link is not None:
             with contextlib.suppress(OSError):  # the vehicle may have closed it
                 self._link.port.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Disconnect, once nobody receives any more."""
+        """Disconnect after the receiving thread has ended."""
         if self._link is not None:
             self._link.close()
 
@@ -71,7 +69,7 @@ class Connection:
             self._link.mav.send(message)
 
     def beat(self) -> None:
-        """Send the ground station's heartbeat, where there is somebody to hear it."""
+        """Send the ground station's heartbeat if the link is open."""
         with contextlib.suppress(OSError):
             self.send(
                 mavlink.MAVLink_heartbeat_message(
@@ -80,7 +78,7 @@ class Connection:
             )
 
     def receive(self) -> list[Any]:
-        """What has come, after waiting for up to 0.1 s."""
+        """Messages received, after waiting up to 0.1 s."""
         port = self._link.port
         if port.fileno() < 0 or not select.select([port], [], [], 0.1)[0]:
             return []

@@ -1,6 +1,6 @@
-"""The ground station's end of the link: reading, waiting, commands and parameters.
+"""Ground station link: commands, parameters, and waiting for conditions.
 
-One thread reads the vehicle's first serial port and stamps what it receives; the calls block until
+One thread reads the vehicle's first serial port and time-stamps what it receives. Calls block until
 the vehicle has answered.
 """
 
@@ -39,7 +39,7 @@ _TRIES = 80
 
 
 class GroundLink:
-    """A link to a vehicle at a MAVLink endpoint ("tcp:127.0.0.1:5760"), and the record of it.
+    """A link to a vehicle at a MAVLink endpoint ("tcp:127.0.0.1:5760"), with its record.
 
     answers: what the autopilot sends, for who waits for it.
     Seconds are simulated seconds, unless they are said to be wall time.
@@ -99,7 +99,7 @@ class GroundLink:
             )
 
     def sleep(self, seconds: float) -> None:
-        """Let simulated seconds pass."""
+        """Wait for simulated seconds."""
         self._wait(lambda: False, seconds)
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
@@ -142,7 +142,7 @@ class GroundLink:
         raise PilotError(f"the vehicle did not confirm {name} = {value:g}; does it know it?")
 
     def parameter(self, name: str, tries: int = _TRIES) -> float:
-        """Read a parameter, asking so many times: a vehicle does not answer for one it lacks."""
+        """Read a parameter, with `tries` requests; a vehicle does not answer for unknown ones."""
         with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(tries):
                 self.send(
@@ -187,7 +187,7 @@ class GroundLink:
             raise PilotError(f"command {number} was refused (MAV_RESULT {result}): {texts}")
 
     def try_command(self, number: int, *parameters: float) -> int | None:
-        """COMMAND_LONG; its MAV_RESULT, or None without an answer."""
+        """COMMAND_LONG; returns its MAV_RESULT, or None without an answer."""
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         with self.answers.expect("COMMAND_ACK") as box:
             for attempt in range(_TRIES):
@@ -205,7 +205,7 @@ class GroundLink:
         self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / hertz)
 
     def next_of(self, box: queue.SimpleQueue[Any], what: str) -> Any:
-        """The next message in a box of `answers`; PilotError where none comes during `what`."""
+        """The next message in a queue of `answers`; `PilotError` naming `what` after a timeout."""
         try:
             return box.get(timeout=_TRIES * _REPEAT_S)
         except queue.Empty:

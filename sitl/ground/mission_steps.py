@@ -27,7 +27,7 @@ def takeoff_step(height_m: float) -> MissionStep:
 def waypoint_step(
     latitude_deg: float, longitude_deg: float, height_m: float, hold_s: float = 0.0
 ) -> MissionStep:
-    """Fly to a place at a height above home."""
+    """Fly to a position at a height above home."""
     return MissionStep(
         mavlink.MAV_CMD_NAV_WAYPOINT,
         (hold_s, 0.0, 0.0, 0.0),

@@ -1,7 +1,7 @@
-"""The scripted ground station that flies either vehicle, and the record of what it truly did.
+"""Scripted ground station for either simulated vehicle, with a record of the true motion.
 
-The calls block until the vehicle has done, or refused, what was asked. Seconds are simulated
-seconds, truth and gimbal are looked up on CLOCK_MONOTONIC.
+Calls block until the vehicle has executed or refused the command. Seconds are simulated; true
+states and gimbal angles are looked up by CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 
 
 class Pilot:
-    """Flies a vehicle: `link` asks it, `record` is what it said, `missions` its stored mission.
+    """Flies a vehicle. link: commands; record: received data; missions: mission protocol.
 
     The arguments are those of `GroundLink`; as a context it is connected.
     """
@@ -51,7 +51,7 @@ class Pilot:
 
     @contextlib.contextmanager
     def fast_forward(self, speedup: float = 10.0) -> Iterator[None]:
-        """Run simulated time faster for a while (SIM_SPEEDUP), as for waiting on the ground."""
+        """Context manager: run simulated time faster (SIM_SPEEDUP), to wait on the ground."""
         normal = self.link.speedup
         self.link.set_speed(speedup)
         try:
@@ -79,7 +79,7 @@ class Pilot:
         )
 
     def set_mode(self, name: str) -> None:
-        """Change mode and wait until the heartbeat says so."""
+        """Change the mode and wait until the heartbeat reports it."""
         self.link.command(mavlink.MAV_CMD_DO_SET_MODE, 1, MODES[name])
         self.link.wait(lambda: self.record.mode == name, _SHOWN_S, f"mode {name}")
 
@@ -102,11 +102,11 @@ class Pilot:
         self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196.0 if force else 0.0)
 
     def reboot(self) -> None:
-        """Reboot the autopilot (disarmed); it is another vehicle's life then: connect anew."""
+        """Reboot the disarmed autopilot; afterwards connect anew."""
         self.link.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
 
     def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
-        """Take off in GUIDED and wait for the height (above the launch place, in truth)."""
+        """Take off in GUIDED and wait for the true height above the take-off position."""
         ground = self.record.truth.altitude_m
         self.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height_m)
         self.link.wait(
@@ -116,7 +116,7 @@ class Pilot:
         )
 
     def go_to(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
-        """Send the vehicle to a place at a height above home, in GUIDED; does not wait."""
+        """Send the vehicle to a position and height above home in GUIDED; does not wait."""
         self.link.send(
             mavlink.MAVLink_set_position_target_global_int_message(
                 0,
@@ -137,7 +137,7 @@ class Pilot:
         self.link.wait(lambda: not self.record.armed, timeout_s, "the landing")
 
     def gps(self, on: bool) -> None:
-        """Switch the simulated receiver."""
+        """Switch the simulated receiver on or off."""
         self.link.set_parameter("SIM_GPS1_ENABLE", 1.0 if on else 0.0)
 
     def use_source_set(self, number: int) -> None:
@@ -145,8 +145,8 @@ class Pilot:
         self.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
     def set_origin(self, origin: Location) -> None:
-        """Set the EKF origin (needed where there is no GNSS), and read back which one holds.
-        `PilotError` if the vehicle did not take one.
+        """Set the EKF origin (needed without GNSS) and read it back. `PilotError` if the vehicle
+        has none then.
         """
         self.link.send(
             mavlink.MAVLink_set_gps_global_origin_message(

@@ -1,4 +1,4 @@
-"""STATUSTEXT (253) as lines: what is longer than 50 characters comes in chunks under one id."""
+"""Assembles STATUSTEXT (253): texts longer than 50 characters come in chunks with one id."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class StatusText:
-    """A status text of any component, as far as its chunks have come."""
+    """A status text of any component, as far as its chunks have arrived."""
 
     time_ns: int
     severity: int
@@ -17,7 +17,7 @@ class StatusText:
 
 
 class TextLog:
-    """The lines in the order of their first chunks; one thread takes, any may read `lines`.
+    """Status texts in order of their first chunks; one thread fills it, any may read `lines`.
 
     A chunk that is missing leaves three dots. An id may be used again for another line.
     """

@@ -1,6 +1,6 @@
-"""What a vehicle did, as samples in time: true states, gimbal angles and EKF positions.
+"""Time series of a vehicle: true states, gimbal angles and EKF positions.
 
-Samples lie on CLOCK_MONOTONIC; seconds since boot are simulated seconds.
+Sample times are CLOCK_MONOTONIC; seconds since boot are simulated seconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CLOCK_WINDOW = 25  # samples over which the least latency is taken
 
 
 class TimedSample(Protocol):
-    """What lies at a time on CLOCK_MONOTONIC."""
+    """A sample with a time on CLOCK_MONOTONIC."""
 
     @property
     def time_ns(self) -> int:
@@ -71,7 +71,7 @@ class GimbalState:
 
     @property
     def yaw_in_vehicle_frame(self) -> bool:
-        """By the YAW_IN_* flags; where neither is set, by YAW_LOCK."""
+        """Whether the yaw is from the nose, by the YAW_IN_* flags or else by YAW_LOCK."""
         if self.flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME:
             return True
         if self.flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME:
@@ -97,19 +97,19 @@ class EkfSample:
 
     @property
     def location(self) -> Location | None:
-        """Where the EKF says the vehicle is."""
+        """The location that the EKF reports."""
         return self.origin.offset(*self.position_ned) if self.origin else None
 
 
 class LeastLatencyClock:
-    """Maps the vehicle's boot time to CLOCK_MONOTONIC by the least latency lately seen."""
+    """Converts the vehicle's boot time to CLOCK_MONOTONIC by the smallest recent latency."""
 
     def __init__(self, speedup: float) -> None:
         self._scale = 1e6 / speedup  # ns of wall time per ms of simulated time
         self._offsets: deque[float] = deque(maxlen=_CLOCK_WINDOW)
 
     def restart(self, speedup: float) -> None:
-        """Simulated time runs at another speed from now on."""
+        """Reset after a change of the speed of simulated time."""
         self._scale = 1e6 / speedup
         self._offsets.clear()
 
@@ -123,7 +123,7 @@ class LeastLatencyClock:
 
 
 class SampleTrack(Generic[_Sample]):
-    """Samples in time order, safe between one writer and many readers."""
+    """Samples in time order for one writing and many reading threads."""
 
     def __init__(self, limit: int) -> None:
         self._lock = threading.Lock()
@@ -132,7 +132,7 @@ class SampleTrack(Generic[_Sample]):
         self._limit = limit
 
     def add(self, sample: _Sample) -> None:
-        """Append a sample; it must carry `time_ns`, and be newer than the last."""
+        """Append a sample that is newer than the last."""
         with self._lock:
             if self._times and sample.time_ns <= self._times[-1]:
                 return
@@ -143,7 +143,7 @@ class SampleTrack(Generic[_Sample]):
                 del self._samples[: self._limit]
 
     def around(self, time_ns: int) -> tuple[_Sample, _Sample] | None:
-        """The samples before and after a time; None outside the track."""
+        """The samples before and after a time, for interpolation; None outside the track."""
         with self._lock:
             i = bisect.bisect_left(self._times, time_ns)
             if i == len(self._times) or (i == 0 and self._times[0] != time_ns):
@@ -163,13 +163,13 @@ class SampleTrack(Generic[_Sample]):
 
 
 def share(before_ns: int, after_ns: int, time_ns: int) -> float:
-    """How far a time lies between two others, 0 to 1."""
+    """Position of a time between two others as a fraction, 0 to 1."""
     return (time_ns - before_ns) / (after_ns - before_ns) if after_ns > before_ns else 0.0
 
 
 def slerp(a: Array, b: Array, t: float) -> Array:
-    """Between two unit quaternions that are close (20 ms apart): normalised linear is exact to
-    far below sensor noise.
+    """Interpolate two close unit quaternions (20 ms apart): normalised linear interpolation; its
+    error is far below sensor noise.
     """
     if float(a @ b) < 0:
         b = -b

@@ -1,4 +1,4 @@
-"""What the vehicle says of itself, kept: the state now, and the tracks since the connection."""
+"""Records what the vehicle reports: newest state, and time series since the connection."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _MODE_NAMES = {number: name for name, number in MODES.items()}
 
 
 def from_autopilot(message: Any) -> bool:
-    """Whether the vehicle's autopilot sent it, not another component."""
+    """Whether a message is from the vehicle's autopilot and not another component."""
     return bool(message.get_srcSystem() == VEHICLE and message.get_srcComponent() == AUTOPILOT)
 
 
 class VehicleRecord:
-    """Takes in a vehicle's messages on one thread; any thread may look things up.
+    """Stores a vehicle's messages; one thread writes, any thread reads.
 
     latest: the autopilot's newest message of each type; ekf_flags: EKF_STATUS_FLAGS; reached: the
     mission items, in order; origin: of the EKF; mode: None before the first heartbeat.
@@ -113,7 +113,7 @@ class VehicleRecord:
         return min(truth.time_ns, gimbal.time_ns) if truth and gimbal else None
 
     def ekf_pairs(self) -> Iterator[tuple[EkfSample, Location]]:
-        """Every position that the EKF reported, with where the vehicle truly was then."""
+        """Yield every reported EKF position with the true location at the same time."""
         # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
         truth = self._truth.all()
         times = np.array([t.boot_s for t in truth])
@@ -129,11 +129,11 @@ class VehicleRecord:
     # --- messages ----------------------------------------------------------------------------
 
     def restart_clock(self, speedup: float) -> None:
-        """Simulated time runs at another speed from now on."""
+        """Reset the clock after a change of the speed of simulated time."""
         self._clock.restart(speedup)
 
     def take(self, message: Any, received_ns: int) -> None:
-        """Take in what was received at a CLOCK_MONOTONIC time."""
+        """Store a message received at a CLOCK_MONOTONIC time."""
         kind = message.get_type()
         if kind == "STATUSTEXT":
             self._text_log.take(message, received_ns)

@@ -1,1 +1,1 @@
-"""A simulated operator who clicks at a car, and what comes of it."""
+"""A simulated operator who clicks a car to track, and the evaluation of the track."""

@@ -1,7 +1,6 @@
-"""A car to follow: a minute of road with two roofs over it that no map knows, and its pursuer.
+"""A car to follow, on a minute of road with two roofs that the map does not contain.
 
-Under each roof the car is out of sight for about two seconds. The aircraft keeps above and behind
-it, as a pilot would by eye.
+Under each roof the car is hidden for about two seconds. The aircraft stays above and behind it.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _OTHER_LANE_M = 4.4
 
 @dataclass(frozen=True)
 class Chase:
-    """The car and what hides it. begin_m: metres on its path where it is clicked at."""
+    """A car and the roofs that hide it. begin_m: path position at which it is clicked."""
 
     car: Mover
     roofs: tuple[Mover, ...]
@@ -36,11 +35,11 @@ class Chase:
 
     @property
     def movers(self) -> tuple[Mover, ...]:
-        """What is drawn besides the world and its traffic."""
+        """Objects to draw in addition to the world's traffic."""
         return (self.car, *self.roofs)
 
     def hidden_ns(self) -> tuple[tuple[int, int], ...]:
-        """When, on CLOCK_MONOTONIC, the car's middle is below each roof."""
+        """Time spans (CLOCK_MONOTONIC) in which the car's centre is below a roof."""
         half = 0.5 * _roof_length()
         spans = []
         for after_s in _ROOFS_AFTER_S:
@@ -50,15 +49,15 @@ class Chase:
         return tuple(spans)
 
     def begins_ns(self) -> int:
-        """When the car is where it is clicked at."""
+        """Time at which the car is clicked."""
         return self.car.epoch_ns + round((self.begin_m - self.car.phase_m) / SPEED_MPS * 1e9)
 
 
 def make_chase(
     world: WorldInfo, frame: LocalFrame, epoch_ns: int, lead_s: float, seed: int = 0
 ) -> Chase:
-    """The stretch of road nearest to home that is long enough; the car reaches it `lead_s` after
-    the epoch. frame: the map's ENU. ValueError if there is none.
+    """Choose the road nearest to home that is long enough; the car reaches it `lead_s` after
+    epoch_ns. frame: the map's ENU. ValueError if there is none.
     """
     needed = _ROOFS_AFTER_S[-1] * SPEED_MPS + 0.5 * _roof_length() + _AHEAD_M
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
@@ -89,7 +88,7 @@ def make_chase(
 
 
 def pursuit(car: Mover, time_ns: int, height_m: float, behind_m: float) -> Array:
-    """Where the aircraft should be, (3,) map ENU: above and behind the car."""
+    """Desired aircraft position (3,), map ENU: above and behind the car."""
     velocity = car.velocity_at(time_ns)
     ahead = velocity / max(float(np.linalg.norm(velocity)), 1e-9)
     place: Array = car.position_at(time_ns) - behind_m * ahead

@@ -1,4 +1,4 @@
-"""Flights that follow a car, one after the other: flown, judged, kept as JSON."""
+"""Flies and judges car-following flights one after the other; results are kept as JSON."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ FLIGHT = LoopCase(
 
 @dataclass(frozen=True)
 class FollowRow:
-    """One flight's outcome; error says why it could not be flown."""
+    """Result of one flight; error: why it could not be flown."""
 
     vehicle: VehicleKind
     seed: int
@@ -60,13 +60,13 @@ class FollowRow:
 
     @property
     def ok(self) -> bool:
-        """Whether it was flown and the car was followed."""
+        """Whether the flight was flown and the car was tracked."""
         return self.verdict is not None and self.verdict.is_followed
 
 
 def fly_follows(options: RunOptions, world: int) -> tuple[FollowRow, ...]:
-    """Fly along with the car of each seed; ``out/follow.json`` holds what was measured, from the
-    first flight on. world: the seed of the world.
+    """Fly a car-following flight for each seed; results are written to ``out/follow.json`` after
+    each. world: seed of the world.
     """
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[FollowRow] = []
@@ -102,7 +102,7 @@ def _flown(kind: VehicleKind, draw: int, options: RunOptions, seed: int) -> Foll
 
 
 def read_fixes(targets: Path, number: int) -> list[FollowedFix]:
-    """A clicked target's rows of ``targets.csv``."""
+    """Positions of one clicked target in ``targets.csv``."""
     table = read_columns(targets, ("target_id", "visibility"))
     rows = np.flatnonzero(np.asarray(table.get("target_id", [])) == clicked_name(number))
     return [_fix(table, int(k)) for k in rows]
@@ -121,7 +121,7 @@ def _fix(table: dict[str, np.ndarray], k: int) -> FollowedFix:
 
 
 def line_of(row: FollowRow) -> str:
-    """A flight in one line, what does not hold first."""
+    """One-line result of a flight, failures first."""
     head = f"{row.vehicle}, world {row.seed}, draw {row.draw}: "
     if row.verdict is None:
         return head + f"not flown: {row.error}"

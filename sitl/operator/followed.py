@@ -1,4 +1,4 @@
-"""Whether a car was followed: reported to the end, as itself, and found again after each roof."""
+"""Judges a target track: kept to the end, on the right car, and reacquired after each roof."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _SETTLED_S = 3.0  # after the click its motion is measured
 
 @dataclass(frozen=True)
 class FollowedFix:
-    """One report. position: (3,) m with its covariance, velocity: (3,) m/s or None, map ENU;
-    is_seen: found in its picture, not carried on by its motion.
+    """One reported target position (3,) m, map ENU, with covariance and velocity (3,) m/s or None.
+    is_seen: detected in its frame, not predicted.
     """
 
     time_ns: int
@@ -32,8 +32,8 @@ class FollowedFix:
 
 @dataclass(frozen=True)
 class FollowVerdict:
-    """Errors horizontal, of what was seen, settled, with the share inside their 95 % bound. back_s:
-    after each roof's end; foreign: reports as seen farther than 4 m from the car.
+    """Result of a target track. Errors: horizontal, of detected positions after settling. back_s:
+    time to reacquire after each roof; foreign: positions farther than 4 m from the car.
     """
 
     is_followed: bool
@@ -55,7 +55,7 @@ _CHI2_95 = 5.991  # of two degrees of freedom
 
 
 def follow_verdict(fixes: Sequence[FollowedFix], chase: Chase, end_ns: int) -> FollowVerdict:
-    """Judge one target's reports against the car of a chase, from the click until `end_ns`."""
+    """Compare one target's positions with the true car, from the click until `end_ns`."""
     begin_ns = chase.begins_ns()
     off = np.array([(f.position - chase.car.position_at(f.time_ns))[:2] for f in fixes])
     off = off.reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A flight that follows a car: the aircraft flies along, the operator clicks once and watches."""
+"""A flight that follows a car: the aircraft follows it, and the operator clicks it once."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class _FrameLog:
 
 
 class Pursuer:
-    """A `FlightParticipant`. camera: the true one; seed: of the car and of the operator's hand."""
+    """A `FlightParticipant` that follows a car. camera: the true one; seed: car and click."""
 
     def __init__(self, assets: FlightAssets, camera: Camera, height_m: float, seed: int) -> None:
         self._assets, self._camera, self._height_m = assets, camera, height_m
@@ -78,7 +78,7 @@ class Pursuer:
 
     @contextmanager
     def ride(self, cabin: ParticipantContext) -> Iterator[None]:
-        """Fly along and click while the flight goes on."""
+        """Context manager: follow the car and click it during the flight."""
         thread = threading.Thread(target=self._run, args=(cabin,), name="pursuer")
         thread.start()
         try:

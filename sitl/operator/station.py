@@ -1,6 +1,6 @@
-"""The operator's ground station: one MAVLink client on the vehicle's spare port.
+"""The operator's ground station: a MAVLink client on the vehicle's spare port.
 
-It sends the camera protocol's commands to component 100 and waits for their answers.
+It sends commands of the camera protocol to component 100 and waits for the answers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _TRIES = 4
 
 
 class Station:
-    """Sends and listens in its caller's thread; `run_until` passes the time."""
+    """Sends and receives in the caller's thread."""
 
     def __init__(self, endpoint: str, alive: Callable[[], None] = lambda: None) -> None:
         self._link = Connection(endpoint)
@@ -34,7 +34,7 @@ class Station:
         self._link.close()
 
     def run_until(self, done: Callable[[], bool], until_ns: int) -> bool:
-        """Listen until something holds, or a CLOCK_MONOTONIC time is reached: False."""
+        """Receive until `done` holds (True) or a CLOCK_MONOTONIC time is reached (False)."""
         while not done():
             now_ns = time.monotonic_ns()
             if now_ns >= until_ns:
@@ -48,7 +48,7 @@ class Station:
         return True
 
     def track(self, x: float, y: float) -> tuple[int | None, int]:
-        """MAV_CMD_CAMERA_TRACK_POINT at a place of the picture, 0 to 1, sent until it is answered:
+        """Send MAV_CMD_CAMERA_TRACK_POINT for an image point, 0 to 1, until it is answered. Returns
         (MAV_RESULT or None, the target's number).
         """
         command = mavlink.MAV_CMD_CAMERA_TRACK_POINT

@@ -1,1 +1,1 @@
-"""A planned mission, flown in simulation over the user's own map."""
+"""Fly a planned mission in simulation over the user's own map."""

@@ -1,4 +1,4 @@
-"""The missions of `companion.planning.mission`, as far as a rehearsal flies them."""
+"""Read missions of `companion.planning.mission` for a rehearsal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sitl.demo.scenario import ScenarioError
 
 
 def read_mission(path: Path) -> PlannedMission:
-    """Read a saved mission; ScenarioError says what is wrong with it, or cannot be rehearsed."""
+    """Read a saved mission. `ScenarioError` if it is invalid or cannot be rehearsed."""
     try:
         planned = saved.read_mission(path)
     except MissionFileError as error:

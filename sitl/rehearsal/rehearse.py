@@ -1,4 +1,4 @@
-"""A scenario and its assets from the user's cache, and from a mission that was planned over it."""
+"""Make a simulated flight of the user's map and mission."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LOWEST_M = 5.0  # of a leg
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """What is flown, and what of it the user should know. notes: sentences."""
+    """A simulated flight over the user's map. notes: limitations that the user should know."""
 
     assets: FlightAssets
     scenario: Scenario
@@ -36,7 +36,7 @@ class Rehearsal:
 
 
 def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Scenario) -> Rehearsal:
-    """The flight over `cache`; `live` is what the camera sees (none: the map itself).
+    """Prepare a flight over the tile cache `cache`. live: the cache that the camera sees, else it.
 
     The scenario's weather, camera and errors are kept; its legs are replaced by the mission's, or
     by a triangle about the map's middle.

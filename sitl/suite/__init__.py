@@ -1,5 +1,5 @@
-"""The scenario suite: what ArduPilot was measured to do, flown again with our bridge and judged.
+"""Scenario suite: flies the bridge with simulated fixes and checks measured behaviour of ArduPilot.
 
-A scenario file (`sitl/scenarios/NAME.yaml`) says what is fed, what goes wrong when, and what must
-come of it; `python -m sitl suite` flies all of them on either vehicle and prints one table.
+A scenario file (`sitl/scenarios/NAME.yaml`) gives the fixes, the faults in time, and the
+expectations. `python -m sitl suite` flies all of them on either vehicle and prints a table.
 """

@@ -1,4 +1,4 @@
-"""A scenario file as data: who injects what, the faults in time, and what must come of it."""
+"""Scenario file of the suite: injection, faults in time, expectations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
 class VehicleSpec(StrictModel):
-    """The vehicle's parameters: a named set and what differs from it.
+    """Parameters of the vehicle: a named set and changes to it.
 
     vision: EK3_SRC1 on external navigation, no receiver. gnss_then_vision: a receiver in source
     set 1, vision in set 2. gps_input: GPS_INPUT is the only receiver.
@@ -57,7 +57,7 @@ class VehicleSpec(StrictModel):
 
 
 class Flight(StrictModel):
-    """Where it flies. side_m 0 hovers; seconds None ends when the square is closed.
+    """Flight path: a square of side_m (0: hover). seconds None: until the square is closed.
 
     ground: never arms; `seconds` are spent on the ground.
     """
@@ -75,7 +75,7 @@ class Flight(StrictModel):
 
 
 class CaseEvent(StrictModel):
-    """Something that happens at_s seconds after the take-off height is reached.
+    """A fault or command, at_s seconds after the take-off height is reached.
 
     fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
     vehicle: parameters set by the ground station; ramp: parameters that go from one value to
@@ -102,7 +102,7 @@ class CaseEvent(StrictModel):
         return self
 
     def ramped(self, share: float, rng: np.random.Generator) -> dict[str, float]:
-        """The parameters of the ramp after a share of over_s."""
+        """The ramp's parameters at a share (0 to 1) of over_s."""
         due = {name: first + share * (last - first) for name, (first, last) in self.ramp.items()}
         return {
             name: value * float(rng.uniform(-1, 1)) if name in self.scattered else value
@@ -111,8 +111,8 @@ class CaseEvent(StrictModel):
 
 
 class GroundSetup(StrictModel):
-    """What is done before take-off. doctor: wrong parameters are found and mended by
-    `companion doctor --fix`; reboot: the autopilot starts anew while it is being injected.
+    """Steps before take-off. doctor: `companion doctor --fix` corrects wrong parameters; reboot:
+    the autopilot reboots during injection.
     """
 
     doctor: bool = False
@@ -120,8 +120,8 @@ class GroundSetup(StrictModel):
 
 
 class Case(StrictModel):
-    """One scenario. bridge: its configuration, without the connection; integrity_monitor: watches
-    what goes to it.
+    """One scenario. bridge: its configuration without the connection; integrity_monitor: checks the
+    fixes.
 
     ci: among the few that every test run flies on the embedded vehicle.
     """
@@ -140,7 +140,7 @@ class Case(StrictModel):
 
     @property
     def is_honest(self) -> bool:
-        """Whether the monitor watches, and has nothing to find."""
+        """Whether the monitor runs and no fault is injected, so that each alert is a false one."""
         f = self.fixes
         wrong = f.rotation_deg or f.yaw_error_deg or f.offset_north_m or f.silent or f.frozen
         watched = self.integrity_monitor.enabled and not self.flight.ground

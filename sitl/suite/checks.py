@@ -1,4 +1,4 @@
-"""Expectations of a scenario, held against its record; each says what it saw in any case."""
+"""Expectations of a scenario, checked against the flight's record."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FOREVER = math.inf
 
 @dataclass(frozen=True)
 class ExpectationResult:
-    """One expectation's outcome. better: the figure lies below the reference's band."""
+    """Result of one expectation. better: the error is below the reference's range."""
 
     ok: bool
     what: str
@@ -95,8 +95,8 @@ class MaxErrorExpectation(_Span):
 
 
 class JumpExpectation(_Expectation):
-    """The EKF's north error goes to north_m with the jump at at_s: it is there settled_s later and
-    for 2 s more, and never beyond by more than overshoot_m.
+    """After the jump at at_s the EKF's north error reaches north_m within settled_s, stays for 2 s,
+    and never overshoots by more than overshoot_m.
     """
 
     check: Literal["jump"]
@@ -190,7 +190,7 @@ class AlertExpectation(_Span):
 
 
 class ErrorAlertExpectation(_Span):
-    """Our bridge holds output at latest within_s after an EKF error beyond a limit began."""
+    """The bridge holds output at most within_s after the EKF error exceeds a limit."""
 
     check: Literal["alerted"]
     limit_m: float = Field(gt=0)
@@ -216,9 +216,7 @@ class ErrorAlertExpectation(_Span):
 
 
 class NoWarningExpectation(_Span):
-    """The vehicle says nothing of a severity that an operator would act on: no text contains any
-    of the words.
-    """
+    """No status text of the vehicle contains any of the words."""
 
     check: Literal["no_warning"]
     words: tuple[str, ...] = ("EKF variance", "Failsafe", "rror", "ailed", "litch", "nhealthy")
@@ -267,7 +265,7 @@ class MovementExpectation(_Span):
 
 
 class InjectionExpectation(_Span):
-    """How many messages our bridge injected within the span.
+    """Number of messages that the bridge injected within the span.
 
     at_least is for a vehicle in real time: one whose clock ran slow gave fewer fixes, and owes as
     many messages less.
@@ -295,7 +293,7 @@ class InjectionExpectation(_Span):
 
 
 class SourceSetExpectation(_Expectation):
-    """The EKF source set that the bridge holds active, at a time; by_s: reached by then."""
+    """The EKF source set that the bridge considers active, from from_s, reached at by_s."""
 
     check: Literal["source_set"]
     number: int

@@ -1,4 +1,4 @@
-"""`companion doctor --fix` on a vehicle whose parameters are wrong, as an operator runs it."""
+"""Runs `companion doctor --fix` on a simulated vehicle with wrong parameters."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _TIMEOUT_S = 180.0
 
 
 class DoctorError(SimulationError):
-    """`companion doctor` did not come to its end."""
+    """`companion doctor` failed."""
 
 
 def consult(config: BridgeConfig) -> Doctor:
-    """Examine, let `companion doctor --fix --yes` write, and examine again.
+    """Run the doctor, `companion doctor --fix --yes`, and the doctor again.
 
     The exit codes are those of the flight controller's part: a suite has neither map nor camera,
     which `companion doctor` finds missing as well.

@@ -1,4 +1,4 @@
-"""One scenario flown: vehicle, pilot, injector, the timeline of faults, and the record of it."""
+"""Flies one scenario: vehicle, pilot, injection of simulated fixes, faults, record."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ARMING_TRIES = 3
 
 
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
-    """Fly a scenario on a vehicle; SimulationError when it could not be flown at all."""
+    """Fly a scenario on a vehicle. `SimulationError` if it could not be flown."""
     with ExitStack() as stack:
         setup = VehicleSetup(parameters=case.vehicle.all_parameters(), seed=seed)
         vehicle = open_vehicle(kind, HOME, setup)
@@ -277,7 +277,7 @@ class _CaseFlight:
 
 
 def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:
-    """The least of (vehicle's seconds / seconds due) over spans of span_s; ticks: (due, vehicle's).
+    """Lowest ratio of simulated to real time over any span_s; ticks: (due, vehicle's) s.
 
     A vehicle's clock that runs back was rebooted, and is left out.
     """
@@ -292,7 +292,7 @@ def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> 
 
 
 def longest_stall(ticks: Sequence[tuple[float, float]], span_s: float = 1.0) -> float:
-    """The most seconds that a vehicle fell behind within span_s; ticks as for `slowest_pace`."""
+    """The largest delay (s) of simulated time within any span_s; ticks as for `slowest_pace`."""
     worst, first = 0.0, 0
     for due, own in ticks:
         while due - ticks[first][0] > span_s:
@@ -303,8 +303,8 @@ def longest_stall(ticks: Sequence[tuple[float, float]], span_s: float = 1.0) -> 
 
 
 def bridge_config(case: Case, connection: str) -> BridgeConfig:
-    """The scenario's bridge, on a connection: injecting, with home as its origin where there is no
-    receiver to give one.
+    """Bridge configuration of a scenario: injecting, with home as the EKF origin if there is no
+    receiver.
     """
     settings: dict[str, Any] = {"mode": "inject", **case.bridge}
     if not case.vehicle.receiver:

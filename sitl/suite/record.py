@@ -1,7 +1,7 @@
-"""What a flight of the suite leaves behind: plain lists, so that it can be stored and read again.
+"""Record of a flight of the suite: plain lists, stored as JSON.
 
-Seconds count from the take-off height reached (on the ground: from the start of injection), in
-simulated time.
+Seconds count from the moment when the take-off height is reached (on the ground: from the start of
+injection), in simulated time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Text:
-    """A STATUSTEXT. sender: "vehicle", or "bridge" for what our bridge told the operator."""
+    """A STATUSTEXT. sender: "vehicle" or "bridge"."""
 
     at_s: float
     sender: str
@@ -28,21 +28,21 @@ class Text:
 
     @property
     def alert(self) -> AlertId | None:
-        """The active alert of our bridge that it tells; None for others."""
+        """The bridge's active alert in this text; None for others."""
         read = values_of(self.text) if self.sender == "bridge" else None
         return None if read is None else read[0]
 
     @property
     def values(self) -> dict[str, str]:
-        """Of its alert, as shown."""
+        """Values of the alert, as shown."""
         read = values_of(self.text)
         return {} if read is None else read[1]
 
 
 @dataclass(frozen=True)
 class VehicleSample:
-    """The flight's state, ten times a second. north, east: true metres from home; vehicle_s: the
-    vehicle's own clock since its boot.
+    """State of the flight, sampled at 10 Hz. north, east: true metres from home; vehicle_s: seconds
+    since the vehicle's boot.
     """
 
     at_s: float
@@ -57,7 +57,7 @@ class VehicleSample:
 
 @dataclass(frozen=True)
 class Doctor:
-    """What `companion doctor` found wrong and what its `--fix` left, and the exit codes of both."""
+    """What `companion doctor` found wrong before and after `--fix`, and its exit codes."""
 
     found: tuple[str, ...]
     left: tuple[str, ...]
@@ -87,7 +87,7 @@ class CaseRecord:
 
     @property
     def starved(self) -> str:
-        """How far the vehicle was from real time, in words."""
+        """How far simulated time fell behind real time, as text."""
         return f"{self.pace:.2f} of real time over 10 s, {self.stall_s:.2f} s lost within a second"
 
     def horizontal(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
@@ -99,6 +99,6 @@ class CaseRecord:
         return np.array([n for t, n, _ in self.errors if from_s <= t <= to_s])
 
     def at(self, seconds: float) -> VehicleSample | None:
-        """The first sample at or after a time; the last one where there is none."""
+        """The first sample at or after a time, otherwise the last one."""
         later = [s for s in self.samples if s.at_s >= seconds]
         return later[0] if later else (self.samples[-1] if self.samples else None)

@@ -25,7 +25,7 @@ _COLUMNS = (
 
 
 def print_row(console: Console, row: ReportRow) -> None:
-    """One line as soon as a flight has landed."""
+    """Print one flight's result."""
     colour = _COLOURS[row.verdict]
     told = row.error.splitlines()[0] if row.error else "; ".join(_broken(row))
     line = f"[{colour}]{row.verdict:6}[/] {row.vehicle} {row.case.name} ({row.wall_s:.0f} s)"
@@ -33,7 +33,7 @@ def print_row(console: Console, row: ReportRow) -> None:
 
 
 def summary(rows: Iterable[ReportRow]) -> str:
-    """How many of what, and how often the monitor spoke where it had nothing to find."""
+    """Text: number of flights passed, and false alarms of the monitor."""
     rows = list(rows)
     verdicts = [row.verdict for row in rows]
     counts = (f"{verdicts.count(v)} {v}" for v in _COLOURS if v in verdicts)
@@ -46,7 +46,7 @@ def summary(rows: Iterable[ReportRow]) -> str:
 
 
 def write_report(rows: Sequence[ReportRow], folder: Path) -> None:
-    """suite.md and suite.json into a folder."""
+    """Write suite.md and suite.json into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "suite.md").write_text(markdown(rows), encoding="utf-8")
     text = json.dumps([_as_data(row) for row in rows], indent=1)
@@ -54,7 +54,7 @@ def write_report(rows: Sequence[ReportRow], folder: Path) -> None:
 
 
 def markdown(rows: Sequence[ReportRow]) -> str:
-    """The table for a document: EKF errors horizontal, median / p95 / max in metres."""
+    """Markdown table; EKF errors are horizontal: median / p95 / max in metres."""
     lines = [
         "| " + " | ".join(_COLUMNS) + " |",
         "|" + "---|" * len(_COLUMNS),

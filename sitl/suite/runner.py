@@ -1,4 +1,4 @@
-"""All scenarios, several flights side by side, each judged as it lands."""
+"""Flies all scenarios, several in parallel, and judges each at its end."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MONITORED = {spec.id for spec in INTEGRITY}
 
 @dataclass(frozen=True)
 class ReportRow:
-    """One line of the report. record: None where the flight could not be flown; error says why."""
+    """One row of the report. record: None if the flight could not be flown; error says why."""
 
     case: Case
     vehicle: VehicleKind
@@ -43,7 +43,7 @@ class ReportRow:
 
     @property
     def ok(self) -> bool:
-        """Whether it was flown and every expectation holds."""
+        """Whether the flight was flown and every expectation holds."""
         return not self.error and all(f.ok for f in self.findings)
 
     @property
@@ -57,20 +57,20 @@ class ReportRow:
 
     @property
     def slow(self) -> bool:
-        """Whether the machine could not keep the vehicle in real time, which costs accuracy."""
+        """Whether the machine could not run the vehicle in real time, which costs accuracy."""
         r = self.record
         return r is not None and (r.pace < PACE_LIMIT or r.stall_s > STALL_LIMIT_S)
 
     @property
     def guardian_lines(self) -> tuple[str, ...]:
-        """What the monitor told, with seconds; the bridge's own lines are others."""
+        """Alerts of the integrity monitor with their times, without the bridge's own."""
         texts = self.record.texts if self.record is not None else []
         its = [t for t in texts if t.alert in _MONITORED]
         return tuple(f"{t.at_s:.1f} s: {t.text}" for t in its)
 
     @property
     def reference(self) -> AccuracyExpectation | None:
-        """The figures to be reproduced, where the case has any."""
+        """The measured ArduPilot figures to compare with, if any."""
         return next((e for e in self.case.expect if isinstance(e, AccuracyExpectation)), None)
 
     @property
@@ -83,7 +83,7 @@ class ReportRow:
 
 
 def figures(errors: Array) -> Figures | None:
-    """Median, 95th percentile and maximum; None of nothing."""
+    """Median, 95th percentile and maximum; None for an empty array."""
     if not len(errors):
         return None
     median, p95, largest = (float(v) for v in (*np.percentile(errors, [50, 95]), errors.max()))
@@ -91,12 +91,12 @@ def figures(errors: Array) -> Figures | None:
 
 
 def judge(case: Case, record: CaseRecord) -> tuple[ExpectationResult, ...]:
-    """Every expectation of the case, held against the record."""
+    """Check every expectation of the scenario against the record."""
     return tuple(expectation.judge(record) for expectation in case.expect)
 
 
 def run_case(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
-    """Fly and judge one scenario; what goes wrong becomes the row's error."""
+    """Fly and judge one scenario; an error becomes the row's error."""
     start = time.monotonic()
     try:
         record = fly(case, kind, seed)
@@ -113,7 +113,7 @@ def run_suite(
     seed: int = 1,
     landed: Callable[[ReportRow], None] = lambda _row: None,
 ) -> list[ReportRow]:
-    """Fly all cases on all vehicles, `jobs` at a time; rows in the order of the cases.
+    """Fly all scenarios on all vehicles, `jobs` at a time; rows in the order of the cases.
 
     landed: called with every row as it comes.
     """
@@ -159,7 +159,7 @@ def _fly_in_worker(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
 
 
 def default_jobs() -> int:
-    """Twice the processors: a real-time flight, its bridge and its pilot take 0.3 of one."""
+    """Default number of parallel flights: twice the processors, as a flight uses 0.3 of one."""
     return 2 * (os.cpu_count() or 1)
 
 

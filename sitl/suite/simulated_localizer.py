@@ -1,6 +1,6 @@
-"""A localizer made of the simulator's truth: noise, rate, latency, and faults switched in flight.
+"""Simulated localizer: makes fixes from the truth, with noise, latency and faults.
 
-`BridgeFeed` gives its fixes to our bridge, through the bridge's public interface.
+`BridgeFeed` submits the fixes to the bridge through its public interface.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Vector = tuple[float, float, float]
 
 
 class FixModel(BaseModel):
-    """How the fixes differ from the truth, when they come, and what is wrong with them.
+    """Rate, noise, latency and faults of simulated fixes.
 
     velocity_sigma_mps: None where no velocity is measured. rotation_deg turns the whole vision
     frame (positions and yaw) about turns_about_m (north, east of home), yaw_error_deg the yaw
@@ -56,7 +56,7 @@ class FixModel(BaseModel):
 
 @dataclass(frozen=True)
 class Observation:
-    """One noisy look at the truth: NED metres from an origin, radians, m/s NED."""
+    """One noisy pose: NED metres from an origin, radians, m/s NED."""
 
     position_ned: Vector
     roll_pitch_yaw: Vector
@@ -64,20 +64,20 @@ class Observation:
 
 
 class Observer:
-    """Draws observations of the truth."""
+    """Draws noisy poses from the truth."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         self._lags = np.random.default_rng([seed, 1])
 
     def latency_s(self, model: FixModel) -> float:
-        """From an exposure to the hand-over of its fix, seconds."""
+        """Random latency from exposure to submission of a fix, seconds."""
         spread = model.latency_spread_ms
         drawn = self._lags.uniform(0.0, spread) if spread else 0.0
         return (model.latency_ms + drawn) * 1e-3
 
     def observe(self, truth: Truth, origin: Location, model: FixModel) -> Observation:
-        """What a localizer with the errors of `model` makes of the truth, about `origin`."""
+        """A noisy pose of `truth` about `origin`, with the errors of `model`."""
         draw = self._rng.standard_normal(9)
         position = np.array(origin.ned_of(truth.location)) + model.sigma_m * draw[0:3]
         position[0] += model.offset_north_m
@@ -95,7 +95,7 @@ class Observer:
 
 
 class FixSink(Protocol):
-    """Takes fixes: our bridge, or the monitor in front of it."""
+    """Receives fixes: the bridge, or the monitor in front of it."""
 
     def submit(self, fix: VisionFix) -> None:
         """One fix; never blocks."""
@@ -103,7 +103,7 @@ class FixSink(Protocol):
 
 
 class BridgeFeed:
-    """Submits fixes, in a thread and in real time, until it is closed.
+    """Submits fixes in a thread, in real time, until it is closed.
 
     home: the map's origin, altitude AMSL; geoid_m: the map's geoid separation there.
     """
@@ -129,7 +129,7 @@ class BridgeFeed:
         self._thread.start()
 
     def change(self, model: FixModel, *, reset: bool = False) -> None:
-        """Another model from now on; reset: its fixes have another reset count."""
+        """Use another model from now on. reset: increment the fixes' reset count."""
         with self._lock:
             self._model, self._resets = model, self._resets + reset
 

@@ -1,4 +1,4 @@
-"""Launcher of ArduPilot SITL: finds the arducopter binary, runs it in a folder of its own."""
+"""Starts ArduPilot SITL: finds the arducopter binary and runs it in its own folder."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _DEFAULTS = ("copter.parm", "Tools/autotest/default_params/copter.parm")
 
 
 class ArduPilotNotFoundError(VehicleProcessError):
-    """No arducopter binary, or no default parameters for it."""
+    """The arducopter binary or its default parameters were not found."""
 
 
 def find_arducopter() -> Path | None:
-    """The SITL binary: below ARDUPILOT_HOME, else on PATH; None when there is none."""
+    """Path of the SITL binary, below ARDUPILOT_HOME or on PATH; None if there is none."""
     home = os.environ.get("ARDUPILOT_HOME")
     if home:
         for relative in _BINARIES:

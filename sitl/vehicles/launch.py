@@ -1,4 +1,4 @@
-"""One way to open either vehicle, and the parameter sets that flights and tests need."""
+"""Starts either simulated vehicle, with parameter sets for flights and tests."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _CHECK_ALL_BUT_VISION = ((1 << 20) - 2) & ~(1 << 18)
 
 
 def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
-    """Start on GNSS (source set 1), switch to VISION_POSITION_ESTIMATE or ODOMETRY (set 2)."""
+    """Parameters: start on GNSS (source set 1), switch to vision messages (set 2)."""
     return {
         "VISO_TYPE": 1,
         "VISO_POS_M_NSE": sigma_m,
@@ -57,7 +57,7 @@ def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[
 
 
 def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
-    """No GNSS receiver at all; the origin must be sent. The smallest set that arms on vision."""
+    """Parameters without a GNSS receiver; the EKF origin must be sent."""
     return {
         "GPS1_TYPE": 0,
         "VISO_TYPE": 1,
@@ -68,7 +68,7 @@ def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> 
 
 
 def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
-    """Start on the simulated receiver; GPS_INPUT with gps_id 1 takes over when that goes."""
+    """Parameters: simulated receiver first; GPS_INPUT with gps_id 1 takes over when it fails."""
     return {
         "GPS2_TYPE": 14,
         "GPS2_DELAY_MS": delay_ms,
@@ -83,7 +83,7 @@ def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
 
 
 def gps_input_only_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
-    """GPS_INPUT with gps_id 0 is the only receiver; no velocity is sent."""
+    """Parameters: GPS_INPUT with gps_id 0 is the only receiver, without velocity."""
     return {
         "GPS1_TYPE": 14,
         "GPS1_DELAY_MS": delay_ms,
@@ -138,8 +138,8 @@ class EmbeddedSitl(VehicleProcess):
 
 @dataclass(frozen=True)
 class VehicleSetup:
-    """How a vehicle stands and runs. parameters: beside the vehicle's own; seed: of the embedded
-    vehicle, ArduPilot draws its own noise; log: where what it prints is kept.
+    """Start conditions of a vehicle. parameters: added to the defaults; seed: of the embedded
+    vehicle's noise; log: file for its output.
     """
 
     heading_deg: float = 0.0
@@ -154,7 +154,7 @@ def open_vehicle(
     home: Location,
     setup: VehicleSetup | None = None,
 ) -> VehicleProcess:
-    """A vehicle that is not started yet; "auto" is ArduPilot where its binary is found.
+    """Create a vehicle that is not started yet; "auto" is ArduPilot if its binary is found.
 
     home: altitude AMSL.
     """

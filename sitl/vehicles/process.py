@@ -1,4 +1,4 @@
-"""A simulated vehicle as a child process with TCP ports: what ArduPilot and the stand-in share."""
+"""A simulated vehicle as a child process with TCP ports: base of ArduPilot and embedded vehicle."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _Self = TypeVar("_Self", bound="VehicleProcess")
 
 
 class VehicleProcessError(SimulationError):
-    """A simulated vehicle that did not start, or died; says where its log is."""
+    """A simulated vehicle did not start or died; names its log."""
 
 
 class VehicleProcess(ABC):
@@ -66,7 +66,7 @@ class VehicleProcess(ABC):
 
     @abstractmethod
     def command(self, instance: int) -> list[str]:
-        """The command line of an instance; `PARAMETERS` lies in the folder in which it runs."""
+        """Command line of an instance; its folder contains the file `PARAMETERS`."""
 
     # --- where it listens --------------------------------------------------------------------
 
@@ -99,12 +99,12 @@ class VehicleProcess(ABC):
 
     @property
     def processes(self) -> tuple[subprocess.Popen[bytes], ...]:
-        """The vehicle's, and the one that ends it once we are gone."""
+        """The vehicle's process, and the one that ends it if this process dies."""
         return tuple(p for p in (self._process, self._lifeline) if p is not None)
 
     @property
     def boots(self) -> int:
-        """How often it has opened its ports since it was launched: once more after a reboot."""
+        """Number of boots since the launch."""
         # The log is watched, as a probing connection would take the port's only client slot.
         marker = f"SERIAL2 on TCP port {_port(self._instance, _SPARE_OFFSET)}"
         return self.log_tail(_WHOLE_LOG).count(marker)
@@ -140,8 +140,8 @@ class VehicleProcess(ABC):
         return fault
 
     def restart(self) -> None:
-        """End the vehicle and start it anew on the same ports, as after a power loss.
-        `VehicleProcessError` if it does not come back.
+        """Restart the vehicle on the same ports, as after a power loss. `VehicleProcessError` if it
+        does not start.
         """
         self._end()
         self._launch()
@@ -185,7 +185,7 @@ class VehicleProcess(ABC):
         return self._log or (self._folder or Path()) / "vehicle.log"
 
     def log_tail(self, characters: int = _LOG_TAIL) -> str:
-        """The end of what the process has printed."""
+        """The end of the process's output."""
         try:
             return self._log_path.read_text("utf-8", "replace")[-characters:]
         except FileNotFoundError:

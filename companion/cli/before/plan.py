@@ -44,9 +44,13 @@ def plan_command(
     pitch: Annotated[
         float, typer.Option(min=-90, max=0, help="gimbal pitch if the mission has none")
     ] = -75.0,
+    flown: Annotated[
+        Path | None, typer.Option(help="record of a flight of this mission: checks the forecast")
+    ] = None,
     alternatives: Annotated[bool, typer.Option(help="search alternatives for failing legs")] = True,
 ) -> None:
     """Forecast a mission over its map. Exit code 1: a leg fails, or not all was judged."""
+    from companion.planning import flown as check
     from companion.planning import page, pictures
     from companion.planning.judge import MissionLimits
     from companion.planning.mission import read_mission
@@ -65,6 +69,7 @@ def plan_command(
     deployment = load_config(config)
     planned = read_mission(mission)
     cache = TileCache.open(map_cache or deployment.map)
+    frames = None if flown is None else check.recorded_frames(flown, cache)
     made_folder(out, "--out")
     question = replace(
         Question(mission, conditions, MissionLimits(sigma)),
@@ -83,11 +88,15 @@ def plan_command(
     for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
         write_picture(out / name, rgb)
     page.write_page(plan, shown, out / "plan.html")
+    legs = () if frames is None else check.flown_legs(plan.verdicts, *frames)
     document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}
     (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
     _print("to be bridged", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
     _print("what would do instead", page.INSTEAD_HEADINGS, page.instead_rows(plan))
+    if legs:
+        _print("flown", check.FLOWN_HEADINGS, [leg.row for leg in legs])
+        Console().print(check.flown_words(legs), highlight=False, soft_wrap=True)
     for note in plan.notes:
         Console().print(escape(note), style="dim", soft_wrap=True, highlight=False)
     Console().print(f"{escape(page.verdict_words(plan))} {escape(str(out / 'plan.html'))}",

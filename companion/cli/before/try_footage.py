@@ -46,10 +46,12 @@ def try_command(
     Exit code 0: vision works there; 1: it does not, or there is no map.
     """
     from companion.recorded.footage import FootageOptions, read_footage
+    from companion.trial.deployment import refuse_edited
 
     for name in ("report.html", "trial.json", "frames.csv", "deployment.yaml"):
         refuse_input(report / name, "--report", footage, places, log, camera)
     made_folder(report, "--report")
+    refuse_edited(report / "deployment.yaml")
     console = Console(stderr=True)
     options = FootageOptions(report, frames, places, log, camera, fov, mount_pitch)
     with shown_count(console, "reading footage") as count:

@@ -14,7 +14,7 @@ GYRO_SETTLE_S = 25.0  # as measured on ArduPilot SITL
 
 @dataclass(frozen=True)
 class ArmingContext:
-    """What the checks look at."""
+    """Vehicle state that the pre-arm checks use."""
 
     time_s: float
     parameters: Parameters

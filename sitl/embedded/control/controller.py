@@ -36,7 +36,7 @@ _HEIGHT_P, _CLIMB_P, _CLIMB_I = 1.0, 4.0, 1.0
 def attitude_control(
     q: Array, gyro: Array, target: Array, integrator: Array, dt: float, motors: Array
 ) -> None:
-    """Motor thrusts (4,) N for a target attitude (quaternion) and total thrust, (5,), in place."""
+    """Write motor thrusts (4,) N for a target (5,): attitude quaternion and total thrust."""
     # Error quaternion conj(q) * target; its vector part is half the rotation vector.
     w, x, y, z = q[0], -q[1], -q[2], -q[3]
     a, b, c, d = target[0], target[1], target[2], target[3]
@@ -65,7 +65,7 @@ def attitude_control(
 
 
 def sqrt_controller(error: float, gain: float, limit: float) -> float:
-    """Speed towards a target: proportional near it, sqrt(2 a d) farther off (limit in m/s²)."""
+    """Target speed for a position error: proportional near it, sqrt(2 limit error) farther."""
     linear = limit / gain**2
     if abs(error) <= linear:
         return gain * error
@@ -85,7 +85,7 @@ class ControlLimits:
 
 @dataclass
 class Carrot:
-    """A target that moves along a straight leg with limited speed and acceleration."""
+    """A set point that moves along a straight leg with limited speed and acceleration."""
 
     start: Vector
     end: Vector
@@ -100,11 +100,11 @@ class Carrot:
 
     @property
     def arrived(self) -> bool:
-        """Whether the target itself has reached the leg's end."""
+        """Whether the set point is at the leg's end."""
         return self.position == self.end
 
     def move(self, vehicle: Vector, limits: ControlLimits, dt: float) -> None:
-        """Advance along the leg; it waits when the vehicle lags by more than its stopping way."""
+        """Advance the set point; wait if the vehicle lags by more than its stopping distance."""
         leg = tuple(e - s for s, e in zip(self.start, self.end, strict=True))
         length = sqrt(sum(c * c for c in leg))
         if length < 1e-3 or self._travelled >= length:
@@ -146,7 +146,7 @@ def _along(direction: tuple[float, ...], limits: ControlLimits) -> tuple[float, 
 
 
 class PositionController:
-    """Velocity and climb loops with integrators; yields attitude and thrust."""
+    """Velocity and climb controllers with integrators; output: attitude and thrust."""
 
     def __init__(self) -> None:
         self._integral = [0.0, 0.0, 0.0]  # m/s², NED
@@ -154,7 +154,7 @@ class PositionController:
         self.yaw_rad = 0.0
 
     def reset(self, yaw_rad: float) -> None:
-        """Forget all history and hold a heading."""
+        """Clear the integrators and hold a heading."""
         self._integral = [0.0, 0.0, 0.0]
         self._acceleration = [0.0, 0.0]
         self.yaw_rad = yaw_rad

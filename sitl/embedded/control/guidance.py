@@ -1,4 +1,4 @@
-"""How the vehicle moves: along a straight leg or straight down; and its heading."""
+"""Guidance: follow a straight leg, descend, hold a heading."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LAND_FINAL_HEIGHT = 10.0  # m; below it LAND_SPEED
 
 @dataclass
 class Guidance:
-    """What the vehicle is after, and the attitude and thrust that follow from it.
+    """Target of the vehicle, and the attitude and thrust that lead to it.
 
     returning: RTL's speed and heading hold. NED metres about the EKF origin, m/s, radians.
     """
@@ -69,7 +69,7 @@ class Guidance:
         self.yaw_target = self.yaw
 
     def fly(self, target: Vector) -> None:
-        """Follow a straight leg to NED metres about the origin, from where the last one stands."""
+        """Follow a straight leg to a target, NED metres, starting at the last set point."""
         old, here = self.carrot, self.estimator.position
         if old is not None and old.end == target:
             return
@@ -87,7 +87,7 @@ class Guidance:
             self.yaw_target = atan2(east, north)
 
     def arrived(self) -> bool:
-        """Whether the leg's end is reached, within the waypoint radius."""
+        """Whether the vehicle is within the waypoint radius of the leg's end."""
         if self.carrot is None:
             return True
         end = self.carrot.end
@@ -96,9 +96,9 @@ class Guidance:
         return self.carrot.arrived and gap < radius
 
     def steer(self, home_down: float, *, level_when_lost: bool) -> Array:
-        """Attitude quaternion and thrust (5,) that follow the carrot (or straight down), holding
-        the heading target. home_down: of home, NED metres; level_when_lost: stay
-        level without a position, and let the wind take the vehicle.
+        """Attitude quaternion and thrust (5,) that follow the set point (or descend) and hold the
+        heading target. home_down: of home, NED metres; level_when_lost: stay level without a
+        position and drift with the wind.
         """
         limits, position = self.limits, self.estimator.position
         if self.yaw_target is not None:

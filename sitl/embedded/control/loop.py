@@ -23,7 +23,7 @@ def advance(
     increment: Array,
     armed: bool,
 ) -> None:
-    """One 10 ms tick, everything in place.
+    """Advance attitude control, motors, rigid body, IMU and navigation by 10 ms, in place.
 
     x: true state (17,); output: nominal state at the present (16,), see `navigation`; target: (5,)
     attitude quaternion and total thrust in N; integrator: (3,) of the rate loop; wind: (3,) NED

@@ -31,7 +31,7 @@ SUPPORTED = NAVIGATION | {
 
 
 class Reply(Protocol):
-    """Where answers go: the link that asked."""
+    """Sends answers on the link that asked."""
 
     def send(self, message: Any) -> None:
         """Send one message."""
@@ -173,7 +173,7 @@ def _not_a_number(item: StoredMissionItem) -> int | None:
 
 
 def item_from(message: Any) -> StoredMissionItem:
-    """Of MISSION_ITEM_INT, COMMAND_INT (1e-7 degrees) or MISSION_ITEM (degrees)."""
+    """From MISSION_ITEM_INT, COMMAND_INT (1e-7 degrees) or MISSION_ITEM (degrees)."""
     scale = 1.0 if message.get_type() == "MISSION_ITEM" else 1e-7
     return StoredMissionItem(
         message.command,

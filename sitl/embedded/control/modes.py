@@ -1,4 +1,4 @@
-"""What the vehicle is doing: modes, the mission and the failsafe, as ArduCopter's."""
+"""ArduCopter's flight modes, mission execution and EKF failsafe."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sitl.geodesy import Location
 
 
 class RtlStage(Enum):
-    """Where a return to launch stands."""
+    """Stage of a return to launch."""
 
     CLIMB = "climb"
     RETURN = "return"
@@ -33,7 +33,7 @@ class RtlStage(Enum):
 
 @dataclass
 class FlightModes:
-    """What the vehicle is doing, and the attitude and thrust that follow from it.
+    """Flight mode logic: target, attitude and thrust of the active mode.
 
     Above 200 lines: a few lines for each mode, which share home, target and the way down.
     """
@@ -90,7 +90,7 @@ class FlightModes:
             self._begin_rtl()
 
     def arm(self) -> None:
-        """Arm; the caller has run the checks."""
+        """Arm; the caller has run the pre-arm checks."""
         self.armed = self.estimator.sources.armed = True
         self._armed_since = self._ground_since = self._time
         self._flying = False
@@ -158,7 +158,7 @@ class FlightModes:
 
     @property
     def target(self) -> Vector | None:
-        """Where the vehicle is headed, NED metres about the origin."""
+        """Target position, NED metres about the origin; None without one."""
         return self._guidance.carrot.end if self._guidance.carrot else None
 
     # --- every tick --------------------------------------------------------------------------
@@ -180,7 +180,7 @@ class FlightModes:
         return self._guidance.steer(self._home_ned()[2], level_when_lost=self.mode is Mode.LAND)
 
     def check_ekf(self) -> None:
-        """The 10 Hz checks of the filter, and the failsafe."""
+        """Run the EKF checks at 10 Hz, and the failsafe if they fail."""
         if self.ekf_check.fails(self._time) and self.armed:
             self.ekf_check.failsafe = True
             if not self.mode.needs_position or self.parameters["FS_EKF_ACTION"] == 0:

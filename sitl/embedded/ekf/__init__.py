@@ -1,1 +1,1 @@
-"""The navigation filter, as EKF3 behaves."""
+"""An EKF that behaves as ArduPilot's EKF3."""

@@ -1,7 +1,7 @@
-"""The filter's sources: which measurements are used, when aiding starts and ends, as in EKF3 4.7.
+"""Sensor source selection of the EKF, and start and end of aiding, as in EKF3 4.7.
 
-No aiding for 7 s (10 s with velocity) ends the position flag, 15 s ends aiding; a jump is taken at
-once only when announced.
+Without aiding for 7 s (10 s with velocity) the position flag ends; after 15 s aiding ends. A jump
+is accepted at once only if it is announced.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Aiding(IntEnum):
 
 
 class AidedFilter:
-    """Fuses what the active source set (1 to 3) names, into `gated`, once that is `aligned`.
+    """Fuses measurements of the active source set (1 to 3) into `gated`, after alignment.
 
     armed: whether the vehicle is. `notify(severity, text)` sends a STATUSTEXT.
     """
@@ -61,7 +61,7 @@ class AidedFilter:
         self._last_position_source = self._last_yaw_source = -1
 
     def set_origin(self, origin: Location) -> bool:
-        """Set the origin once; a second one is refused, silently, as EKF3 does."""
+        """Set the origin once; a second one is ignored without a message, as in EKF3."""
         if self.origin is not None:
             return False
         self.origin = origin
@@ -76,7 +76,7 @@ class AidedFilter:
         return True
 
     def fuse(self, measurement: Measurement) -> None:
-        """Use one measurement, if its source is the one that counts."""
+        """Fuse one measurement if its source is selected."""
         if isinstance(measurement, Baro):
             self._fuse_baro(measurement.height)
         elif isinstance(measurement, Compass):
@@ -100,7 +100,7 @@ class AidedFilter:
         return int(self._parameters[f"EK3_SRC{self.source_set}_{what}"])
 
     def check_sources(self) -> None:
-        """Note a change of source: position and yaw are reset to the new one."""
+        """After a change of the source set, reset position and yaw to the new source."""
         position, yaw = self.source("POSXY"), self.source("YAW")
         if position != self._last_position_source:
             self.gated.source_reset = self._last_position_source >= 0 and position != 0
@@ -110,7 +110,7 @@ class AidedFilter:
             self._last_yaw_source = yaw
 
     def check_gps(self, gps: GpsData) -> None:
-        """EKF3's checks of a receiver; the first good fix sets the origin."""
+        """EKF3's receiver checks; the first good fix sets the origin."""
         now = self.gated.now_ms
         if not gps.good or now - self.gated.clock.gps_received > 1000:
             self.gated.clock.gps_bad = now
@@ -127,7 +127,7 @@ class AidedFilter:
         self._tell(INFO, f"is using {source}")
 
     def update_aiding(self) -> None:
-        """End what has had no measurement for too long."""
+        """End aiding by sources that have timed out."""
         if self.aiding is not Aiding.ABSOLUTE:
             return
         now, clock = self.gated.now_ms, self.gated.clock

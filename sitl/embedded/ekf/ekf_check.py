@@ -1,4 +1,4 @@
-"""ArduCopter's ekf_check and gpsglitch_check: when the filter is not to be trusted any more."""
+"""ArduCopter's ekf_check and gpsglitch_check: detect a failed EKF."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WARNING_PERIOD_S = 30.0
 
 
 class EkfCheck:
-    """Watches the filter's variances and innovations; both checks are called at 10 Hz.
+    """Checks the EKF's variances and innovations; call both methods at 10 Hz.
 
     failsafe: set by whoever acts on a failure, cleared with a text when the filter is good again.
     """
@@ -32,7 +32,7 @@ class EkfCheck:
         self._glitching = False
 
     def fails(self, time_s: float) -> bool:
-        """Whether the filter has failed just now."""
+        """Whether the EKF has just failed."""
         limit = self._parameters["FS_EKF_THRESH"]
         if self._estimator.origin is None or limit <= 0:
             return False
@@ -55,7 +55,7 @@ class EkfCheck:
         return self._bad
 
     def watch_glitch(self) -> None:
-        """Tell when GNSS leaves the innovation gate, and when it returns."""
+        """Report when GNSS leaves the innovation gate and when it returns."""
         if self._estimator.gps_glitching is self._glitching:
             return
         self._glitching = not self._glitching

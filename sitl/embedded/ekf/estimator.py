@@ -46,7 +46,7 @@ class EkfFlags(IntFlag):
 
 
 class Estimator:
-    """The vehicle's navigation filter.
+    """The vehicle's EKF.
 
     output: the nominal state (16,) at the present, see `navigation`; sources: what it fuses.
     """
@@ -76,7 +76,7 @@ class Estimator:
         return self.sources.set_origin(origin)
 
     def add(self, measurement: Measurement, time_ms: int) -> None:
-        """Queue a measurement that was taken at time_ms (ms since boot)."""
+        """Queue a measurement taken at time_ms since boot."""
         if isinstance(measurement, GpsData):
             self.sources.check_gps(measurement)
         heapq.heappush(
@@ -85,8 +85,8 @@ class Estimator:
         )
 
     def add_external(self, fix: ExternalPosition, stamp_ms: int) -> bool:
-        """A companion's position with its corrected time stamp; False when it is dropped, as it
-        is over 50 Hz.
+        """Queue a companion's position with its corrected time stamp; False if it is dropped
+        because of the 50 Hz limit.
         """
         if not all(isfinite(c) for c in (*fix.position, fix.sigma)):
             return False
@@ -98,7 +98,7 @@ class Estimator:
         return True
 
     def add_external_velocity(self, velocity: ExternalVelocity, stamp_ms: int) -> None:
-        """A companion's velocity with its corrected time stamp."""
+        """Queue a companion's velocity with its corrected time stamp."""
         if not all(isfinite(c) for c in velocity.velocity):
             return
         if not self._spaced(stamp_ms - self._gated.clock.external_velocity_stamp):
@@ -127,12 +127,12 @@ class Estimator:
 
     @property
     def location(self) -> Location | None:
-        """Where the filter says the vehicle is; None without an origin."""
+        """Estimated location; None without an origin."""
         return self.origin.offset(*self.position) if self.origin else None
 
     @property
     def position_valid(self) -> bool:
-        """Whether a relative or absolute horizontal position is claimed."""
+        """Whether the flags claim a relative or absolute horizontal position."""
         since_ms = self._gated.now_ms - self._gated.clock.position_delta
         holds = self.sources.aiding is Aiding.ABSOLUTE and since_ms < _DELTA_FRESH_MS
         return self._is_absolute or holds
@@ -189,7 +189,7 @@ class Estimator:
     # --- one tick ----------------------------------------------------------------------------
 
     def update(self, increment: Array, now_ms: int) -> None:
-        """Take one 10 ms IMU increment: advance the horizon, fuse what is due, refresh output."""
+        """Process a 10 ms IMU increment: propagate, fuse what is due, update the output."""
         self._gated.now_ms = now_ms
         size = self._ring.shape[0]
         self._ring[(self._start + self._filled) % size] = increment

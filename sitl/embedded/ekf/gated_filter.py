@@ -1,7 +1,7 @@
-"""The filter's measurement side: gates, updates and resets, as EKF3 makes them.
+"""Measurement updates of the EKF with innovation gates and resets, as in EKF3.
 
-A measurement within its gate is fused; one outside is not, until a timeout has let the state be
-reset to it.
+A measurement inside its gate is fused. One outside is rejected until a timeout allows a reset to
+it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class TestRatios:
 
 @dataclass
 class FilterClock:
-    """When things last happened, in ms since boot; None is never."""
+    """Times of the last events, ms since boot; None: never."""
 
     position_pass: int = -1_000_000
     velocity_pass: int = -1_000_000
@@ -42,7 +42,7 @@ class FilterClock:
 
 
 class GatedFilter:
-    """State, covariance, and what may change them. Times are ms since boot.
+    """State and covariance with gated updates. Times are ms since boot.
 
     state: nominal state (16,), cov: (15, 15), see `navigation`, at the delayed time horizon;
     now_ms: the present. position_timeout, velocity_timeout: nothing was within its gate for so long
@@ -73,7 +73,7 @@ class GatedFilter:
         sigma: float,
         velocity: tuple[float, float] | None,
     ) -> None:
-        """North and east in metres; a reset instead, where the timeout allows one."""
+        """Fuse north and east (m); after a timeout, reset to them instead."""
         p = self.parameters
         innovation = [position[i] - float(self.state[nav.P + i]) for i in range(2)]
         variance = self.cov[6, 6] + self.cov[7, 7]
@@ -127,7 +127,7 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 3 + i, value - self.state[nav.V + i], sigma**2)
 
     def fuse_height(self, height: float, sigma: float) -> None:
-        """Metres above the origin, if within the gate."""
+        """Fuse a height above the origin (m) if it is inside the gate."""
         innovation = -height - float(self.state[nav.P + 2])
         variance = self.cov[8, 8] + sigma**2
         gate = max(0.01 * self.parameters["EK3_HGT_I_GATE"], 1.0) ** 2
@@ -136,7 +136,7 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 8, innovation, sigma**2)
 
     def fuse_yaw(self, yaw_rad: float, sigma: float) -> None:
-        """Heading, if within the gate."""
+        """Fuse a heading if it is inside the gate."""
         innovation = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
         variance = self.cov[2, 2] + sigma**2
         gate = max(0.01 * self.parameters["EK3_YAW_I_GATE"], 1.0) ** 2
@@ -152,7 +152,7 @@ class GatedFilter:
         nav.reset_error(self.cov, 2, 1, sigma**2)
 
     def reset_position(self, north: float, east: float, variance: float | None) -> None:
-        """Jump to a position; variance None keeps the covariance, as EKF3's announced reset."""
+        """Set the position; variance None keeps the covariance (EKF3's announced reset)."""
         self.source_reset = False
         self.state[nav.P : nav.P + 2] = (north, east)
         if variance is not None:
@@ -161,7 +161,7 @@ class GatedFilter:
             self.position_timeout = False
 
     def reset_velocity(self, horizontal: tuple[float, float], variance: float) -> None:
-        """Jump to a horizontal velocity, m/s."""
+        """Set the horizontal velocity, m/s."""
         self.state[nav.V : nav.V + 2] = horizontal
         nav.reset_error(self.cov, 3, 2, variance)
         self.velocity_timeout = False

@@ -1,4 +1,4 @@
-"""Positions from the companion (vision, odometry, GPS_INPUT), taken as ArduPilot takes them."""
+"""Positions from the companion (vision, odometry, GPS_INPUT), processed as ArduPilot does."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ExternalNavInput:
     # --- vision ------------------------------------------------------------------------------
 
     def healthy(self, now_ms: int) -> bool:
-        """Whether a vision message came in the last 300 ms."""
+        """Whether a vision message arrived in the last 300 ms."""
         return now_ms - self._last_vision_ms < _VISION_TIMEOUT_MS
 
     def vision(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
@@ -91,7 +91,7 @@ class ExternalNavInput:
             self._estimator.add_external_velocity(velocity, stamp)
 
     def position_delta(self, message: Any, now_ms: int) -> None:
-        """VISION_POSITION_DELTA: a velocity in body axes, dated by its arrival."""
+        """VISION_POSITION_DELTA: a velocity in body axes, with the arrival time."""
         p = self._parameters
         if p["VISO_TYPE"] == 0:
             return
@@ -136,12 +136,12 @@ class ExternalNavInput:
     # --- GPS_INPUT ---------------------------------------------------------------------------
 
     def gps_fix(self, now_ms: int) -> bool:
-        """Whether GPS_INPUT gives a 3D fix now."""
+        """Whether GPS_INPUT states a 3D fix now."""
         fresh = bool(self._gps_times) and now_ms - self._gps_times[-1] < _GPS_TIMEOUT_MS
         return fresh and self._gps_fix_type >= 3
 
     def gps_healthy(self, now_ms: int) -> bool:
-        """Whether the mean gap between fixes is at most 215 ms."""
+        """Whether the mean interval between fixes is at most 215 ms."""
         times = self._gps_times
         if len(times) < 3 or now_ms - times[-1] > 2 * _GPS_MAX_GAP_MS:
             return False

@@ -1,4 +1,4 @@
-"""What the filter is given, each at the time at which it was true."""
+"""Measurements for the EKF."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class GpsData:
-    """A GNSS solution for the filter. velocity: NED m/s; None where the receiver gives none."""
+    """A GNSS solution. velocity: NED m/s, None if the receiver has none."""
 
     latitude_deg: float
     longitude_deg: float
@@ -22,7 +22,7 @@ class GpsData:
 
     @property
     def good(self) -> bool:
-        """By the default thresholds of EKF3's GNSS checks (EK3_GPS_CHECK)."""
+        """Whether it passes the default thresholds of EK3_GPS_CHECK."""
         return (
             self.satellites >= 6
             and self.hdop <= 2.5
@@ -44,7 +44,7 @@ class ExternalPosition:
 
 @dataclass(frozen=True)
 class ExternalVelocity:
-    """A velocity from the companion: NED m/s. is_delta: as a change of the position."""
+    """A velocity from the companion, NED m/s. is_delta: derived from a position change."""
 
     velocity: tuple[float, float, float]
     sigma: float

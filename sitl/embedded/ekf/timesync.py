@@ -1,7 +1,7 @@
-"""Jitter removal for a remote sender's time stamps, as ArduPilot's JitterCorrection does it.
+"""Removes transport jitter from a sender's time stamps, as ArduPilot's JitterCorrection.
 
-The link's lag is taken as the least seen over 100 samples; a sample never lies in the future and
-at most 500 ms in the past. The least lag itself stays invisible: that is what VISO_DELAY_MS is for.
+The link's lag is the smallest over 100 samples. A sample is never in the future, and at most 500 ms
+in the past. The smallest lag cannot be measured; VISO_DELAY_MS compensates it.
 """
 
 from __future__ import annotations

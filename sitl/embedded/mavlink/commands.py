@@ -1,4 +1,4 @@
-"""What the vehicle does with each MAVLink message that is meant for it."""
+"""Handles MAVLink messages addressed to the vehicle."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FORCE_ARM = 21196.0
 
 
 class Commands:
-    """Dispatch of incoming messages and commands."""
+    """Dispatches incoming messages and commands."""
 
     def __init__(self, vehicle: Aircraft, telemetry: TelemetryBuilder) -> None:
         self._vehicle, self._telemetry = vehicle, telemetry

@@ -1,4 +1,4 @@
-"""What the handlers of messages share: their kinds, results, and places in messages."""
+"""Shared by the message handlers: types, results, and positions in messages."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ CommandHandler = Callable[[SerialPort, Any], int]
 def location_of(
     home: Location | None, frame: int, x: int, y: int, altitude: float
 ) -> Location | None:
-    """A place in a message's global frame (degrees * 1e7, m); None where the frame is no global one
-    or home, which relative altitudes are above, is not set.
+    """Location of a message's coordinates (degrees * 1e7, m) in a global MAV_FRAME. None for other
+    frames, or for a relative altitude without home.
     """
     if frame not in _GLOBAL_FRAMES or home is None:
         return None

@@ -1,4 +1,4 @@
-"""Commands and messages that say where to fly: origin, home, sources, mission, guided targets."""
+"""Navigation commands and messages: origin, home, source set, mission, guided targets."""
 
 from __future__ import annotations
 

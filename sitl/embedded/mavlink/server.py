@@ -1,8 +1,8 @@
-"""TCP links and MAVLink routing as ArduPilot's serial ports have them.
+"""TCP links and MAVLink routing as on ArduPilot's serial ports.
 
-Each port takes one client at a time. Messages of other components travel between links under
-ArduPilot's rules: a link is sent nothing until something was heard on it, addressed messages go
-where their target was heard, unknown message ids go nowhere.
+Each port accepts one client at a time. ArduPilot's routing rules apply: a link is sent nothing
+until something was received on it, addressed messages go to links on which their target was heard,
+unknown message ids are not forwarded.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SerialPort:
             self._mav.seq = (self._mav.seq + 1) % 256
 
     def forward(self, raw: bytes) -> None:
-        """Queue a frame of another component, as it came."""
+        """Queue a frame of another component unchanged."""
         if self.client is not None:
             self._queue(raw)
 
@@ -73,7 +73,7 @@ class SerialPort:
             self.due[message_id] = 0.0
 
     def due_messages(self, now_s: float) -> list[int]:
-        """Ids of streamed messages whose time has come, ATTITUDE before the truth it dates."""
+        """Ids of streamed messages that are due, ATTITUDE before the truth messages."""
         if self.client is None:
             return []
         ready = []
@@ -87,7 +87,7 @@ class SerialPort:
         return sorted(ready)
 
     def receive(self) -> list[Any]:
-        """All messages that have come in; accepts and drops clients as they come and go."""
+        """Receive all waiting messages; accepts new clients and drops closed ones."""
         if self.client is None:
             self._accept()
             return []
@@ -108,7 +108,7 @@ class SerialPort:
         return self._mav.parse_buffer(bytes(chunks)) or []
 
     def flush(self) -> None:
-        """Write what is queued, as far as the socket takes it."""
+        """Write the queue as far as the socket accepts it."""
         if self.client is None or not self._outgoing:
             return
         try:
@@ -155,7 +155,7 @@ class MavlinkServer:
             raise
 
     def poll(self) -> Iterator[tuple[SerialPort, Any]]:
-        """Messages for the autopilot, after routing; (link it came on, message)."""
+        """Yield (link, message) for the autopilot, after routing."""
         sockets = [link.client or link.listener for link in self.links]
         ready = set(select.select(sockets, [], [], 0.0)[0])
         for link in self.links:

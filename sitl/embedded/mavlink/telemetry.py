@@ -27,7 +27,7 @@ DEFAULT_STREAMS = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
 
 
 class TelemetryBuilder:
-    """Builds messages from the vehicle's present state.
+    """Builds telemetry messages from the vehicle's state.
 
     Above 200 lines: one short method for each of its messages, and their table.
     """
@@ -62,7 +62,7 @@ class TelemetryBuilder:
         return message_id in self._builders
 
     def message(self, message_id: int) -> Any | None:
-        """One message now; None while there is nothing to say."""
+        """Build one message now; None if it is not available."""
         builder = self._builders.get(message_id)
         return builder() if builder else None
 
@@ -78,7 +78,7 @@ class TelemetryBuilder:
                     link.send(built[message_id])
 
     def send(self, link: SerialPort, message_id: int) -> bool:
-        """Send one message on one link; False when there is none to send."""
+        """Send one message on one link; False if it is not available."""
         message = self.message(message_id)
         if message is not None:
             link.send(message)

@@ -1,1 +1,1 @@
-"""The rigid body, its sensors and its gimbal."""
+"""Rigid body, sensors and gimbal of the simulated vehicle."""

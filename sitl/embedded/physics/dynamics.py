@@ -33,7 +33,7 @@ POSITION, VELOCITY, ATTITUDE, RATES, THRUST, STATE_SIZE = 0, 3, 6, 10, 13, 17
 
 
 def initial_state(yaw_rad: float) -> Array:
-    """At rest on the ground at home, level, heading `yaw_rad`."""
+    """State (17,) at rest on the ground at home, level, with heading `yaw_rad`."""
     x = np.zeros(STATE_SIZE)
     x[ATTITUDE] = np.cos(yaw_rad / 2)
     x[ATTITUDE + 3] = np.sin(yaw_rad / 2)

@@ -22,7 +22,7 @@ _SLEW = radians(60.0)  # rad/s of the motors
 
 
 class GimbalMode(Enum):
-    """What the gimbal follows."""
+    """What the gimbal points at."""
 
     NEUTRAL = "neutral"
     ANGLE = "angle"
@@ -70,7 +70,7 @@ class Gimbal:
         return quaternion(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
     def reported(self, vehicle_roll_rad: float, vehicle_pitch_rad: float) -> Array:
-        """The quaternion that is sent: the true one of a brushless gimbal (type 7).
+        """The reported attitude quaternion (4,): the true one of a brushless gimbal (type 7).
 
         For a servo gimbal (type 1) ArduPilot sends the servo angles, from which the vehicle's lean
         is subtracted, under the same earth-frame flags.
@@ -101,7 +101,7 @@ class Gimbal:
             self._wanted_yaw = radians(yaw_deg)
 
     def rotate(self, pitch_rate_deg: float, yaw_rate_deg: float, *, yaw_locked: bool) -> None:
-        """Turn at a rate (degrees per second)."""
+        """Rotate at a rate (degrees per second)."""
         self.mode = GimbalMode.RATE
         self.yaw_locked = yaw_locked
         self._rates = (radians(pitch_rate_deg), radians(yaw_rate_deg))

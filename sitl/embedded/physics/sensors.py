@@ -1,7 +1,7 @@
 """Sensor models: IMU with bias and random walk, barometer, compass, GNSS receiver with lag.
 
-Levels are those of a good consumer autopilot, so that dead reckoning over a 5 s gap stays under a
-metre, as measured on ArduPilot SITL. Everything is drawn from one seeded generator.
+Noise levels are those of a good consumer autopilot: dead reckoning over a 5 s gap stays below one
+metre, as measured in ArduPilot SITL. One seeded random generator.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class GpsSample:
 
 
 class Jammer:
-    """What a jammed receiver puts out: no fix at first, then fixes that leap, with a wild claim.
+    """Output of a jammed receiver: first no fix, then jumping fixes with wrong accuracies.
 
     Rates and sizes are those of ArduPilot's SIM_GPS1_JAM.
     """
@@ -55,7 +55,7 @@ class Jammer:
         self._satellites, self._fix = 0, False
 
     def distort(self, clean: GpsSample) -> GpsSample:
-        """The sample that comes out instead of a clean one, `_GPS_PERIOD_S` after the last."""
+        """The jammed sample that replaces a clean one, `_GPS_PERIOD_S` after the last."""
         if clean.time_s < self._silent_until_s:
             return replace(clean, satellites=0, fix=False)
         rng = self._rng
@@ -128,7 +128,7 @@ class Sensors:
         lag_s: float = 0.1,
         accuracy_m: float = 0.5,
     ) -> GpsSample | None:
-        """The solution that arrives now, if one does; it is lag_s old and claims accuracy_m.
+        """The GNSS solution that arrives now, if any; it is lag_s old and states accuracy_m.
 
         glitch: (3,) NED metres added to its position.
         """

@@ -1,5 +1,5 @@
-"""Flights with the whole companion in the loop: world camera, video, engine, bridge, autopilot.
+"""Flights with the complete companion in the loop: world camera, video, engine, bridge, autopilot.
 
-A file in ``sitl/scenarios/loop`` says what goes wrong when, and what must come of it. The other
-scenarios of the suite feed the bridge with positions made of the truth; these feed it nothing.
+A file in ``sitl/scenarios/loop`` gives the faults in time and the expectations. The other scenarios
+of the suite use fixes made from the truth; these use rendered video.
 """

@@ -1,4 +1,4 @@
-"""A flight with the whole companion in the loop as data: the faults in time, and what must hold."""
+"""Scenario file of a flight with the complete companion: faults in time, and expectations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PITCH_DEG = -80.0
 
 
 class VideoFault(StrictModel):
-    """A fault of the picture for some seconds; see `PictureFault`."""
+    """A video fault of some seconds; see `PictureFault`."""
 
     kind: PictureFaultKind
     for_s: float = Field(gt=0, le=300)
@@ -32,19 +32,19 @@ class VideoFault(StrictModel):
 
     @property
     def fault(self) -> PictureFault:
-        """As the world camera takes it."""
+        """The fault for the world camera."""
         return PictureFault(self.kind, self.late_s)
 
 
 class Zoom(StrictModel):
-    """The lens goes to a multiple of its shortest focal length, in so many seconds."""
+    """A change of the focal length to a multiple of the shortest, over some seconds."""
 
     to: float = Field(ge=1.0, le=ZOOM_MOST)
     over_s: float = Field(2.0, ge=0, le=60)
 
 
 class Drag(StrictModel):
-    """A receiver's position that moves away from the true one, so fast, for so long; it stays."""
+    """GNSS spoofing: the reported position moves away for some seconds, then stays."""
 
     north_m_s: float = Field(0.0, ge=-10, le=10)
     east_m_s: float = Field(0.0, ge=-10, le=10)
@@ -52,23 +52,21 @@ class Drag(StrictModel):
 
 
 class Load(StrictModel):
-    """Other work on the companion's computer: processes that compute, for so long, all of them and
-    the companion on one processor.
-    """
+    """CPU load: `processes` busy processes run on one processor with the companion."""
 
     processes: int = Field(ge=1, le=32)
     for_s: float = Field(gt=0, le=300)
 
 
 class OperatorHint(StrictModel):
-    """The operator tells the companion where the vehicle is, off_north_m beside it."""
+    """The operator sends a position hint that is off_north_m from the true position."""
 
     radius_m: float = Field(gt=0, le=5000)
     off_north_m: float = Field(0.0, ge=-2000, le=2000)
 
 
 class LoopEvent(StrictModel):
-    """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
+    """A fault or command, at_s seconds after the recorded part began (and GNSS was denied).
 
     picture: a fault of the video. zoom: of the lens. kill: SIGKILL to the companion, started again
     restart_after_s later, or by its supervisor. hang: SIGSTOP to the flight process. start: of a
@@ -89,7 +87,7 @@ class LoopEvent(StrictModel):
 
 
 class DeploymentErrors(StrictModel):
-    """What the deployment has wrong from the start.
+    """Errors in the deployment file or the map from the start.
 
     map_shift_m: east, north, up of where the map shows the ground. gimbal_deg: roll, pitch, yaw
     that the gimbal does not report. focal: the calibration's focal length over the true one.
@@ -107,7 +105,7 @@ class DeploymentErrors(StrictModel):
 
 
 class Expectation(StrictModel):
-    """What must hold between the start and the end of the recorded part.
+    """Limits and alerts to check between start and end of the recorded part.
 
     told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
     monitor that stands) at latest so long after it began. never_modes: flight modes that must not
@@ -180,20 +178,20 @@ class LoopCase(StrictModel):
 
     @property
     def earns(self) -> bool:
-        """Whether injection is earned by the shadow score before GNSS is gone; else, where what is
-        wrong would not be flown at all, it is forced. A cold companion has nothing to compare.
+        """Whether the shadow check must pass before GNSS is denied. Otherwise injection is forced:
+        for errors that would fail the check, and for a companion that starts later.
         """
         return self.wrong == DeploymentErrors() and not self.cold
 
     @property
     def is_normal(self) -> bool:
-        """Whether nothing is wrong: whatever is told then is a false alarm."""
+        """Whether no fault is injected, so that each alert is a false one."""
         told = bool(self.zoom_points) and all(e.zoom is not None for e in self.timeline)
         return self.wrong == DeploymentErrors() and (not self.timeline or told) and not self.cold
 
     @property
     def scenario(self) -> Scenario:
-        """The demo's scenario that this flight begins with."""
+        """The demo scenario of this flight."""
         legs = tuple(
             ScenarioLeg(
                 east_m=east, north_m=north, height_m=self.height_m, gimbal_pitch_deg=_PITCH_DEG
@@ -214,7 +212,7 @@ class LoopCase(StrictModel):
 def load_loop_cases(
     names: Iterable[str] = (), folder: Path = LOOP_SCENARIOS
 ) -> tuple[LoopCase, ...]:
-    """All flights of a folder, or those named; ScenarioError names what is wrong with a file.
+    """Load all scenarios of a folder, or those named; `ScenarioError` for an invalid file.
 
     ``normal`` names all flights in which nothing is wrong.
     """

@@ -1,4 +1,4 @@
-"""The companion of a flight of the loop: started, killed, started again, and what it reports."""
+"""Controls the companion of a flight: start, kill, restart, health."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _FRESH_S = 2.0  # a health report that is written every second
 
 @dataclass(frozen=True)
 class Health:
-    """The newest ``health.json``: level and text, its age in seconds (infinite without one), names
-    of the monitor's findings that stand, localized frames per second, whose report it is, its
-    shadow score and whether that is ready, ids of active alerts.
+    """Contents of the newest ``health.json``. age_s: infinite without a file; findings: names of
+    active findings of the monitor; rate_hz: localized frames per second; shadow, ready: shadow
+    check; alerts: ids of active alerts.
     """
 
     level: str = "starting"
@@ -39,12 +39,12 @@ class Health:
 
     @property
     def is_tracking(self) -> bool:
-        """Whether all is well."""
+        """Whether the health is ok."""
         return self.level == "ok" and AlertId.TRACKING.value in self.alerts
 
 
 class LoopCompanion:
-    """`companion run` with one deployment file; each start has its log in a folder of its own.
+    """`companion run` with one deployment file; each start logs to its own folder.
 
     supervised: its supervisor is started, which starts it again when it is killed.
     """
@@ -67,7 +67,7 @@ class LoopCompanion:
         self._process = self._stack.enter_context(companion)
 
     def wait_up(self) -> None:
-        """Wait until it reports its health; FlightError when it does not."""
+        """Wait until it reports its health; `FlightError` after a timeout."""
         started = time.monotonic()
         while self.health().age_s > _FRESH_S:
             self.require()
@@ -78,7 +78,7 @@ class LoopCompanion:
             time.sleep(0.2)
 
     def kill(self) -> None:
-        """SIGKILL, and wait until it is gone; for a supervised one its supervisor waits."""
+        """SIGKILL, and wait for the end of the process. A supervised process is restarted."""
         if self._supervised:
             os.kill(self.health().pid, signal.SIGKILL)
         elif self._process is not None:
@@ -86,17 +86,17 @@ class LoopCompanion:
             self._process.wait()
 
     def hang(self) -> None:
-        """SIGSTOP to the process that flies: it is not dead, and does nothing."""
+        """SIGSTOP to the flight process, so that it hangs."""
         os.kill(self.health().pid, signal.SIGSTOP)
 
     def require(self) -> None:
-        """FlightError when it has ended by itself."""
+        """`FlightError` if the process has ended by itself."""
         code = None if self._process is None else self._process.poll()
         if code is not None:
             raise FlightError(f"the companion ended with code {code}: see {self._out}")
 
     def confine(self, processors: set[int]) -> None:
-        """Let all of its threads, and those to come, run on these processors only."""
+        """Set the CPU affinity of all its present and future threads."""
         if self._process is None:
             return
         for thread in Path(f"/proc/{self._process.pid}/task").glob("*"):

@@ -1,6 +1,6 @@
-"""What disturbs a flight from outside: a receiver that is dragged away, other work on the computer.
+"""External disturbances of a flight: GNSS spoofing, CPU load.
 
-Both end by themselves after their time, and with the flight.
+Both end after their time or with the flight.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ while time.monotonic() < end:
 
 
 class GnssDrag:
-    """Moves what the simulated receiver says, on and on."""
+    """Moves the simulated receiver's position away step by step (spoofing)."""
 
     def __init__(self, drag: Drag, link: GroundLink, home: Location, began_s: float) -> None:
         self._drag, self._link, self._began_s = drag, link, began_s
         self._cos = math.cos(math.radians(home.latitude_deg))
 
     def is_over(self, now_s: float) -> bool:
-        """Whether it stays where it is from now on."""
+        """Whether the offset has its final value."""
         return now_s - self._began_s > self._drag.for_s + 1.0
 
     def step(self, now_s: float) -> None:
-        """Set the error that is due."""
+        """Set the offset that is due now."""
         seconds = min(now_s - self._began_s, self._drag.for_s)
         north, east = self._drag.north_m_s * seconds, self._drag.east_m_s * seconds
         self._link.set_parameter("SIM_GPS1_GLTCH_X", north / _METRES_PER_DEGREE)
@@ -47,7 +47,7 @@ class GnssDrag:
 
 
 class OtherWork:
-    """Processes that take one processor from the companion, which is confined to it with them."""
+    """CPU load: confines the companion and busy processes to one processor."""
 
     def __init__(self, load: Load, companion: LoopCompanion) -> None:
         self._companion = companion
@@ -62,7 +62,7 @@ class OtherWork:
             os.sched_setaffinity(process.pid, one)
 
     def end(self) -> None:
-        """Give the processors back; harmless when done before."""
+        """End the load; harmless if it has ended."""
         for process in self._processes:
             process.kill()
             process.wait()

@@ -1,4 +1,4 @@
-"""One flight with the whole companion in the loop, with its faults, and the record of it."""
+"""Flies one scenario with the complete companion, its faults, and its record."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _POSITION_FRESH_S = 1.0  # LOCAL_POSITION_NED comes 25 times a second, while the
 
 @dataclass(frozen=True)
 class LoopAssets:
-    """The world that is flown, and the map that the companion gets where it is not that one's."""
+    """The world of a flight. wrong_map: a map of another world for the companion, if any."""
 
     world: FlightAssets
     wrong_map: Path | None = None
@@ -55,8 +55,8 @@ class LoopAssets:
 
 @dataclass(frozen=True)
 class ParticipantContext:
-    """What a passenger finds. frames: the world camera's log; movers: everything that moves, in
-    the map's ENU.
+    """The running flight for a `FlightParticipant`. frames: log of the world camera; movers: all
+    moving objects, map ENU.
     """
 
     vehicle: VehicleProcess
@@ -66,14 +66,14 @@ class ParticipantContext:
 
 
 class FlightParticipant(Protocol):
-    """Someone who takes part in a flight: an operator, or who flies it by hand."""
+    """Code that takes part in a flight: a simulated operator or pilot."""
 
     def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
-        """What is in the world besides its traffic, from that CLOCK_MONOTONIC time on."""
+        """Additional moving objects in the world; epoch_ns: CLOCK_MONOTONIC."""
         ...
 
     def ride(self, cabin: ParticipantContext) -> AbstractContextManager[None]:
-        """Entered when the recorded part begins, left at its end."""
+        """Context of the recorded part: entered at its start, left at its end."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""The map of a generated world that ends before the world does."""
+"""A map that covers only the inner part of a generated world."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _BEYOND_M = 50.0  # what may stick out of a tile's square (a tree that sticks ou
 
 
 def inner_map(whole: Path, reach_m: float) -> Path:
-    """The cache of a world's surveyed tiles within reach_m of its centre, east, west, north, south.
+    """Write a cache of the tiles within reach_m of the world's centre; returns its path.
 
     whole: the cache of all of them, beside their tileset's folder; the smaller one is made beside
     it, once. Coarse tiles that reach further are left out: nothing stands in for what is missing.

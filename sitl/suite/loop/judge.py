@@ -1,4 +1,4 @@
-"""What came of a flight: pure functions over its samples, held against what was expected."""
+"""Computes a flight's figures from its samples and checks the expectations."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _FALSE_M = 5.0
 
 @dataclass(frozen=True)
 class LoopSample:
-    """A moment of the recorded part, seconds since it began.
+    """State of the recorded part at a time, seconds since its start.
 
     error_m: the EKF's horizontal error, infinite while it reports no position. level, health: the
-    companion's health; age_s: of that report; findings: of its monitor, that stand; rate_hz:
+    companion's health; age_s: of that report; findings: active findings of its monitor; rate_hz:
     localized frames. mode: the autopilot's.
     """
 
@@ -43,13 +43,13 @@ class LoopSample:
 
     @property
     def is_told(self) -> bool:
-        """Whether the operator can see that something is wrong."""
+        """Whether the operator is shown that something is wrong."""
         return self.level != "ok" or self.age_s > _STALE_S or bool(self.findings)
 
 
 @dataclass(frozen=True)
 class LoopText:
-    """A status text and the MAVLink component that it came from."""
+    """A status text and the MAVLink component that sent it."""
 
     at_s: float
     component: int
@@ -58,22 +58,22 @@ class LoopText:
 
     @property
     def alert(self) -> AlertId | None:
-        """Of the companion, whether it began or ended; None for texts of the autopilot."""
+        """The companion's alert, raised or cleared; None for texts of the autopilot."""
         read = alert_of(self.text) if self.component != _AUTOPILOT else None
         return None if read is None else read[0]
 
     @property
     def is_warning(self) -> bool:
-        """Whether the companion says that something is wrong."""
+        """Whether it is a warning of the companion, or worse."""
         return self.component != _AUTOPILOT and self.severity <= _WARNING
 
 
 @dataclass(frozen=True)
 class RestartTimes:
-    """Seconds from the end of a companion to what came of the next; infinite: never.
+    """Seconds from the end of a companion until its successor works; infinite: never.
 
-    estimates_s, tracks_s: until its first accepted estimate was known, and the first one of a
-    tracker that tracks; injects_s: until its first position was sent to the autopilot.
+    estimates_s, tracks_s: until its first accepted estimate, and the first while tracking;
+    injects_s: until its first position was sent to the autopilot.
     """
 
     estimates_s: float
@@ -83,7 +83,7 @@ class RestartTimes:
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """What a flight left. fix_errors_m: horizontal, of every position that was injected.
+    """Record of a flight. fix_errors_m: horizontal, of every injected position.
 
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
     back: where the companion was killed or hung; None elsewhere. shadow: the health when the
@@ -101,10 +101,10 @@ class LoopRecord:
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """A flight in numbers, metres and seconds. max_error_m: of the EKF, horizontal, while it
-    reports a position (it reports none for blind_s); untold_s: see `untold_s`; false: injected
-    positions further off than 5 m, of `sent`, the worst max_fix_m; told_s: of health worse than ok
-    or a finding; rate_hz: median of localized frames.
+    """Figures of a flight, metres and seconds. max_error_m: of the EKF, horizontal, while it
+    reports a position (it reports none for blind_s); untold_s: see `untold_s`; false: of `sent`
+    injected positions, those with an error above 5 m, the largest max_fix_m; told_s: with an alert;
+    rate_hz: median of localized frames.
     """
 
     max_error_m: float
@@ -120,7 +120,7 @@ class LoopFigures:
 
 @dataclass(frozen=True)
 class Held:
-    """One expectation: what it is, whether it holds, and what was seen."""
+    """Result of one expectation: its text, whether it holds, and the observed value."""
 
     what: str
     ok: bool
@@ -128,7 +128,7 @@ class Held:
 
 
 def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
-    """The longest time that an error beyond `beyond_m` stood without being told, seconds."""
+    """The longest time (s) with an EKF error above beyond_m and no alert."""
     longest, begun = 0.0, None
     for sample in samples:
         if sample.error_m <= beyond_m or sample.is_told:
@@ -140,7 +140,7 @@ def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
 
 
 def figures(record: LoopRecord, beyond_m: float) -> LoopFigures:
-    """The flight's numbers."""
+    """Figures of a flight."""
     samples, fixes = record.samples, np.asarray(record.fix_errors_m)
     spans = [(s, after.at_s - s.at_s) for s, after in pairwise(samples)]
     known = [s.error_m for s in samples if math.isfinite(s.error_m)]
@@ -158,7 +158,7 @@ def figures(record: LoopRecord, beyond_m: float) -> LoopFigures:
 
 
 def false_alarms(record: LoopRecord, *, denied: bool = False) -> tuple[str, ...]:
-    """Everything that was told in a flight in which nothing was wrong, in order of time.
+    """All alerts of a flight without a fault, in order of time.
 
     denied: GNSS was switched off, and that it is lost is true.
     """
@@ -178,7 +178,7 @@ def false_alarms(record: LoopRecord, *, denied: bool = False) -> tuple[str, ...]
 
 
 def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> tuple[Held, ...]:
-    """Every expectation, held against the record. denied: GNSS was switched off as it began."""
+    """Check all expectations. denied: GNSS was switched off at the start."""
     samples, flown = record.samples, figures(record, expect.beyond_m)
     held = [
         Held(

@@ -1,4 +1,4 @@
-"""The flights of the loop as a table for a document, and as JSON: what was missed stands first."""
+"""Results of the flights as a table (failures first) and as JSON."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class LoopRow:
-    """One flight's outcome; error says why it could not be flown.
+    """Result of one flight; error: why it could not be flown.
 
     alarms: what was told although nothing was wrong; None where something was. pace, stall_s: of
     the simulated vehicle.
@@ -44,19 +44,19 @@ class LoopRow:
 
     @property
     def ok(self) -> bool:
-        """Whether it was flown and everything holds."""
+        """Whether the flight was flown and every expectation holds."""
         return not self.error and all(held.ok for held in self.held)
 
     @property
     def slow(self) -> bool:
-        """Whether the machine could not keep the vehicle in real time: it says little then."""
+        """Whether the vehicle did not run in real time; the result then says little."""
         return self.pace < PACE_LIMIT or self.stall_s > STALL_LIMIT_S
 
 
 @dataclass(frozen=True)
 class FalseAlarms:
-    """Over the flights in which nothing was wrong. low, high: of the share of flights with an
-    alarm, exact 95 % (Clopper and Pearson). hours: recorded; told_s: of them, with something told.
+    """False-alarm statistics of flights without a fault. low, high: exact 95 % interval of the
+    share of flights with an alarm (Clopper and Pearson). told_s: seconds with an alert.
     """
 
     flights: int
@@ -68,7 +68,7 @@ class FalseAlarms:
 
 
 def false_alarm_rate(rows: Sequence[LoopRow]) -> FalseAlarms | None:
-    """Of the normal flights that were flown; None without any."""
+    """False-alarm statistics of the flown flights without a fault; None without any."""
     normal = [row for row in rows if row.alarms is not None and row.figures is not None]
     if not normal:
         return None
@@ -85,7 +85,7 @@ def false_alarm_rate(rows: Sequence[LoopRow]) -> FalseAlarms | None:
 
 
 def as_data(rows: Sequence[LoopRow]) -> dict[str, Any]:
-    """For JSON, which has neither NaN nor infinity."""
+    """Rows as JSON data; NaN and infinity become None."""
     rate = false_alarm_rate(rows)
     flights = [asdict(row) | {"ok": row.ok, "slow": row.slow} for row in rows]
     data = {"flights": flights, "false_alarms": None if rate is None else asdict(rate)}
@@ -95,7 +95,7 @@ def as_data(rows: Sequence[LoopRow]) -> dict[str, Any]:
 
 
 def read_rows(path: Path) -> tuple[LoopRow, ...]:
-    """The flights of a ``loop.json``; ScenarioError where it is none."""
+    """Read the rows of a ``loop.json``. `ScenarioError` for another file."""
     try:
         flights = json.loads(path.read_text(encoding="utf-8"))["flights"]
         return tuple(_row(flight) for flight in flights)
@@ -114,7 +114,7 @@ def _row(flight: dict[str, Any]) -> LoopRow:
 
 
 def markdown(rows: Sequence[LoopRow]) -> str:
-    """The table; flights that do not hold come first."""
+    """Markdown table of the flights, failures first."""
     ordered = sorted(rows, key=lambda row: (row.ok, row.name, row.vehicle, row.seed))
     lines = ["| " + " | ".join(_COLUMNS) + " |", "|" + "---|" * len(_COLUMNS)]
     lines += ["| " + " | ".join(_cells(row)) + " |" for row in ordered]
@@ -128,7 +128,7 @@ def markdown(rows: Sequence[LoopRow]) -> str:
 
 
 def print_loop_row(console: Console, row: LoopRow) -> None:
-    """A flight's outcome as soon as it has landed."""
+    """Print one flight's result."""
     if row.error:
         console.print(f"[red]ERROR[/] {row.name}: {escape(row.error)}", highlight=False)
     for held in row.held:

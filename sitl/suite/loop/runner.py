@@ -1,4 +1,4 @@
-"""Flights of the loop one after the other, each judged as it lands, its record kept as JSON."""
+"""Flies scenarios one after the other, judges each at its end, keeps the results as JSON."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 
 @dataclass(frozen=True)
 class RunOptions:
-    """On which vehicles, with which seeds (world, light, errors), and where records and worlds are
-    kept. say: progress, one line at a time; building: how far a world is that is being made (what,
-    share done).
+    """Vehicles, seeds (world, light, errors), and folders of records and worlds. say: receives
+    progress lines; building: receives the progress of world generation (step, share done).
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -42,8 +41,8 @@ class RunOptions:
 def fly_loop(
     cases: Sequence[LoopCase], options: RunOptions, landed: Callable[[LoopRow], None]
 ) -> tuple[LoopRow, ...]:
-    """Fly all cases with every seed; ``out/VEHICLE-NAME-SEED`` holds each flight, ``out/loop.json``
-    and ``out/loop.md`` the table. landed: every flight's outcome as it comes.
+    """Fly all scenarios with every seed. Each flight is kept in ``out/VEHICLE-NAME-SEED``, the
+    table in ``out/loop.json`` and ``out/loop.md``. landed: called with each result.
     """
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[LoopRow] = []
@@ -61,7 +60,7 @@ def fly_loop(
 def loop_assets(
     case: LoopCase, seed: int, worlds: Path | None, progress: Callable[[str, float], None]
 ) -> LoopAssets:
-    """What a case flies over, and the map that it gives the companion; made where missing."""
+    """The world of a scenario and the companion's map; generated if missing."""
     world = prepare(seed, worlds, progress, case.size_m, ideal=not case.honest)
     if case.wrong.other_map:
         other = prepare(seed + _OTHER_SEED, worlds, progress, case.size_m, ideal=True)
@@ -72,7 +71,7 @@ def loop_assets(
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """``5``, or ``1..10`` for both and all between; ScenarioError for anything else."""
+    """Seeds from ``5`` or ``1..10`` (inclusive). `ScenarioError` for other texts."""
     first, dots, last = text.partition("..")
     if not (first.isdecimal() and (last.isdecimal() or not dots)):
         raise ScenarioError(f"--seeds is a number or FIRST..LAST, not {text[:40]!r}")

@@ -1,4 +1,4 @@
-"""A terrain model of a generated world as one gets it: coarse, and of another datum."""
+"""Writes a coarse terrain model of a generated world, with a height offset."""
 
 from __future__ import annotations
 

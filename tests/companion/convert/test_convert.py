@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.convert.angles import Angles, angles_of_matrix, gimbal_of_pose, pose_of_gimbal
 from companion.convert.formats import AUTOPILOT_COLUMNS
-from companion.errors import ConfigError
+from companion.errors import ConfigError, ReportError
 from companion.flight.recorder import ESTIMATE_COLUMNS
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -155,10 +155,10 @@ def test_a_photos_own_tags(tmp_path):
 def test_a_photo_without_angles_is_named(tmp_path):
     options = ("--from", "photos", "--to", "poses", "--heights", "ellipsoidal", *PLACE)
     Image.new("RGB", (16, 12)).save(tmp_path / "plain.jpg")
-    with pytest.raises(PoseFileError, match=r"plain\.jpg: has no XMP"):
+    with pytest.raises(PoseFileError, match=r"plain\.jpg: no gimbal angles"):
         _convert(tmp_path, tmp_path / "o", *options)
     _photo(tmp_path / "plain.jpg", '<x:xmpmeta drone-dji:GimbalYawDegree="1"></x:xmpmeta>')
-    with pytest.raises(PoseFileError, match="lacks GimbalRollDegree, GimbalPitchDegree"):
+    with pytest.raises(PoseFileError, match=r"plain\.jpg: no gimbal angles"):
         _convert(tmp_path, tmp_path / "o", *options)
 
 
@@ -225,6 +225,33 @@ def test_a_photo_without_a_fix_is_named(tmp_path):
     _photo(tmp_path / "DJI_0.JPG", xmp)
     with pytest.raises(PoseFileError, match=r"DJI_0\.JPG: .*no GNSS fix"):
         _convert(tmp_path, tmp_path / "o", *PHOTOS)
+
+
+def test_photos_of_another_maker_are_read_as_try_reads_them(tmp_path):
+    """Pix4D's Camera tags: pitch 0 looks down."""
+    xmp = '<x:xmpmeta Camera:Pitch="30" Camera:Roll="0" Camera:Yaw="90"></x:xmpmeta>'
+    _photo(tmp_path / "A.JPG", xmp)
+    _convert(tmp_path, tmp_path / "o", *PHOTOS)
+    (row,) = read_poses(tmp_path / "o")
+    R = world_from_camera(row, LocalFrame(row.position)).rotation
+    assert R[:, 2] == pytest.approx([0.5, 0, -np.sqrt(0.75)], abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "b.JPG", "a.xmp", "c.mp4", "d.DNG"])
+def test_no_result_replaces_footage(tmp_path, name):
+    _placed(tmp_path / "a.jpg")
+    before = (tmp_path / "a.jpg").read_bytes()
+    with pytest.raises(ConfigError, match="footage file's name"):
+        _convert(tmp_path, tmp_path / name, *PHOTOS)
+    assert (tmp_path / "a.jpg").read_bytes() == before
+
+
+def test_no_sidecar_replaces_the_one_that_is_read(tmp_path):
+    _placed(tmp_path / "a.jpg")
+    for source in (tmp_path, tmp_path / "a.jpg"):
+        with pytest.raises(ReportError, match="would replace"):
+            _convert(source, tmp_path, "--from", "photos", "--to", "photos",
+                     "--heights", "ellipsoidal", *PLACE)  # fmt: skip
 
 
 def test_what_a_mac_leaves_beside_photos_is_none(tmp_path):

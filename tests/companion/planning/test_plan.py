@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import MissionFileError
 from companion.geometry import Mount
+from companion.planning.flown import flown_legs, flown_words
 from companion.planning.instead import changes
 from companion.planning.judge import (
     JudgedSample,
@@ -292,6 +293,26 @@ def test_the_worst_condition_counts(leg):
     both = [forecast(condition="day"), forecast(risk=0.5, condition="night")]
     judged = judge(leg.samples[0], both, MissionLimits())
     assert (judged.forecast.condition, judged.holds) == ("night", False)
+
+
+def test_a_forecast_is_checked_by_a_flight(leg):
+    """A frame every 4 m over the leg's first 60 m; vision fails on 20 m that should hold, and holds
+    on 20 m that should fail.
+    """
+    judged = [judge(s, [forecast(risk=0.9 if k == 2 else 0.0)], MissionLimits())
+              for k, s in enumerate(leg.samples)]  # fmt: skip
+    places = np.array([s.position + np.array([dx, 0.3, 2.0]) for s in leg.samples[:3]
+                       for dx in (-8.0, -4.0, 0.0, 4.0, 8.0)])  # fmt: skip
+    accepted = np.array([True] * 5 + [True, True, True, False, False] + [True] * 5)
+    (flown,) = flown_legs([LegVerdict(leg, tuple(judged))], places, accepted)
+    assert flown.forecast.tolist() == [True, True, False]
+    assert flown.held.tolist() == [True, False, True]
+    assert flown.row == ("home to 1", "67 %", "67 %", "33 %", "3 of 5")
+    words = flown_words([flown])
+    assert "right at 33 %; 1 failed that should hold, 1 held that should fail" in words
+    (none,) = flown_legs([LegVerdict(leg, tuple(judged))], places + 1000.0, accepted)
+    assert flown_words([none]) == "The flight has no frame on this mission."
+    assert none.row[1:] == ("-", "-", "-", "0 of 5")
 
 
 def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):

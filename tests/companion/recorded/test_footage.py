@@ -203,6 +203,30 @@ def test_a_video_with_subtitles(tmp_path):
         assert latitude == pytest.approx(47.3 + 1e-13 * (frame.time_ns or 0), abs=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("day", "cues", "told"),
+    [("2024-05-01", 20, ()), ("2024-05-02", 18, ()), ("2024-05-04", 20, ("another flight",)),
+     ("2024-05-01", 40, ("cut?",)), ("2024-05-01", 9, ("cut?",)), ("2024-13-01", 20, ())],
+)  # fmt: skip
+def test_subtitles_of_another_video_are_named(tmp_path, day, cues, told):
+    plain = write_video(tmp_path / "a.mp4", seconds=20.0)
+    with av.open(str(plain)) as read, av.open(str(tmp_path / "b.mp4"), "w") as out:
+        out.metadata["creation_time"] = "2024-05-01T10:00:00.000000Z"
+        stream = out.add_stream_from_template(read.streams.video[0])
+        for packet in read.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    (tmp_path / "b.srt").write_text("".join(
+        f"{s + 1}\n00:00:{s:02d},000 --> 00:00:{s:02d},500\n{day} 10:00:{s:02d}.000\n"
+        f"[focal_len: 24] [latitude: 47.3] [longitude: {8.5 + 1e-4 * s}] [rel_alt: 60.0]\n\n"
+        for s in range(cues)
+    ))  # fmt: skip
+    flight = read_footage(tmp_path / "b.mp4", FootageOptions(tmp_path / "w", frames=4))
+    for word in ("another flight", "cut?"):
+        assert any(word in note for note in flight.notes) == (word in told), flight.notes
+
+
 def test_a_log_of_a_flight_elsewhere_is_refused(tmp_path):
     """Its motion can look alike by chance: a real log of Australia was laid beside such a video."""
     folder = _survey(tmp_path / "p")

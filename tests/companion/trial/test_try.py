@@ -11,12 +11,14 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.convert.angles import gimbal_of_pose
+from companion.errors import ReportError
 from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer
-from companion.trial.priors import priors_of
+from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
+from companion.trial.run import sampled
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -88,6 +90,13 @@ def test_a_camera_without_a_gimbal_is_written_as_fixed(small_assets, tmp_path, p
     camera = load_config(file).bridge.camera
     assert camera.mount == mount
     assert camera.mount_pitch_deg == pytest.approx(pitch_deg or 0.0)
+    write_trial_deployment(file, trial, small_assets.map_cache)  # its own file may be replaced
+    file.write_text(edited := file.read_text().replace("5600", "5601"))
+    with pytest.raises(ReportError, match="changed by hand"):
+        write_trial_deployment(file, trial, small_assets.map_cache)
+    told = _run(tmp_path, "--report", tmp_path)
+    assert isinstance(told.exception, ReportError)  # before anything is computed
+    assert file.read_text() == edited
 
 
 def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequence, tmp_path):
@@ -124,6 +133,43 @@ def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequen
             assert one.pose.distance_to(same.pose)[0] < 1e-6
             assert one.quality == pytest.approx(same.quality, abs=0.01)
     stack.close()
+
+
+def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(small_assets, tmp_path):
+    cache = TileCache.open(small_assets.map_cache)
+    middle = cache.frame.position(np.zeros(3))
+    for k in range(90):
+        view = {} if k % 2 else {"GimbalRollDegree": 1, "GimbalPitchDegree": -89,
+                                 "GimbalYawDegree": 5}  # fmt: skip
+        xmp = dji(GpsLatitude=middle.latitude_deg, GpsLongitude=middle.longitude_deg + 1e-6 * k,
+                  RelativeAltitude=60, **view)  # fmt: skip
+        write_photo(tmp_path / f"{k:02d}.jpg", xmp, exif={_FOCAL_35: 24})
+    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
+    known = priors_of(flight, cache)
+    kept, priors = sampled(flight, known)
+    names = [int(frame.name[:2]) for frame in kept.frames]
+    assert [k for k in names if not k % 2] == list(range(0, 90, 2))  # their heading is known
+    odd = [k for k in names if k % 2]
+    assert (len(odd), odd[0], odd[-1]) == (40, 1, 89)
+    assert len(priors.priors) == len(names)
+    assert sum("40 of them" in note for note in priors.notes) == 1
+    assert sampled(kept, priors)[0] is kept
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, 0), (0.3048, 1), (0.6, 0)])
+def test_a_map_with_heights_in_feet_is_named(small_assets, tmp_path, factor, told):
+    """By the photos' two heights, whose difference is the ground's below the take-off."""
+    cache = TileCache.open(small_assets.map_cache)
+    middle = cache.frame.position(np.zeros(3))
+    ground_m = Ground(cache).height(0.0, 0.0) + middle.height_m - cache.manifest.geoid_separation_m
+    assert ground_m > 250.0  # otherwise feet and metres differ by less than these heights err
+    for k in range(4):
+        xmp = dji(GpsLatitude=middle.latitude_deg, GpsLongitude=middle.longitude_deg + 1e-5 * k,
+                  AbsoluteAltitude=factor * ground_m + 60, RelativeAltitude=60)  # fmt: skip
+        write_photo(tmp_path / f"{k}.jpg", xmp, exif={_FOCAL_35: 24})
+    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
+    notes = priors_of(flight, cache).notes
+    assert sum("--height-unit ft" in note for note in notes) == told, notes
 
 
 def test_without_a_map_the_needed_one_is_named(tmp_path):
