@@ -10,7 +10,7 @@ from localizer.config import LocalizerConfig
 from localizer.features.extractor import FeatureExtractor
 from localizer.forecast.risk import RIGHT_M, WORST_M, Figures, expected_sigma_m, failure_risk
 from localizer.forecast.rivals import AmbiguousPosition, most_similar_rival
-from localizer.forecast.visit import another_visit
+from localizer.forecast.visit import simulate_visit
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.integrity.acceptance import is_acceptable
@@ -95,7 +95,7 @@ class Forecaster:
     ) -> ViewForecast:
         found, rival = [], AmbiguousPosition(0.0, 0.0)
         for draw in range(self._draws):
-            query = self._extractor.extract(another_visit(view, condition, rng))
+            query = self._extractor.extract(simulate_visit(view, condition, rng))
             found.append(self._optimizer.register(query, self._camera, anchors, prior, seed=draw))
             if draw == 0 and found[0].status is RegistrationStatus.OK:
                 origin = local_origin(anchors, view.world_from_camera)

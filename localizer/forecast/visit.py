@@ -26,7 +26,7 @@ _DRY = np.array([1.12, 1.0, 0.8], np.float32)  # grass and leaves out of season,
 _LEAST_CELL_M = 0.02
 
 
-def another_visit(view: RenderedView, condition: str, rng: np.random.Generator) -> Image:
+def simulate_visit(view: RenderedView, condition: str, rng: np.random.Generator) -> Image:
     """A simulated image (H, W, 3) of `view` under one of `FORECAST_CONDITIONS`; ValueError for
     another condition.
     """

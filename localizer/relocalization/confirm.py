@@ -24,7 +24,7 @@ _SAME_START = 1.0  # m and degrees: a registration from so near is the same one
 _HOPELESS = 0.5  # of the best quality
 
 
-class StopAskedError(Exception):
+class SearchCancelledError(Exception):
     """The search was cancelled."""
 
 
@@ -69,7 +69,7 @@ class Confirmation:
                 self._screen(min(len(self.candidates), _ROUNDS[-1]))
                 self._settle_alike(order[0])
                 self._finish()
-        except StopAskedError:
+        except SearchCancelledError:
             return []
         return self._order()
 
@@ -210,4 +210,4 @@ class Confirmation:
 
     def _go_on(self) -> None:
         if self.should_stop():
-            raise StopAskedError
+            raise SearchCancelledError

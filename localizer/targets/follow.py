@@ -23,7 +23,7 @@ from localizer.targets.foreground import (
     is_distinct,
     is_ground,
 )
-from localizer.targets.standing import StandingLook
+from localizer.targets.standing import StaticAppearance
 from localizer.targets.track import projected
 from localizer.types import PoseEstimate
 
@@ -98,7 +98,7 @@ class ImageFollower:
         self._isolated_look: TargetAppearance | None = None  # as it was on that ground
         self._learns_m = 0.5 * self._half_m  # from where it was clicked, once it is so far away
         self._renewed_ns = estimate.exposure_time_ns
-        self._stands = StandingLook()
+        self._stands = StaticAppearance()
         self.ready = first is not None and float(first.std()) >= _FLAT
 
     def find(

@@ -116,7 +116,7 @@ class LastPlace:
         return None
 
 
-def is_by_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
+def is_near_map_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
     """Whether a ray passes through or near a hole of the map or its edge, so that it hits ground
     behind. eye, direction: (3,); distance: metres to its hit.
 

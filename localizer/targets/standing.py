@@ -24,7 +24,7 @@ _LEARNS_NS = 1_000_000_000  # what is usual, before anything is not
 _LATELY = 0.2  # weight of the newest in what is usual
 
 
-class StandingLook:
+class StaticAppearance:
     """Appearance of one target over time. Not thread-safe. is_changed: it changed suddenly and has
     stayed so.
     """

@@ -19,7 +19,7 @@ from localizer.targets.limits import (
     RefusalReason,
     TargetRefusal,
     is_at_seen_depth,
-    is_by_hole,
+    is_near_map_hole,
     is_on_map,
 )
 from localizer.targets.locate import (
@@ -107,7 +107,7 @@ class TargetTrack:
         distance = float(np.linalg.norm(surfaces[0].position - eye))
         if distance > settings.max_range_m:
             return self._refuse(TargetRefusal(RefusalReason.TOO_FAR, distance))
-        if self._last.fix is None and is_by_hole(eye, d, distance, self._cast):
+        if self._last.fix is None and is_near_map_hole(eye, d, distance, self._cast):
             self._begin_anew()
             return self._refuse(TargetRefusal(RefusalReason.HOLE))
         if any(drift):

@@ -38,7 +38,7 @@ from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
 
 
-def fallen_m(place: Array) -> float:
+def curvature_drop_m(place: Array) -> float:
     """Height (m) by which the Earth's curvature lowers the ground at a position (3,) below the
     tangent plane at the world's origin: 7.8 m at 10 km.
     """
@@ -162,6 +162,6 @@ class DeadReckoning:
         if rotation is not None:
             known.append(attitude_constraint(rotation, _TILT_RAD, _HEADING_RAD))
         if height_m is not None:
-            world_z = height_m - fallen_m(about.translation)
+            world_z = height_m - curvature_drop_m(about.translation)
             known.append(height_constraint(world_z, _HEIGHT_M))
         return combine(*known) if known else None

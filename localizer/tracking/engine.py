@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from localizer.errors import LocalizerError
-from localizer.tracking.engine_health import EngineHealth, HealthBook
+from localizer.tracking.engine_health import EngineHealth, HealthCounters
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
 from localizer.tracking.prefetch import FeaturePrefetcher, PrefetchedFrame
@@ -89,7 +89,7 @@ class DualThreadEngine:
         self._interval_ns = _DEFAULT_INTERVAL_NS
         self._last_exposure_ns: int | None = None
         self._reference_ms: dict[str, float] = {}
-        self._book = HealthBook(localizer.renderer_name, localizer.features_name)
+        self._book = HealthCounters(localizer.renderer_name, localizer.features_name)
         self._stop = threading.Event()
         self._turns: dict[str, int] = {}
         self._threads = [

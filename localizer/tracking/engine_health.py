@@ -41,7 +41,7 @@ class EngineHealth:
     horizon_off_deg: tuple[float, float, float] | None = None
 
 
-class HealthBook:
+class HealthCounters:
     """Collects the threads' counters. Thread-safe."""
 
     def __init__(self, renderer: str, features: str) -> None:

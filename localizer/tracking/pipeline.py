@@ -124,7 +124,7 @@ def _shrink(image: Image, camera: Camera) -> Image:
     return shrunk
 
 
-def only_seen(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
+def mask_unseen_features(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
     """The features with zero confidence outside the lens's image circle, where anchors would
     otherwise be compared with black.
     """
@@ -382,7 +382,7 @@ class Localizer:
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
-        return only_seen(self._extractor.extract(undistorter(frame)), undistorter.seen)
+        return mask_unseen_features(self._extractor.extract(undistorter(frame)), undistorter.seen)
 
     def localize(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None

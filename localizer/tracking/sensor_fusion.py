@@ -27,7 +27,7 @@ from localizer.tracking.attitude_bias import (
     AttitudeObservation,
     AttitudePrior,
 )
-from localizer.tracking.dead_reckoning import fallen_m
+from localizer.tracking.dead_reckoning import curvature_drop_m
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import RegistrationStatus
 
@@ -145,7 +145,7 @@ class SensorFusion:
             known.append(tilt)
         height_m = self._sensors.height_at(time_ns)
         if height_m is not None and self._height_sigma_m is not None:
-            world_z = height_m - fallen_m(about.translation)
+            world_z = height_m - curvature_drop_m(about.translation)
             known.append(height_constraint(world_z, self._height_sigma_m))
         return known
 

@@ -12,7 +12,7 @@ import numpy as np
 from localizer.geometry.pose import Array
 from localizer.map.building.cutting import cropped
 from localizer.map.building.staging import texel_size
-from localizer.map.building.topdown import TEXELS, made_error, seen_from_above
+from localizer.map.building.topdown import TEXELS, seen_from_above, tile_error_m
 from localizer.map.cache.tile import build_mips
 from localizer.map.importers.rules import ImportRules
 from localizer.map.source import SourceMesh, SourceNode
@@ -127,7 +127,7 @@ def _node(tile: MeshTile) -> SourceNode:
         for row in (2 * tile.row, 2 * tile.row + 1):
             for column in (2 * tile.column, 2 * tile.column + 1):
                 children.append(_node(replace(tile, level=tile.level + 1, column=column, row=row)))
-    return SourceNode(made_error(tile.size) if children else 0.0, True, (tile,), children)
+    return SourceNode(tile_error_m(tile.size) if children else 0.0, True, (tile,), children)
 
 
 @lru_cache(maxsize=1)

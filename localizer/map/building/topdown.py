@@ -28,7 +28,7 @@ _DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera axes: x east, 
 Textured = tuple[SourceMesh, tuple[Image, ...]]  # a mesh and its mips
 
 
-def made_error(size: float) -> float:
+def tile_error_m(size: float) -> float:
     """Geometric error (m) of a tile of `size` metres made by `seen_from_above`."""
     return ERROR_PER_STEP * size / CELLS
 

@@ -128,7 +128,7 @@ def vector_area(positions: Array, faces: NDArray[np.int32]) -> Array:
     return np.asarray(0.5 * np.cross(b - a, c - a).sum(axis=0))
 
 
-def facing_fault(area: Array) -> str | None:
+def orientation_fault(area: Array) -> str | None:
     """Why a map with this `vector_area` (ENU) is wrongly oriented; None if most of it faces up."""
     up, aside = float(area[2]), float(np.hypot(area[0], area[1]))
     if up >= aside:

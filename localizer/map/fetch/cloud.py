@@ -27,7 +27,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, utm_zone
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.heights import UNITS, metres_of
-from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.polite import HttpClient, shown
 from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, cut, grid_over
 from localizer.map.importers.raster_file import offline
 
@@ -48,7 +48,7 @@ class RangeFile(io.RawIOBase):
     errors, which GDAL would replace by a generic one.
     """
 
-    def __init__(self, url: str, client: PoliteClient, failed: list[MapFetchError]) -> None:
+    def __init__(self, url: str, client: HttpClient, failed: list[MapFetchError]) -> None:
         super().__init__()
         self._url, self._client, self._failed = url, client, failed
         self._at = 0
@@ -136,7 +136,7 @@ class CloudFile:
 
 def plan_files(
     source: CatalogueSource, area: Area, resolution_m: float, files: Sequence[CloudFile],
-    client: PoliteClient,
+    client: HttpClient,
 ) -> FetchPlan:  # fmt: skip
     """Plan the windows of the files that meet an area, on the files' common grid if there is one.
     `MapFetchError` if there is no file or there are too many, `NoFileError` if none exists.
@@ -184,7 +184,7 @@ def degree_files(source: CatalogueSource, area: Area) -> list[CloudFile]:
 
 
 def _grid_of(
-    files: Sequence[CloudFile], area: Area, resolution_m: float, client: PoliteClient
+    files: Sequence[CloudFile], area: Area, resolution_m: float, client: HttpClient
 ) -> FetchGrid:
     """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
     crs, transform = _lie_of(files[0], client)
@@ -199,7 +199,7 @@ def _grid_of(
     return grid_over(area.bounds_in(flat), pixel, flat, (transform.c, transform.f))
 
 
-def _lie_of(file: CloudFile, client: PoliteClient) -> tuple[CRS, Any]:
+def _lie_of(file: CloudFile, client: HttpClient) -> tuple[CRS, Any]:
     """A file's CRS and transform."""
     with _opened(file.url, client, []) as data:
         if data.crs is None:
@@ -207,7 +207,7 @@ def _lie_of(file: CloudFile, client: PoliteClient) -> tuple[CRS, Any]:
         return CRS(data.crs), data.transform
 
 
-def _exists(file: CloudFile, client: PoliteClient) -> bool:
+def _exists(file: CloudFile, client: HttpClient) -> bool:
     return client.get(file.url, {"Range": "bytes=0-0"}, (_NOT_THERE,)).status != _NOT_THERE
 
 
@@ -224,7 +224,7 @@ def _meets(window: FetchGrid, file: CloudFile) -> bool:
     return bool(west <= there[2] and there[0] <= east and south <= there[3] and there[1] <= north)
 
 
-def _opened(url: str, client: PoliteClient, failed: list[MapFetchError]) -> Any:
+def _opened(url: str, client: HttpClient, failed: list[MapFetchError]) -> Any:
     """A dataset that reads through the client; GDAL itself stays off the network."""
 
     def opener(path: str, mode: str = "rb", **_: object) -> RangeFile:
@@ -251,7 +251,10 @@ def check_depth(name: str, dtype: str) -> None:
 
 
 def _window(
-    source: CatalogueSource, window: FetchGrid, files: Sequence[CloudFile], client: PoliteClient
+    source: CatalogueSource,
+    window: FetchGrid,
+    files: Sequence[CloudFile],
+    client: HttpClient,
 ) -> bytes | None:
     """The first file that knows a pixel gives it."""
     bands = 1 if source.has_heights else 3
@@ -269,7 +272,7 @@ def _window(
 
 
 def _of_file(
-    source: CatalogueSource, window: FetchGrid, url: str, client: PoliteClient
+    source: CatalogueSource, window: FetchGrid, url: str, client: HttpClient
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """A window's bands (n, height, width) of one file, and where it knows them."""
     bands = 1 if source.has_heights else 3

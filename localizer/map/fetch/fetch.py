@@ -15,7 +15,7 @@ from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import degree_files, plan_files
 from localizer.map.fetch.mosaic import assemble, check_piece
-from localizer.map.fetch.polite import PoliteClient
+from localizer.map.fetch.polite import HttpClient
 from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.fetch.stac import stac_files
 from localizer.map.fetch.tiles import plan_tiles
@@ -38,7 +38,7 @@ class FetchEstimate:
 
 
 def make_plan(
-    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+    source: CatalogueSource, area: Area, resolution_m: float, client: HttpClient
 ) -> FetchPlan:
     """Plan all requests; may query the service (capabilities, catalogue, file header)."""
     if source.kind in ("wms", "wcs"):
@@ -60,7 +60,7 @@ def estimate(source: CatalogueSource, plan: FetchPlan) -> FetchEstimate:
 
 
 def fetch(
-    source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path, client: PoliteClient,
+    source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path, client: HttpClient,
     progress: Progress = lambda _done, _total: None,
 ) -> float:  # fmt: skip
     """Download the raster to `out`. Pieces of an interrupted run in `folder` are reused; those of
@@ -101,7 +101,7 @@ def fetch(
     return known
 
 
-def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: PoliteClient) -> None:
+def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: HttpClient) -> None:
     """A piece becomes a file when it is whole; an empty one says that there is nothing."""
     data = piece.get(client)
     if data is not None:

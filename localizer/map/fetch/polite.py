@@ -60,7 +60,7 @@ class _Request:
     body: bytes | None = None
 
 
-class PoliteClient:
+class HttpClient:
     """Sends GET and POST requests from any thread, within limits. `MapFetchError` for a refusal or
     an exceeded limit. sleep, clock: seconds.
     """

@@ -10,7 +10,7 @@ from affine import Affine
 from pyproj import CRS
 
 from localizer.errors import MapFetchError
-from localizer.map.fetch.polite import PoliteClient
+from localizer.map.fetch.polite import HttpClient
 
 _MOST_PIXELS = 1e9
 _MOST_PIECES = 200_000
@@ -61,7 +61,7 @@ class Piece:
     row: int
     width: int
     height: int
-    get: Callable[[PoliteClient], bytes | None]
+    get: Callable[[HttpClient], bytes | None]
     placed: bool = False
 
 

@@ -275,14 +275,14 @@ class _Reader:
 
     def _doubted(self, T: Array, path: Path) -> Array:
         """A tile's transform, which should move and turn only."""
-        text = stretch_of(T)
+        text = transform_warning(T)
         if text is not None:
             name = "mirrored" if np.linalg.det(T[:3, :3]) < 0 else "scaled"
             self.warnings.append(self.rules.doubt(name, f"{path}: a tile's transform {text}"))
         return T
 
 
-def stretch_of(T: Array) -> str | None:
+def transform_warning(T: Array) -> str | None:
     """Warning text if a transform (4, 4) mirrors, or scales by more than 1 %; None otherwise.
     `MapSourceError` if it is singular or a projection.
     """

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from localizer.errors import MapCacheError
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.tile import facing_fault, vector_area
+from localizer.map.cache.tile import orientation_fault, vector_area
 from localizer.map.inspection.alignment import ImageryOffset, alignment_of
 from localizer.map.inspection.kind import map_kind
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
@@ -233,7 +233,7 @@ def _intact(cache: TileCache) -> list[MapFinding]:
         if number in leaves:
             local = vector_area(mesh.positions.astype(np.float64), mesh.faces)
             area += mesh.world_from_tile.rotation @ local
-    fault = facing_fault(area)
+    fault = orientation_fault(area)
     found = f"{len(damaged)} of {len(cache.tile_ids)} tiles"
     words = f"build it again: {damaged[0]}" if damaged else "each as its hash says"
     return [
