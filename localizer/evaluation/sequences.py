@@ -122,14 +122,13 @@ def evaluate(
     progress: Callable[[int], None] = lambda _: None,
     find: FindPlace | None = None,
 ) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
-    """Localize every frame of a sequence and compute the errors and metrics.
+    """Localize every frame of a sequence and compute errors and metrics.
 
-    mode ``first``: only the first frame's prior is known, as in the paper. ``each``: every frame
-    starts from its own perturbed truth. passes: how often a frame that starts from a perturbed
-    prior is rendered and registered, each time from the last result. A frame that is predicted
-    outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
-    `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
-    whenever it is lost or led nowhere, instead of the perturbed truth.
+    mode ``first``: only the first frame has a prior, as in the paper; ``each``: every frame starts
+    from its own perturbed true pose. passes: number of renderings and registrations of a frame that
+    starts from a perturbed prior, each from the last result. find: gives a prior at the start and
+    when the camera is lost, instead of the perturbed true pose. A frame outside the map or with an
+    unusable image counts as not localized; `OutsideMapError` or `SequenceError` if all frames are.
     """
 
     def begin(frame: Frame, index: int) -> bool:

@@ -12,9 +12,9 @@ from localizer.device_array import DeviceArray
 
 
 class BoundSession:
-    """A session whose outputs are allocated once per image size and written in place.
+    """A session whose outputs are allocated once per image size and reused.
 
-    device: onnxruntime's name of the memory, "cuda" or, in tests, "cpu". What `run` returns is
+    device: onnxruntime's name of the memory, "cuda" or, in tests, "cpu". The result of `run` is
     valid until the next call.
     """
 

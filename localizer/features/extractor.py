@@ -240,10 +240,10 @@ def load_extractor(
     size: tuple[int, int] | None = None,
     half: bool = False,
 ) -> FeatureExtractor:
-    """The extractor for `model`; None takes the shipped weights. Options: see `OnnxExtractor`.
+    """The extractor for `model`; None: the shipped weights.
 
-    Without shipped weights it is the gradient fallback, which says so in its name and in a warning.
-    A model that was asked for by path and is missing or corrupt raises `ModelError`.
+    Options: see `OnnxExtractor`. Without shipped weights the gradient extractor is used, with a
+    warning. `ModelError` if a given model is missing or corrupt.
     """
     if model is None:
         if not SHIPPED_MODEL.exists():

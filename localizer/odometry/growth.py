@@ -36,8 +36,9 @@ def walked(model: GrowthModel, way_m: float) -> Array:
 def stretched(known: Array, scale: float, displacement: Array) -> Array:
     """Covariance (3, 3) of position from scale errors, after another displacement (3,).
 
-    scale: its sigma, a share. How alike two stretches of ground err is not known: the bound holds
-    for any correlation (covariance intersection), and is exact for one scale along a straight line.
+    scale: relative sigma. The correlation between two stretches of ground is unknown, so the sum is
+    bounded for any correlation (covariance intersection); it is exact for one scale along a
+    straight line.
     """
     added = scale * displacement
     before, size = float(np.sqrt(np.trace(known))), float(np.linalg.norm(added))
@@ -51,9 +52,9 @@ def stretched(known: Array, scale: float, displacement: Array) -> Array:
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
     """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis.
 
-    Such a sensor's error stays from frame to frame and does not average out. So it is heard only
-    where less is known than it knows, and then no better is known than it knows: with the noise
-    ``R P / (P - R)`` instead of its own R, a variance P becomes R, however often it is asked.
+    The sensor's error is constant over frames and does not average out. So a variance P larger than
+    the sensor's R becomes R, however often it is measured, by an update with the noise ``R P / (P -
+    R)``; a smaller one is unchanged.
     """
     if constraint is None:
         return pose, covariance
@@ -77,8 +78,8 @@ def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> t
 def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
     """The pose after an independent measurement of single axes: a Kalman update.
 
-    What hangs on those axes moves with them: a turn that is known better mends the position that
-    the registration took it for. covariance: (6, 6) of the pose before.
+    Correlated axes are corrected, too: a better rotation also corrects the position. covariance:
+    (6, 6) of the pose before.
     """
     information = np.diag(constraint.information)
     known = np.flatnonzero(information > 0)

@@ -108,12 +108,12 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
-    """The pose after a constraint of another sensor was applied. covariance: (6, 6).
+    """The pose after a constraint of another sensor was applied.
 
-    Such a sensor's error (mounting, gimbal, air pressure) stays from frame to frame and does not
-    average out. So it is used only where less is known than it knows, and then no better is known
-    than it knows: along each principal direction a variance P > R becomes R, with the noise
-    ``R P / (P - R)``. The odometry follows the same rule, axis by axis (`odometry.growth.fused`).
+    covariance: (6, 6). The sensor's error (mounting, gimbal, air pressure) is constant over frames
+    and does not average out. So along each principal direction a variance P larger than the
+    sensor's R becomes R, by an update with the noise ``R P / (P - R)``; a smaller one is unchanged.
+    `odometry.growth.fused` follows the same rule.
     """
     rows, values = constraint_rows(constraint, pose)
     known = rows @ covariance @ rows.T

@@ -87,11 +87,10 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
 
 
 class LevelCorrelator:
-    """Correlates patches with one level; caches spectra up to `byte_budget`. Thread-safe.
+    """Correlates patches with one level; caches spectra up to `byte_budget`.
 
-    A search goes over all its blocks again and again. Where they do not fit, the block unused for
-    longest is the next one wanted: so only what other searches left is given up for a new one, and
-    the share that fits is found each time.
+    Thread-safe. A search visits all blocks repeatedly. If they do not fit, only spectra of earlier
+    searches are replaced, so that part of the blocks is always found in the cache.
     """
 
     def __init__(self, level: OverviewLevel, byte_budget: int) -> None:

@@ -76,11 +76,9 @@ class TargetFilter:
         return track.mean[:3], track.covariance[:3, :3]
 
     def update(self, sighting: TargetSighting) -> TargetFix | None:
-        """Fuse an observation of at least one surface. After three that fit no track the filter
-        restarts.
+        """Fuse an observation of at least one surface; None for one that fits no track.
 
-        None for a sighting that fits none: where the target would be by its motion is no place at
-        which it was seen.
+        Three of those restart the filter.
         """
         tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]
         met = _met(tracks, sighting.surfaces)

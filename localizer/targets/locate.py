@@ -86,9 +86,9 @@ def surface_covariance(
 ) -> Array:
     """Covariance (3, 3) in m², world axes, of a ray's hit on a surface.
 
-    offset: (3,) from the camera to the point. First order about the tangent plane with normal n
-    (3,): what moves the ray across by e moves the point by ``M e``, ``M = I - d n' / (n' d)``. The
-    map's own error adds along the ray.
+    offset: (3,) from the camera to the hit; normal: (3,) of the surface; spread: of the ray. First
+    order about the tangent plane: a displacement e across the ray moves the hit by ``M e``, ``M = I
+    - d n' / (n' d)``. map_sigma_m is added along the ray.
     """
     distance = float(np.linalg.norm(offset))
     d = offset / distance
