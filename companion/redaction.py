@@ -1,4 +1,4 @@
-"""Credentials out of texts: a camera's address may hold a user's name and password."""
+"""Removes credentials from texts: a camera's URL may contain user name and password."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _IN_QUERY = re.compile(r"(?i)\b((?:pass(?:word|wd)?|pwd|user(?:name)?|token|key)
 
 
 def redacted(text: str) -> str:
-    """The text with ``***`` for what stands before the @ of an address, and for passwords and
-    tokens in its query.
+    """The text with ``***`` for the user part of URLs, and for passwords and tokens in their
+    queries.
     """
     return _IN_QUERY.sub(rf"\g<1>{HIDDEN}", _IN_ADDRESS.sub(HIDDEN, text))

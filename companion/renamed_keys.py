@@ -1,8 +1,7 @@
-"""Settings of earlier versions that have another name or none: read, with a warning.
+"""Reads settings of earlier versions that were renamed or removed, with a warning.
 
-The one place that knows old names. It serves deployments, the deployment in a flight's record, and
-scenario files. A field with `exclude=True` is a constant of the program: code may give it another
-value, a deployment may not.
+The only place with old names, for deployment files, records and scenario files. A field with
+`exclude=True` is a constant of the program: code may change it, a file may not.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ REMOVED = {
 
 
 def with_current_keys(model: type[BaseModel], data: dict[str, Any], where: str) -> dict[str, Any]:
-    """The settings of `model` under today's names; `where` names the file in the warnings.
+    """The settings of `model` with today's names; `where` names the file in warnings.
 
     A key that is given under both names keeps both: the model then refuses the old one.
     """

@@ -1,4 +1,4 @@
-"""Settings files: YAML with a mapping at the top, and what is wrong with one in clear lines."""
+"""Reads YAML settings files, with one clear line for each error."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _SHORT = 60
 
 
 class SettingsError(ValueError):
-    """Settings that do not fit their model; its text has a line for each that is wrong."""
+    """Invalid settings; its text has a line for each error."""
 
 
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
-    """The mapping in a YAML file, empty for an empty file; `error_type` names file and fault."""
+    """The mapping in a YAML file, empty for an empty file; else raises `error_type`."""
     try:
         data = load_yaml(plain_text(path, _MAX_BYTES))
     except OSError as error:
@@ -41,7 +41,7 @@ def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
 
 
 def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
-    """The settings as their model; SettingsError lists where, what, and what was given."""
+    """The settings as a model instance; SettingsError lists location, error and given value."""
     try:
         read = model.model_validate(data)
     except ValidationError as error:
@@ -54,7 +54,7 @@ def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
 
 
 def settings(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """The fields of a model that a file can set: all but the program's constants (`exclude`)."""
+    """The fields of a model that a file can set (all without `exclude`)."""
     return {name: field for name, field in model.model_fields.items() if not field.exclude}
 
 

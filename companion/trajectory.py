@@ -1,4 +1,4 @@
-"""The files of a trajectory, whole or while it is flown: pose lines, TUM, covariances."""
+"""Trajectory files: pose lines, TUM, covariances, written at once or during the flight."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ TRAJECTORY_NAMES = ("poses.txt", "trajectory.tum", "covariances.csv")
 
 
 def stamped(name: str, estimate: PoseEstimate) -> StampedPose:
-    """An estimate as a trajectory's pose."""
+    """An estimate as a `StampedPose`."""
     return StampedPose(
         name, estimate.world_from_camera, estimate.exposure_time_ns, estimate.covariance
     )
 
 
 def snapshot_name(exposure_time_ns: int) -> str:
-    """What a record calls the frame of that time, in its snapshots and in its trajectory."""
+    """File name of the frame with that exposure time, in snapshots and trajectory."""
     return f"{exposure_time_ns}.jpg"
 
 
 class TrajectoryFiles:
-    """``poses.txt`` (our pose lines), ``trajectory.tum`` and ``covariances.csv``, in one order.
+    """Writes ``poses.txt`` (our pose lines), ``trajectory.tum`` and ``covariances.csv``.
 
     Raises OSError where the disk does not take them.
     """
@@ -50,7 +50,7 @@ class TrajectoryFiles:
             self._stack = stack.pop_all()
 
     def append(self, pose: StampedPose) -> None:
-        """Write one pose behind the others. `PoseFileError` without a time: TUM needs one."""
+        """Append a pose. `PoseFileError` without a time, which TUM needs."""
         # All three lines are made before the first is written: the files stay in one order.
         line, tum = (
             pose_line(pose_row(pose.name, pose.world_from_camera, self._frame)),
@@ -63,7 +63,7 @@ class TrajectoryFiles:
             self._rows.writerow(row)
 
     def flush(self) -> None:
-        """Hand what is buffered to the disk."""
+        """Write the buffers to the disk."""
         for file in (self._poses, self._tum, self._covariances):
             file.flush()
 
@@ -73,7 +73,7 @@ class TrajectoryFiles:
 
 
 def write_trajectory(folder: Path, poses: Iterable[StampedPose], frame: LocalFrame) -> None:
-    """The files of a whole trajectory (`TrajectoryFiles`)."""
+    """Write the files of a complete trajectory (`TrajectoryFiles`)."""
     files = TrajectoryFiles(folder, frame)
     with contextlib.closing(files):
         for pose in poses:

@@ -1,5 +1,5 @@
-"""For reports: versions of this package, of Python and of what the numbers depend on; the commit
-of a checkout; the processor.
+"""Versions for reports: of this package, Python and relevant dependencies; the commit of a
+checkout; the processor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PACKAGES = ("pilot-companion", "numpy", "numba", "onnxruntime", "openvino",
 
 
 def versions() -> dict[str, str]:
-    """Package name to version; what is not installed or not known is left out."""
+    """Package name to version; unknown ones are left out."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for name in _PACKAGES:
         try:
@@ -27,13 +27,13 @@ def versions() -> dict[str, str]:
 
 
 def made_by() -> dict[str, str]:
-    """The versions, the processor and, in a checkout, the commit: what a figure depends on."""
+    """Versions, processor and, in a checkout, the commit: the origin of a figure."""
     commit = checkout()
     return versions() | {"processor": processor()} | ({"commit": commit} if commit else {})
 
 
 def processor() -> str:
-    """How many of which, as Linux names it."""
+    """Number and name of the processors."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -44,7 +44,7 @@ def processor() -> str:
 
 
 def checkout() -> str:
-    """The commit that runs, with `+` where files differ from it; empty where it is installed."""
+    """The running commit, with `+` if files differ from it; empty if installed."""
     root = Path(__file__).resolve().parents[1]
     if not (root / ".git").exists():
         return ""

@@ -1,4 +1,4 @@
-"""What a disk does not take, as a named error; and writing that nobody waits for."""
+"""Named errors for failed writes, and non-blocking writing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BY_UMASK = 0o666
 
 @contextmanager
 def writing(path: Path, option: str = "") -> Iterator[None]:
-    """Around the writing of a file or folder: an `OSError` becomes a `ReportError` that names it.
+    """Context manager: an `OSError` becomes a `ReportError` with the file's name.
 
     option: through which it was asked for, e.g. ``--out``.
     """
@@ -28,7 +28,7 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
 
 
 def made_folder(path: Path, option: str = "") -> Path:
-    """The folder, made where it is missing. `ReportError` where it cannot be."""
+    """Create the folder if it is missing; `ReportError` if that fails."""
     if path.is_file():
         raise ReportError(f"{option} {path}: is a file; give a folder".lstrip())
     with writing(path, option):
@@ -37,8 +37,8 @@ def made_folder(path: Path, option: str = "") -> Path:
 
 
 def result_file(path: Path, option: str, suffixes: tuple[str, ...], *inputs: Path | None) -> Path:
-    """A file that may be written, or replaced, with a result. `ReportError` where it has another
-    suffix, is one of the inputs, or lies in a tile cache.
+    """Check that a result may be written to a file. `ReportError` if it has another suffix, is one
+    of the inputs, or lies in a tile cache.
     """
     if path.suffix.lower() not in suffixes:
         raise ReportError(f"{option} {path}: give a file that ends in {' or '.join(suffixes)}")
@@ -47,9 +47,7 @@ def result_file(path: Path, option: str, suffixes: tuple[str, ...], *inputs: Pat
 
 
 def refuse_input(path: Path, option: str, *inputs: Path | None) -> None:
-    """`ReportError` where a file to be written is one that was given to be read, or lies in a tile
-    cache.
-    """
+    """`ReportError` if an output file is one of the inputs, or lies in a tile cache."""
     for given in inputs:
         if given is not None and path.exists() and given.exists() and path.samefile(given):
             raise ReportError(f"{option}: would replace {given}, which is read; give another one")
@@ -58,10 +56,10 @@ def refuse_input(path: Path, option: str, *inputs: Path | None) -> None:
 
 
 class NewestFile:
-    """A file that always holds the newest text, whole. A thread of its own writes it: a disk that
-    stands still keeps nobody else from working, and what it is too slow for is left out.
+    """A file with the newest text, replaced atomically by its own thread, so that a slow disk
+    blocks nobody; texts that it is too slow for are skipped.
 
-    failed: called once, in that thread, with what the disk said.
+    failed: called in that thread with the error.
     """
 
     def __init__(self, path: Path, failed: Callable[[OSError], None]) -> None:
@@ -72,16 +70,16 @@ class NewestFile:
         self._thread = threading.Thread(target=self._run, name=path.name, daemon=True)
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start the thread."""
         self._thread.start()
 
     def put(self, text: str) -> None:
-        """The text that it is to hold from now on. Never blocks."""
+        """Set the text to write. Never blocks."""
         self._newest = text
         self._wake.set()
 
     def stop(self, patience_s: float = 2.0) -> None:
-        """Write the last text and end; a disk that does not respond is left behind."""
+        """Write the last text and end; a disk that hangs is not waited for."""
         self._stopping = True
         self._wake.set()
         self._thread.join(patience_s)

@@ -40,19 +40,19 @@ class BoardPage:
 
 
 def charuco() -> cv2.aruco.CharucoBoard:
-    """The board, a square's side being one: the optics do not depend on its size."""
+    """The ChArUco board with a square's side of 1; the calibration does not need its size."""
     dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
     return cv2.aruco.CharucoBoard((ACROSS, DOWN), 1.0, _MARKER, dictionary)
 
 
 def board_picture(dots: int = _DOTS_PER_SQUARE) -> Image:
-    """(11 dots, 8 dots) grey, without a margin."""
+    """The board as a grey image (11 dots, 8 dots), without a margin."""
     picture = charuco().generateImage((ACROSS * dots, DOWN * dots), marginSize=0)
     return np.asarray(picture, np.uint8)
 
 
 def write_sheet(path: Path, paper: Paper) -> BoardPage:
-    """A PDF or PNG, by the name's ending; `ReportError` for another or where it cannot be written.
+    """Write the board as PDF or PNG, by the file's suffix; `ReportError` for others.
 
     Printed at 100 %, a square has the side that the sheet says: a ruler tells.
     """

@@ -1,8 +1,8 @@
 """Residuals of a flight's images and autopilot data for a set of calibration values.
 
-Pictures: the pixels in which they show the map's points, whatever the pose. Autopilot: attitude
-(through the gimbal) and place, at the stamp less the lateness. Everything is vectorised over the
-frames, so that derivatives are differences: 25 evaluations of some milliseconds.
+Images: pixels of the map's points. Autopilot: attitude (through the gimbal) and position, at the
+timestamp minus the time offset. All frames are evaluated at once, so derivatives are finite
+differences: 25 evaluations of some milliseconds.
 """
 
 from __future__ import annotations

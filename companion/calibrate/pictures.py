@@ -1,8 +1,8 @@
-"""Measure where an image shows points of the map, patch by patch, without a camera model.
+"""Measures where an image shows points of the map, patch by patch, without a camera model.
 
-Each part of the picture (13 of them side by side) is shifted by itself until its features lie on
-the map's, by least squares over the anchors in it. What is left over in one direction, or grows
-from the middle, is the model's error and not the pose's.
+Each of 13 patches of the image is shifted until its features match the map's, by least squares.
+Remaining shifts in one direction, or growing from the centre, are errors of the camera model and
+not of the pose.
 """
 
 from __future__ import annotations

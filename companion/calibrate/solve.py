@@ -1,8 +1,8 @@
 """Least squares over all frames: the shared values and every frame's pose.
 
-The pictures' noise is white between parts; attitude and place by the autopilot wander for seconds,
-so each is a Gauss-Markov process (`wander`) whose strength and memory are taken from what is left
-over.
+Image noise is independent between patches. Errors of the autopilot's attitude and position are
+correlated over seconds, so each is a Gauss-Markov process (`wander`) whose sigma and correlation
+time are estimated from the residuals.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""How strongly the errors of neighbouring pictures are correlated, and the effect on the sigmas.
+"""Correlation of the errors of neighbouring images, and its effect on the sigmas.
 
-Pictures of the same ground show the same roofs and trees: where the map errs there, all of them
-err, and a second picture tells little that the first did not, be it the next one or of another
-leg over it. So the pictures' part of the covariance is not the sum of each one's own noise, but is
-taken from how each of them does pull at the numbers, with those that look near it (Conley 1999).
+Images of the same ground have the same map errors, so a second image adds little information. The
+images' part of the covariance is therefore computed from each image's gradient together with those
+of neighbouring images (Conley 1999).
 """
 
 from __future__ import annotations

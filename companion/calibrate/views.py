@@ -1,4 +1,4 @@
-"""Views of the board: which to keep, and which are missing."""
+"""Selects views of the calibration board, and names the missing ones."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _DOWN = ("top", "upper half", "lower half", "bottom")
 
 @dataclass(frozen=True)
 class BoardView:
-    """The board in one picture. objects: (N, 3), in squares; pixels: (N, 2), centres at + 0.5;
-    signature: (5,) place, size and tilt, one each being a large change.
+    """The board in one image. objects: (N, 3), in squares; pixels: (N, 2), centres at + 0.5;
+    signature: (5,) position, size and tilt, scaled so that 1 is a large change.
     """
 
     objects: Array
@@ -72,7 +72,7 @@ class BoardViews:
         return "taken"
 
     def missing(self) -> list[str]:
-        """What the next views should show; empty: enough."""
+        """What the next views should show; empty if there are enough."""
         wanted = []
         cells = np.zeros((_ROWS, _COLUMNS), int)
         for view in self.views:

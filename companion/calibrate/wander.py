@@ -1,10 +1,9 @@
 """Errors that are correlated in time: their sigma and correlation time.
 
-Each source is a Gauss-Markov process. Places err along the world's axes, each for itself. Attitudes
-err about the camera's axes, and about the vertical: a heading's error turns a camera that looks
-straight down about its boresight, and one that looks ahead sideways. A gimbal's own errors change
-within seconds, a compass's within a minute. Told apart, a heading does not hide the mounting, and
-what is said of both is as unsure as it is.
+Each source is a Gauss-Markov process. Positions have errors along the world's axes. Attitudes have
+errors about the camera's axes (gimbal, seconds) and about the vertical (compass, a minute).
+Separating the two keeps a heading error from hiding the boresight error, and gives correct sigmas
+for both.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _FEW = 100  # frames suffice for the sigmas
 
 @dataclass(frozen=True)
 class GaussMarkovProcess:
-    """Along three axes, each for itself. sigma, memory_s: (3,)."""
+    """Independent along three axes. sigma, memory_s (correlation time): (3,)."""
 
     sigma: Array
     memory_s: Array
@@ -49,9 +48,9 @@ class GaussMarkovProcess:
 
     @classmethod
     def of(cls, left: Array, times_s: Array, least: float) -> GaussMarkovProcess:
-        """Of what is left over, (K, 3), whose mean was taken off it: by restricted likelihood
-        (Patterson and Thompson 1971), and of memories that are about as likely the longest. Else
-        what lasts looks shorter and smaller than it is, and so do the sigmas of what is found.
+        """Estimate from residuals (K, 3) without their mean, by restricted likelihood (Patterson
+        and Thompson 1971); of equally likely correlation times the longest. Otherwise correlation
+        time and sigmas would be too small.
         """
         sigmas, memories = np.zeros(3), np.zeros(3)
         gaps, free_of_mean = np.diff(times_s), len(times_s) - 1
@@ -69,9 +68,9 @@ class GaussMarkovProcess:
         return cls(sigmas, memories)
 
     def over_long_steps(self, left: Array, times_s: Array) -> GaussMarkovProcess:
-        """The same memories, with no smaller sigmas than steps of `_LONG_STEP_S` say. From picture
-        to picture an EKF smooths its receiver's errors, and the poses that were solved for follow
-        it: those steps are too small for how far it strays in a minute. left: (K, 3).
+        """The same correlation times, with sigmas not smaller than steps over `_LONG_STEP_S` show.
+        An EKF smooths its receiver's errors from frame to frame, so short steps underestimate its
+        drift. left: residuals (K, 3).
         """
         spacing_s = max(float(np.median(np.diff(times_s))), 1e-3)
         stride = max(1, round(_LONG_STEP_S / spacing_s))
@@ -146,8 +145,8 @@ class AttitudeProcess:
 
 
 class Likelihood:
-    """Minus twice the logarithm of the restricted likelihood, and its derivatives by the logarithms
-    of five sigmas and of the memory.
+    """Minus twice the log of the restricted likelihood, with derivatives by the logarithms of five
+    sigmas and of the correlation time.
     """
 
     def __init__(self, left: Array, up: Array, times_s: Array, white: float) -> None:

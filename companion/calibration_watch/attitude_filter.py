@@ -1,7 +1,7 @@
-"""Estimate boresight and time offset from the registered attitude, gimbal and autopilot.
+"""Estimates boresight and time offset from registered attitude, gimbal and autopilot.
 
-What is mounted wrong, or what the gimbal or compass gets wrong, is off by the same angle always;
-what is stamped late is off by the turn rate times the delay.
+A mounting, gimbal or compass error is a constant angle. A time offset is an angle of turn rate
+times delay.
 """
 
 from __future__ import annotations

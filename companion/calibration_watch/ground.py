@@ -1,7 +1,7 @@
 """Distance to the ground and width of the view, which scale the effect of calibration errors.
 
-The height above take-off is neither: an aircraft that left a hill flies over a valley below zero,
-and a lens that zooms sees another piece of the same ground. The registered pictures know both.
+Registered frames give both. The height above take-off does not: the terrain may be lower or higher,
+and a lens may zoom.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""Estimate focal length and time offset from vision's position.
+"""Estimates focal length and time offset from vision's position.
 
-A focal length that is long by a share e puts the camera e times the ground's distance too far back
-along its optical axis: the error changes with the axis (a turn, another gimbal pitch) and with the
-height, and a shifted map's or a biased receiver's does not. Stamps that are late by tau put
-the vehicle v tau behind: with the velocity the error changes. One Kalman filter holds both against
-the IMU, against the EKF's position while that is GNSS's, and against the heights of GNSS and the
-barometer, with the biases of all of them as states. Nothing that vision fed to the EKF is evidence.
+A focal length that is too long by a share e puts the camera e times the ground distance too far
+back along its optical axis; this error changes with axis and height, and a map offset does not. A
+delay tau puts the vehicle v tau behind. One Kalman filter compares with the IMU, the EKF's position
+while it uses GNSS, and the heights of GNSS and barometer; their biases are states. Data that depend
+on injected positions are not used.
 """
 
 from __future__ import annotations

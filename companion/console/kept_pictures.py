@@ -19,8 +19,8 @@ from localizer.geometry.pose import Pose, quaternion_from_matrix
 
 
 class KeptPictures:
-    """Returns each frame once, at its time. pictures: renderer of the map; without it there is no
-    map view.
+    """Returns each recorded frame once, at its time, with the map's view. pictures: renderer of the
+    map, None: no map view.
     """
 
     def __init__(self, tables: RecordTables, pictures: MapPictures | None) -> None:

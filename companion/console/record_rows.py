@@ -1,4 +1,4 @@
-"""Rows of a record as the page's state has them."""
+"""Converts rows of a record's tables to the state document of the web page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TARGET_NUMBERS = (
 
 
 def last(columns: Columns, name: str, now_ns: int) -> int | None:
-    """The number of the last row up to a time."""
+    """Index of the last row at or before a time."""
     if not columns:
         return None
     row = int(np.searchsorted(columns[name], now_ns, side="right")) - 1
@@ -24,7 +24,7 @@ def last(columns: Columns, name: str, now_ns: int) -> int | None:
 
 
 def estimate_of(columns: Columns, row: int) -> dict[str, Any]:
-    """An estimate's row; None for what is no number."""
+    """One row of the estimates as JSON data; NaN becomes None."""
 
     def number(name: str) -> float | None:
         value = float(columns[name][row]) if name in columns else float("nan")
@@ -66,7 +66,7 @@ def _heading_deg(columns: Columns, row: int) -> float | None:
 
 
 def target_of(columns: Columns, name: str, row: int) -> dict[str, Any] | None:
-    """A target's row; None where a number lacks: browsers read no NaN."""
+    """One row of a target as JSON data; None if a number is missing."""
     numbers = {key: float(columns[key][row]) for key in _TARGET_NUMBERS if key in columns}
     if len(numbers) < len(_TARGET_NUMBERS) or not all(map(np.isfinite, numbers.values())):
         return None

@@ -1,4 +1,4 @@
-"""The records beside the deployment's own, to list and to download."""
+"""Lists the flight records beside the deployment's own, for download."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class RecordFolder:
 
 
 class Records:
-    """Finds records by names that it listed itself, so no path is taken from a request."""
+    """Finds records by names that it listed itself, so that a request cannot give a path."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
 
     def listed(self) -> list[RecordFolder]:
-        """Every record, newest first. Links are left out: `latest`, and what leads elsewhere."""
+        """Every record, newest first; links are left out."""
         if self._folder is None or not self._folder.is_dir():
             return []
         found = []
@@ -55,10 +55,7 @@ class Records:
 
 
 def archive(record: RecordFolder) -> Iterator[bytes]:
-    """The record as a .tar, piece by piece. Only plain files of the folder itself go in. Of a file
-    that is read no more than a piece is in memory: a .tlog may have two GiB, and the flight needs
-    its own.
-    """
+    """Yield the record as a .tar in pieces, plain files only, with bounded memory."""
     for path in _plain_files(record.path):
         try:
             file = path.open("rb")

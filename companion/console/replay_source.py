@@ -54,10 +54,10 @@ class ReplaySource:
         return True
 
     def watch(self, wanted: bool) -> None:
-        """Pictures are read when their time comes, wanted or not."""
+        """Does nothing: frames are read when their time comes."""
 
     async def changed(self) -> None:
-        """Returns with the next step."""
+        """Return at the next step."""
         await self._event.wait()
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:

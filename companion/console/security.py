@@ -1,8 +1,8 @@
 """Checks every request and WebSocket before anything else handles it.
 
-Attacks thought of: a page of another site that the operator also has open (Origin, Host, a header
-that forms cannot set), a name that is made to point here (Host), somebody on the network (token,
-TLS), floods (rates, sizes), and text of a record that is script (CSP).
+Threats: another site open in the operator's browser (Origin, Host, a header that forms cannot set),
+DNS rebinding (Host), another host on the network (token, TLS), floods (rate and size limits),
+script in a record's text (CSP).
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class RefusedError(CompanionError):
 
 
 class Pages:
-    """The open pages, and the images that they share."""
+    """The connected browser pages and their shared images."""
 
     def __init__(self, source: ConsoleSource) -> None:
         self._source = source
@@ -71,7 +71,7 @@ class Pages:
         self._making = asyncio.Lock()
 
     async def serve(self, socket: WebSocket) -> None:
-        """One page, until it goes. It gets what is newest; what it was too slow for is gone."""
+        """Send the newest data to one page until it disconnects; older data are skipped."""
         await socket.accept()
         if len(self._open) >= _MOST_PAGES:
             await socket.close(1013, "too many pages are open")
@@ -160,7 +160,7 @@ def _width_px(wished: Any) -> int:
 
 
 class Views:
-    """One method for each address. Named errors become one line."""
+    """HTTP handlers, one method for each address. Named errors become one line."""
 
     def __init__(self, site: ConsoleSite) -> None:
         self._site = site
@@ -172,7 +172,7 @@ class Views:
         return HTMLResponse((_STATIC / "index.html").read_text(encoding="utf-8"))
 
     async def about(self, _: Request) -> Response:
-        """What the page may do, and the map."""
+        """The page's rights, and the map."""
         tiles = await run_in_threadpool(self._opened_tiles)
         return JSONResponse(
             {
@@ -189,7 +189,7 @@ class Views:
         return JSONResponse({"samples": list(newest.samples), "events": list(newest.events)})
 
     async def tile(self, request: Request) -> Response:
-        """The map from above."""
+        """One map tile, seen from above."""
         name = TileName(*(request.path_params[k] for k in ("z", "x", "y")))
         tiles = await run_in_threadpool(self._opened_tiles)
         data = await run_in_threadpool(tiles.tile, name)
@@ -199,7 +199,7 @@ class Views:
         return Response(data, media_type="image/jpeg", headers=headers)
 
     async def targets(self, request: Request) -> Response:
-        """The targets for other programs."""
+        """Targets as GeoJSON or Cursor on Target."""
         found = ((self._site.source.newest.state or {}).get("targets")) or []
         if request.path_params["kind"] == "geojson":
             text, kind = json.dumps(exports.geojson(found)), "application/geo+json"
@@ -209,7 +209,7 @@ class Views:
         return Response(text, media_type=kind, headers=_attachment(name))
 
     async def order(self, request: Request) -> Response:
-        """Targets and hints: what may be done in the air, too."""
+        """Orders that are allowed in flight: targets and position hints."""
         self._require_control()
         order = await _object(request)
         if order.get("do") not in ("target", "box", "stop", "hint"):
@@ -219,7 +219,7 @@ class Views:
         return JSONResponse({"ok": ok, "text": text}, status_code=200 if ok else 409)
 
     async def examine(self, request: Request) -> Response:
-        """The doctor: POST begins it, GET tells how far it is."""
+        """The doctor: POST starts it, GET returns its output so far."""
         if self._examination is None:
             raise RefusedError("there is no deployment to examine")
         if request.method == "POST":
@@ -231,7 +231,7 @@ class Views:
         return JSONResponse(self._examination.report())
 
     async def settings(self, request: Request) -> Response:
-        """The deployment file: GET shows it, POST checks or writes it."""
+        """The deployment file: GET returns it, POST checks or writes it."""
         path = self._site.deployment
         if path is None:
             raise RefusedError("there is no deployment to show")
@@ -253,7 +253,7 @@ class Views:
         return JSONResponse({"ok": True, "text": told})
 
     async def records(self, _: Request) -> Response:
-        """What there is to download."""
+        """List of the records for download."""
         listed = await run_in_threadpool(self._site.records.listed)
         keys = ("name", "started_utc_ns", "ended")
         return JSONResponse([{k: asdict(r)[k] for k in keys} for r in listed])
@@ -276,14 +276,14 @@ class Views:
         return HTMLResponse(text, headers={"content-security-policy": REPORT_POLICY})
 
     async def seek(self, request: Request) -> Response:
-        """Of a replay: the time bar."""
+        """Move a replay to another time."""
         if not self._site.replay:
             raise RefusedError("a flight that runs has no time bar")
         ok, text = await self._site.source.order(await _object(request))
         return JSONResponse({"ok": ok, "text": text}, status_code=200 if ok else 409)
 
     def close(self) -> None:
-        """Release what is open."""
+        """Close what is open."""
         if self._tiles is not None:
             self._tiles.close()
 
@@ -305,7 +305,7 @@ class Views:
 
 
 def make_application(site: ConsoleSite) -> RequestGuard:
-    """The whole site."""
+    """The complete web application of the console."""
     views, pages = Views(site), Pages(site.source)
 
     @contextlib.asynccontextmanager

@@ -28,7 +28,7 @@ class RequestTimeoutProtocol(H11Protocol):
 
     @property
     def due_s(self) -> float | None:
-        """When the request must be whole, on the loop's clock; None while none is waited for."""
+        """Time limit of the request, on the loop's clock; None without a request."""
         return None if self._deadline is None else self._deadline.when()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -61,7 +61,7 @@ class RequestTimeoutProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def give_up(self) -> None:
-        """Close it, without a word to who would not read it."""
+        """Close the connection without an answer."""
         self._end()
         self.transport.abort()
 
@@ -75,7 +75,7 @@ class RequestTimeoutProtocol(H11Protocol):
 
 
 class Server(uvicorn.Server):
-    """The site's server. told: called once the page can be opened."""
+    """The console's HTTP server. told: called once the page can be opened."""
 
     def __init__(self, site: ConsoleSite, told: Callable[[], None]) -> None:
         config = site.config

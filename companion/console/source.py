@@ -14,8 +14,8 @@ _EVENTS = 1000
 
 @dataclass
 class Newest:
-    """What came last, and what is kept of what came before. counts: how many states and pictures
-    there were, by which a page sees that there is a new one.
+    """The newest messages of a flight, and a short history. states, frames: counters by which a
+    page notices new data.
     """
 
     hello: dict[str, Any] | None = None
@@ -27,7 +27,7 @@ class Newest:
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
 
     def take(self, message: Message) -> None:
-        """Note a message of the flight."""
+        """Store a message of the flight."""
         kind = message.head.get("kind")
         if kind == "hello":
             self.hello = message.head
@@ -45,7 +45,7 @@ class Newest:
                 self.samples.append(sample)
 
     def is_armed(self) -> bool | None:
-        """Whether the vehicle is; None where that is not known although a flight runs."""
+        """Whether the vehicle is armed; None if unknown during a flight."""
         if self.hello is None:
             return False
         vehicle = (self.state or {}).get("vehicle") or {}
@@ -53,37 +53,37 @@ class Newest:
 
 
 class ConsoleSource(Protocol):
-    """A flight, or a record."""
+    """Data source of the console: a running flight or a record."""
 
     @property
     def newest(self) -> Newest:
-        """What is to be shown."""
+        """The data to show."""
         ...
 
     @property
     def is_connected(self) -> bool:
-        """Whether it gives anything now."""
+        """Whether the source delivers data now."""
         ...
 
     def watch(self, wanted: bool) -> None:
-        """Whether pictures are wanted."""
+        """Request or stop frames."""
         ...
 
     async def changed(self) -> None:
-        """Returns when there is something new."""
+        """Return when there are new data."""
         ...
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """Ask for something to be done; whether it was, and what or why not."""
+        """Send an order; returns whether it was executed, and a text."""
         ...
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run until cancelled."""
         ...
 
 
 def sample_of(state: dict[str, Any]) -> dict[str, Any]:
-    """One second of the plots: t in seconds of UTC; what is not known is None."""
+    """One sample of the plots from a state document: t in seconds UTC; None if unknown."""
     estimate = state.get("estimate") or {}
     health = state.get("health") or {}
     integrity_monitor = health.get("guardian") or {}

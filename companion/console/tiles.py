@@ -27,7 +27,7 @@ _QUALITY = 80
 
 @dataclass(frozen=True)
 class TileName:
-    """Of one tile."""
+    """Zoom and indices of a web map tile."""
 
     zoom: int
     x: int
@@ -35,7 +35,7 @@ class TileName:
 
     @property
     def is_valid(self) -> bool:
-        """Whether there is such a tile on Earth, at a zoom that is drawn."""
+        """Whether the tile exists, at a supported zoom."""
         if not _LEAST_ZOOM <= self.zoom <= _MOST_ZOOM:
             return False
         side = 1 << self.zoom  # of a checked zoom: an address could ask for gigabytes of it
@@ -51,12 +51,12 @@ class TileName:
 
     @property
     def side_m(self) -> float:
-        """Its side on the ground."""
+        """Side length on the ground, m."""
         return _EQUATOR_M * math.cos(math.radians(self.centre[0])) / (1 << self.zoom)
 
 
 class TopTiles:
-    """Renders on demand, one tile at a time, and caches the last ones."""
+    """Renders tiles of the map on demand, with a cache."""
 
     def __init__(self, map_path: Path) -> None:
         self._cache = TileCache.open(map_path)
@@ -66,8 +66,8 @@ class TopTiles:
         self._renderer: NumbaRenderer | None = None
 
     def about(self) -> dict[str, Any]:
-        """What the page needs to place the map. Across the 180th meridian longitudes go on beyond
-        it: a page's box from 179 to -179 degrees would be the rest of the Earth.
+        """Position of the map for the page. Across the 180th meridian, longitudes continue beyond
+        180.
         """
         manifest, frame = self._cache.manifest, self._cache.frame
         low, high = self._cache.index.box_min[0], self._cache.index.box_max[0]
@@ -85,7 +85,7 @@ class TopTiles:
         }
 
     def tile(self, name: TileName) -> bytes | None:
-        """The tile as JPEG; None beside the map."""
+        """The tile as JPEG; None outside the map."""
         if not name.is_valid:
             return None
         frame = self._cache.frame

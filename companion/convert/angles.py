@@ -1,6 +1,6 @@
-"""The angle conventions around a camera's pose (docs/reference/angles.md), turned into each other.
+"""Converts between the angle conventions of camera poses (docs/reference/angles.md).
 
-Everything meets in one place: NED from camera, (3, 3), axes OpenCV, at the camera's position.
+Common form: NED from camera (3, 3), OpenCV axes, at the camera's position.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LOCKED = 1e-9  # cosine of a pitch at which roll and yaw turn about the same ax
 
 @dataclass(frozen=True)
 class Angles:
-    """Rz(yaw) Ry(pitch) Rx(roll), in degrees: a body's in NED, or a gimbal's."""
+    """Euler angles Rz(yaw) Ry(pitch) Rx(roll), degrees, of a body in NED or of a gimbal."""
 
     roll_deg: float
     pitch_deg: float
@@ -82,19 +82,19 @@ def autopilot_of_pose(
 
 
 def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Angles:
-    """The angles of a gimbal against north and the horizon, as DJI's XMP tells them."""
+    """Gimbal angles of a pose relative to north and the horizon, as in DJI's XMP."""
     to_ned = ned_from_world(frame, frame.position(pose.translation))
     return angles_of_matrix(to_ned @ pose.rotation @ GIMBAL_FROM_CAMERA.T)
 
 
 def pose_of_gimbal(position: Geodetic, gimbal: Angles, frame: LocalFrame) -> Pose:
-    """Inverse of `gimbal_of_pose`, with the camera's place."""
+    """Inverse of `gimbal_of_pose` for a camera position."""
     angles = AutopilotAngles("", None, position, Angles(0.0, 0.0, 0.0), gimbal, GimbalFrame.EARTH)
     return pose_of_autopilot(angles, frame)
 
 
 def angles_of_matrix(R: Array) -> Angles:
-    """Euler angles of a rotation (3, 3). Straight down, where roll and yaw are one, roll is 0."""
+    """Euler angles of a rotation (3, 3). At pitch -90, where roll and yaw merge, roll is 0."""
     if np.hypot(R[0, 0], R[1, 0]) < _LOCKED:
         pitch = float(np.copysign(np.pi / 2, -R[2, 0]))
         roll, yaw = 0.0, float(np.arctan2(-R[0, 1], R[1, 1]))

@@ -1,6 +1,6 @@
-"""Reading and writing camera poses: one reader and one writer a format.
+"""Reads and writes camera poses: one reader and one writer for each format.
 
-All poses are `StampedPose` in the map's ENU frame in between.
+The common form is `StampedPose` in the map's ENU frame.
 """
 
 from __future__ import annotations

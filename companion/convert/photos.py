@@ -1,5 +1,6 @@
-"""Poses in photos' tags, and tags of poses as XMP sidecars. `companion.recorded.photo_tags` reads
-them; here stands what a pose needs beyond a prior: all angles, and heights above one surface.
+"""Converts photo tags to poses, and poses to XMP sidecars.
+
+Uses `companion.recorded.photo_tags`; a pose also needs all angles, and heights above one surface.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Heights:
 
     @property
     def lift_m(self) -> float:
-        """What is added to a tag's height to be above the ellipsoid."""
+        """Value to add to a tag's height to obtain the ellipsoidal height, m."""
         return self.separation_m if self.datum == "amsl" else 0.0
 
 
@@ -52,8 +53,8 @@ def read_photos(
     heights: Heights | None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[StampedPose, ...]:
-    """The pose of each photo of a folder, by name, or of one photo. tell: takes what is odd about
-    the tags and does not make them wrong. `PoseFileError` if there is no photo.
+    """Poses of one photo or of a folder's photos, by name. tell: receives warnings about the tags.
+    `PoseFileError` if there is no photo.
     """
     known = _known(path, heights)
     photos = [path]
@@ -135,7 +136,7 @@ def _home_m(tags: PhotoTags) -> float:
 def write_sidecars(
     folder: Path, poses: Sequence[StampedPose], frame: LocalFrame, heights: Heights | None
 ) -> None:
-    """``NAME.xmp`` per pose, with DJI's tags; photos themselves are never changed."""
+    """Write ``NAME.xmp`` with DJI's tags for each pose; photos are not changed."""
     lift = _known(folder, heights).lift_m
     folder.mkdir(parents=True, exist_ok=True)
     for pose in poses:

@@ -30,8 +30,8 @@ _FIX_3D = 3
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: `rows` of tables, pictures and MAVLink, as so many messages of all topics.
-    notes: what the record lacks.
+    """Result of an export. rows: rows, images and MAVLink messages read; messages: written, of all
+    topics; notes: missing parts of the record.
     """
 
     path: Path
@@ -41,7 +41,7 @@ class Exported:
 
 
 def require_extra() -> None:
-    """`ConfigError` where the packages of the extra `mcap` are not installed."""
+    """`ConfigError` if the packages of the extra `mcap` are not installed."""
     try:
         import_module("companion.export.mcap_file")
     except ImportError as error:

@@ -24,8 +24,8 @@ _PROFILE = ""  # Foxglove's schemas need none
 
 
 class McapFile:
-    """Takes a flight's rows. clock_offset_ns: from CLOCK_MONOTONIC to UTC; camera: of the pictures,
-    None leaves out its calibration.
+    """Writes rows of a flight to an MCAP file. clock_offset_ns: from CLOCK_MONOTONIC to UTC;
+    camera: of the images, None: no calibration.
     """
 
     def __init__(self, path: Path, clock_offset_ns: int, camera: Camera | None) -> None:
@@ -40,7 +40,7 @@ class McapFile:
         """How many were written, of all topics; a row can be several."""
 
     def estimate(self, row: Row) -> None:
-        """A row of ``estimates.csv``: its diagnostics, and where it is accepted the pose."""
+        """Write a row of ``estimates.csv``: diagnostics and, if accepted, the pose."""
         time_ns = self._utc_ns(row["exposure_time_ns"])
         self._put_json("/diagnostics", messages.diagnostics(row, time_ns), time_ns)
         if messages.is_accepted(row):
@@ -49,18 +49,18 @@ class McapFile:
             self.put("/vision/location", messages.location(row, time_ns), time_ns)
 
     def target(self, row: Row) -> None:
-        """A row of ``targets.csv``."""
+        """Write a row of ``targets.csv``."""
         time_ns = self._utc_ns(row["exposure_time_ns"])
         self.put("/targets", messages.target(row, time_ns), time_ns)
         self.put("/targets/map", messages.target_on_map(row), time_ns)
 
     def event(self, row: Row) -> None:
-        """A row of ``events.csv``."""
+        """Write a row of ``events.csv``."""
         time_ns = self._utc_ns(row["time_ns"])
         self.put("/events", messages.event(row, time_ns), time_ns)
 
     def image(self, jpeg: bytes, exposure_time_ns: int) -> None:
-        """A picture that was kept, with its calibration."""
+        """Write a recorded image with its calibration."""
         time_ns = self._utc_ns(exposure_time_ns)
         if self._camera is not None:
             calibration = messages.calibration(self._camera, time_ns)
@@ -68,7 +68,7 @@ class McapFile:
         self.put("/camera/image", messages.image(jpeg, time_ns), time_ns)
 
     def put(self, topic: str, message: Any, time_ns: int) -> None:
-        """A message of Foxglove's schemas, at its time in UTC."""
+        """Write a message of Foxglove's schemas."""
         kind = type(message)
         name = kind.DESCRIPTOR.full_name
         if name not in self._schemas:
@@ -76,7 +76,7 @@ class McapFile:
         self._add(topic, "protobuf", self._schemas[name], message.SerializeToString(), time_ns)
 
     def attach(self, path: Path) -> None:
-        """A document of the record, as it is."""
+        """Attach a file of the record unchanged."""
         time_ns = path.stat().st_mtime_ns
         self._writer.add_attachment(
             time_ns, time_ns, path.name, "application/json", plain_bytes(path)

@@ -1,8 +1,8 @@
-"""Rows of a record as messages of Foxglove's published schemas (package foxglove-schemas-protobuf).
+"""Converts rows of a record to messages of Foxglove's schemas (package foxglove-schemas-protobuf).
 
-A row maps a table's column names to numbers or to the text of numbers, so that rows of a file and
-rows of a flight that runs are the same. Frames: "map" is the map's east, north, up in metres;
-"camera" is OpenCV's, x right, y down, z forward. Heights are above the WGS84 ellipsoid.
+A row maps column names to numbers or their text, so that recorded and live rows are processed
+alike. Frames: "map" is the map's ENU in metres; "camera" is OpenCV's: x right, y down, z forward.
+Heights are above the WGS84 ellipsoid.
 """
 
 from __future__ import annotations
@@ -69,18 +69,18 @@ _SEVERITIES = (
 
 
 def stamp(time_ns: int) -> Timestamp:
-    """Nanoseconds of UTC."""
+    """Timestamp of UTC nanoseconds."""
     return Timestamp(seconds=time_ns // 1_000_000_000, nanos=time_ns % 1_000_000_000)
 
 
 def pose(row: Row, time_ns: int) -> PoseInFrame:
-    """The camera in the map."""
+    """Pose of the camera in the frame "map"."""
     at = Pose(position=_vector(row), orientation=_quaternion(row))
     return PoseInFrame(timestamp=stamp(time_ns), frame_id=WORLD, pose=at)
 
 
 def transform(row: Row, time_ns: int) -> FrameTransforms:
-    """The same for whatever is shown in the camera's frame."""
+    """Transform from "map" to "camera", for data shown in the camera's frame."""
     return FrameTransforms(
         transforms=[
             FrameTransform(
@@ -100,7 +100,7 @@ _COLOURS = {
 
 
 def location(row: Row, time_ns: int) -> LocationFix:
-    """The camera on the Earth; of its covariance the diagonal is recorded."""
+    """Position of the camera in WGS84, with the recorded diagonal of its covariance."""
     sigma = [float(row[f"sigma_{axis}_m"]) for axis in _AXES]
     covariance = [sigma[i] ** 2 if i == j else 0.0 for i in range(3) for j in range(3)]
     return LocationFix(
@@ -143,17 +143,17 @@ def diagnostics(row: Row, time_ns: int) -> dict[str, Any]:
 
 
 def is_accepted(row: Row) -> bool:
-    """Whether an estimate counts."""
+    """Whether the row's estimate was accepted."""
     return float(row["accepted"]) > 0
 
 
 def image(jpeg: bytes, time_ns: int) -> CompressedImage:
-    """A picture that was kept."""
+    """A recorded JPEG image."""
     return CompressedImage(timestamp=stamp(time_ns), frame_id=CAMERA, data=jpeg, format="jpeg")
 
 
 def calibration(camera: Camera, time_ns: int) -> CameraCalibration:
-    """Of the pictures; the first pixel's centre is (0, 0) there and (0.5, 0.5) here."""
+    """Camera calibration; the first pixel's centre is (0, 0) there and (0.5, 0.5) here."""
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5
     return CameraCalibration(
         timestamp=stamp(time_ns), frame_id=CAMERA, width=camera.width, height=camera.height,
@@ -170,7 +170,7 @@ def _distortion_model(camera: Camera) -> str:
 
 
 def target(row: Row, time_ns: int) -> SceneUpdate:
-    """One target: a ball of one sigma about it, and its name with latitude and longitude."""
+    """A target in 3-D: a sphere of one sigma, and its name with latitude and longitude."""
     name = str(row["target_id"])
     sigma, up = (
         max(_number(row[k]) or 0.0, _LEAST_M) for k in ("sigma_horizontal_m", "sigma_up_m")
@@ -203,7 +203,7 @@ def target(row: Row, time_ns: int) -> SceneUpdate:
 
 
 def target_on_map(row: Row) -> GeoJSON:
-    """The same for a map from above."""
+    """The target as GeoJSON for a 2-D map."""
     numbers = [float(row[k]) for k in ("longitude_deg", "latitude_deg", "height_m")]
     feature = {
         "type": "Feature",
@@ -223,7 +223,7 @@ def event(row: Row, time_ns: int) -> Log:
 
 
 def status_text(text: str, severity: int, sender: str, time_ns: int) -> Log:
-    """MAVLink's STATUSTEXT. severity: MAV_SEVERITY."""
+    """A MAVLink STATUSTEXT as a log message. severity: MAV_SEVERITY."""
     level = _SEVERITIES[severity] if 0 <= severity < len(_SEVERITIES) else Log.UNKNOWN
     return Log(timestamp=stamp(time_ns), level=level, message=text, name=sender)
 

@@ -36,11 +36,11 @@ _SWITCH_S = 0.0002
 
 
 class Companion:
-    """One deployment. `run` blocks until `stop` is called or the feed ends.
+    """The flight process of one deployment.
 
-    pulse: descriptor of the supervisor's pipe, see `Pulse`; None without a supervisor. again:
-    whether another process of this flight died before: it goes on without what is gone.
-    lost_settings: why `config` is not from the deployment's file, which is gone; else empty.
+    `run` blocks until `stop` is called or the feed ends. pulse: descriptor of the supervisor's
+    pipe, see `Pulse`; None without a supervisor. restart: an earlier process of this flight died.
+    lost_settings: why `config` is not from the deployment's file; else empty.
     """
 
     def __init__(

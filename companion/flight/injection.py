@@ -39,8 +39,8 @@ class JumpCounter:
     """Counts the jumps of the estimate (`VisionFix.reset_count`), so that the EKF resets to the new
     position.
 
-    DEGRADED keeps the filter's track: only a new start after LOST is a jump, as the first is, and
-    the map found again after BRIDGING, whose drift it ends.
+    A jump is each start after LOST, also the first, and a registration after BRIDGING, because it
+    corrects the drift. DEGRADED is none.
     """
 
     def __init__(self) -> None:

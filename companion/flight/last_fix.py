@@ -1,9 +1,8 @@
 """Keeps the last confirmed position in a small file, from which a restart in flight continues.
 
-A process that died a few seconds ago has lost its memory, not the place: the tracker itself would
-have coasted over such a gap. What the EKF moved since then is added. Older than `prior.recall_s`,
-of another boot of this computer, or where the EKF knows no way, the file is not used, and the place
-is searched and confirmed as after any loss.
+The EKF's displacement since then is added. The file is not used if it is older than
+`prior.recall_s`, from another boot of this computer, or the EKF's displacement is unknown; the
+position is then searched.
 """
 
 from __future__ import annotations

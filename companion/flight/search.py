@@ -1,6 +1,6 @@
-"""Search the map with one frame while no position is known, on its own thread.
+"""Searches the map with one frame while no position is known, on its own thread.
 
-The answer is no fix: it is a place that the tracker puts on trial (`PosePrior.independent`).
+The result is not a fix: it is a hypothesis that the tracker must confirm (`PosePrior.independent`).
 """
 
 from __future__ import annotations

@@ -23,8 +23,7 @@ def ready(
 ) -> Companion | None:
     """Return the flight process: at once, or when the standby is released; None if it never is.
 
-    pulse, again, lost_settings: see `Companion`; a standby flies after another died, and so always
-    again.
+    pulse, restart, lost_settings: see `Companion`; a standby always is a restart.
     """
     companion = Companion(
         config, pulse=pulse, restart=restart or standby, lost_settings=lost_settings

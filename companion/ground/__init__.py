@@ -1,1 +1,1 @@
-"""What ground stations show beside the camera protocol: figures to plot, files of targets."""
+"""Additional data for ground stations: named values to plot, files of targets."""

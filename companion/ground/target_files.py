@@ -61,7 +61,8 @@ class _TargetRows:
 
 
 def write_target_files(folder: Path) -> int:
-    """Write both files beside ``targets.csv``; returns how many targets. None: no file.
+    """Write both files beside ``targets.csv``; returns the number of targets. No file is written
+    without targets.
 
     Raises OSError.
     """

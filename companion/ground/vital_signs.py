@@ -22,12 +22,12 @@ _NONE, _WEAK, _FULL = 0.0, 1.0, 2.0
 
 
 class VitalSigns:
-    """Counts estimates and sends the numbers every second, on its own thread.
+    """Sends five named values every second, on its own thread.
 
-    VPS_SIGNAL 0 no position, 1 one that is not to be relied on (initializing, degraded, bridging),
-    2 tracking; VPS_RATE accepted positions a second; VPS_AGE seconds since the newest one's
-    exposure; VPS_SIGMA its horizontal sigma, metres; VPS_QUAL its registration's quality, 0 to 1.
-    tell: takes them; must not block.
+    VPS_SIGNAL: 0 no position, 1 not reliable (initializing, degraded, bridging), 2 tracking;
+    VPS_RATE: accepted positions per second; VPS_AGE: seconds since the newest one's exposure;
+    VPS_SIGMA: its horizontal sigma, m; VPS_QUAL: its registration quality, 0 to 1. tell: receives
+    them; must not block.
     """
 
     def __init__(self, tell: Callable[[Mapping[str, float]], None]) -> None:
@@ -54,7 +54,7 @@ class VitalSigns:
             self._accepted.append(estimate)
 
     def figures(self, now_ns: int) -> dict[str, float]:
-        """The numbers at a CLOCK_MONOTONIC time; what is not known is left out."""
+        """The values at a CLOCK_MONOTONIC time; unknown ones are left out."""
         accepted = list(self._accepted)
         recent = sum(1 for e in accepted if 0 <= now_ns - e.exposure_time_ns < _WINDOW_NS)
         figures = {"VPS_SIGNAL": _NONE, "VPS_RATE": recent / (_WINDOW_NS * 1e-9)}

@@ -1,7 +1,7 @@
-"""Raise and clear alerts after a delay, so that they do not alternate.
+"""Raises and clears alerts after a delay, so that they do not alternate.
 
-Alerts that inhibit injection are kept over a restart: a turn or a climb showed them, and may in
-minutes again. Without that, a process that replaces a killed one would begin after two seconds.
+Alerts that inhibit injection survive a restart, because the evidence for them (a turn, a climb) may
+return only after minutes.
 """
 
 from __future__ import annotations

@@ -106,9 +106,9 @@ class _Held:
 class JumpCheck:
     """Holds a position that is farther from the last one than flight explains, for some seconds.
 
-    Meanwhile the last one that passed is carried on by the EKF's velocity, which the held ones do
-    not reach. A fix that comes to where it leads passes at once. What moves otherwise, or whose
-    heading turned as neither gyros nor autopilot did, is not taken by waiting.
+    Meanwhile the last accepted position is propagated by the EKF's velocity, which held fixes do
+    not affect. A fix near the propagated position passes at once. A position that moves unlike the
+    IMU, or whose heading turned unlike gyros and autopilot, does not pass by waiting.
     """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:

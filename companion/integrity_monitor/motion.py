@@ -152,7 +152,7 @@ class StillPosition:
         self._reference: tuple[int, Array] | None = None
 
     def add(self, time_ns: int, here: Array) -> float:
-        """A position (2,), metres; seconds for which it stands still by now."""
+        """Add a position (2,), metres; returns for how many seconds it has not moved."""
         if not self._block:
             self._block_ns = time_ns
         self._block.append(here)

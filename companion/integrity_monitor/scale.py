@@ -1,8 +1,8 @@
-"""By what factor odometry's way is longer than the aircraft's, as far as the IMU can tell.
+"""Estimates the scale error of odometry from the IMU's acceleration.
 
-Odometry measures metres by the height above the ground. Where that is wrong, velocity and
-acceleration are wrong by the same factor. The IMU knows the acceleration: of a turn or a stop well,
-of a straight flight at constant speed nothing at all.
+Odometry scales with the assumed height above ground. A wrong height scales velocity and
+acceleration by the same factor. The IMU measures acceleration in turns and stops; straight flight
+at constant speed gives no information.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ScaleCheck:
         self._restarts = 0
 
     def add(self, fix: VisionFix, *, leaps: bool) -> None:
-        """A fix that the IMU's record reaches, or that is too late. leaps: to another place."""
+        """Add a fix that the IMU's record reaches, or a late one. leaps: it jumped."""
         moved = self._track.at(fix.time_ns)
         if leaps or moved is None or not fix.by_odometry or self._restarts != self._track.restarts:
             self._restarts = self._track.restarts
@@ -85,9 +85,7 @@ class ScaleCheck:
 
     @property
     def wrong_by(self) -> float:
-        """The share of the odometry's velocity that is too much or too little for sure; 0.0 where
-        it is within what the IMU can tell.
-        """
+        """Relative scale error beyond the IMU's uncertainty; 0.0 if it is within."""
         if not self._bends:
             return 0.0
         felt = np.concatenate([one.felt for one in self._bends])

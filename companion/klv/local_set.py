@@ -1,7 +1,7 @@
-"""MISB ST 0601 UAS Datalink Local Set: numbers by tag to bytes and back (SMPTE ST 336 KLV).
+"""MISB ST 0601 UAS Datalink Local Set: encodes numbers by tag to bytes and back (SMPTE ST 336 KLV).
 
-Tags and ranges as of edition 8, which all later ones keep. What lies outside its tag's range is
-left out: a receiver must not be told a limit for a value.
+Tags and ranges as of edition 8, which all later ones keep. A value outside its tag's range is left
+out, because a limit value would be wrong.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ _LONGEST_TEXT = 127
 
 
 def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
-    """One packet: universal label, length, time first, the fields by tag, checksum last.
+    """Encode one packet: universal label, length, time, the fields by tag, checksum.
 
     time_us: microseconds since 1970-01-01. ValueError for a tag that is not known here.
     """
@@ -109,7 +109,7 @@ def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
 
 
 def decode(packet: bytes) -> dict[int, float | str | int]:
-    """Values by tag, `TIME` in microseconds; unknown tags are left out.
+    """Decode a packet to values by tag, `TIME` in microseconds; unknown tags are left out.
 
     ValueError for another label, a packet that is cut short, or a wrong checksum.
     """
@@ -134,7 +134,7 @@ def decode(packet: bytes) -> dict[int, float | str | int]:
 
 
 def read_length(data: bytes, at: int) -> tuple[int, int]:
-    """A BER length at a place, and where its value begins. ValueError where it is cut short."""
+    """Decode a BER length at index `at`; returns it and the value's index, or ValueError."""
     if at >= len(data):
         raise ValueError("a length is missing")
     first = data[at]

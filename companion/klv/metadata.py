@@ -21,7 +21,7 @@ _OFFSET_DEG = 0.075  # the largest corner offset that tags 26 to 33 hold
 
 @dataclass(frozen=True)
 class KlvContext:
-    """What all pictures of a flight share. geoid_m: ellipsoid below sea level is negative."""
+    """Constants of a flight for its metadata. geoid_m: geoid height above the ellipsoid."""
 
     frame: LocalFrame
     cast: RayCaster
@@ -36,7 +36,7 @@ def picture_fields(
     ned_from_body: Array | None = None,
     target: TargetFix | None = None,
 ) -> dict[int, float | str]:
-    """ST 0601 fields of an accepted estimate's picture.
+    """ST 0601 fields of an accepted estimate's frame.
 
     ned_from_body: (3, 3), the aircraft's attitude; None leaves out its angles and those of the
     camera on it. Without map under the centre or a corner these are left out.

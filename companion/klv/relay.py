@@ -1,7 +1,7 @@
 """Forwards the camera's video unchanged, with ST 0601 metadata of its frames.
 
-A packet is held until its picture's pose is known, at most `hold_ms` after it came: a picture that
-was not localized, or too late, goes on without metadata.
+A packet waits for its frame's pose, at most `hold_ms`. A frame without a pose by then is forwarded
+without metadata.
 """
 
 from __future__ import annotations

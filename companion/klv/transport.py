@@ -45,11 +45,11 @@ class TransportWriter:
         self.late = 0
 
     def describe(self, pts: Fraction, metadata: bytes) -> None:
-        """Metadata of the picture at that presentation time, seconds; before its packet."""
+        """Add metadata of the frame with that presentation time (s); call before its packet."""
         heapq.heappush(self._pending, (round(pts / _CLOCK), metadata))
 
     def write(self, packet: av.Packet) -> None:
-        """One packet of the video, and the metadata of pictures up to its decoding time.
+        """Write a video packet and the metadata of frames up to its decoding time.
 
         Pictures are stored in the order in which they are decoded; metadata must be in the order
         of presentation. Raises OSError.
@@ -61,7 +61,7 @@ class TransportWriter:
         self._container.mux(packet)
 
     def close(self) -> None:
-        """Write what is left, and end the file."""
+        """Write the remaining metadata and close the file."""
         self._flush(1 << 62)
         self._container.close()
 

@@ -1,7 +1,7 @@
-"""The older metadata of UAV video: the universal set of EG 0104 (Predator), read.
+"""Reads the older metadata of UAV video: the universal set of EG 0104 (Predator).
 
 Each item has a key of 16 bytes; numbers are IEEE floats. The set is deprecated, but cameras and
-archives still carry it. Keys as in the last column of ST 0601.12, section 8.
+archives still contain it. Keys are in the last column of ST 0601.12, section 8.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _TEXTS = frozenset((tag.MISSION, tag.IMAGE_SOURCE, tag.COORDINATES))
 
 
 def decode_universal(packet: bytes) -> dict[int, float | str | int]:
-    """Values by ST 0601's tag (`ANGLE_TO_NORTH` and `OBLIQUITY` besides), degrees and metres.
+    """Values by ST 0601 tag (plus `ANGLE_TO_NORTH`, `OBLIQUITY`), degrees and metres.
 
     Unknown items are left out. ValueError for another label or a packet that is cut short.
     """

@@ -1,1 +1,1 @@
-"""Data for the console over a local socket, and the orders that the console may send."""
+"""Sends data to the console over a local socket, and receives its orders."""

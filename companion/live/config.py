@@ -39,7 +39,7 @@ class ConsoleConfig(BaseModel):
 
     @property
     def host(self) -> str:
-        """The address that is listened on, without brackets."""
+        """Listening address without brackets."""
         return self.listen.rpartition(":")[0].strip("[]")
 
     @property
@@ -59,7 +59,7 @@ class ConsoleConfig(BaseModel):
 
     @property
     def url(self) -> str:
-        """What to type into a browser on this machine."""
+        """URL of the page on this machine."""
         scheme = "http" if self.tls_certificate is None else "https"
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"

@@ -11,15 +11,15 @@ _HOT_READS_S = 5.0
 
 
 class MachineLoad:
-    """Of this process, and of the machine."""
+    """Measures the load of this process and of the machine."""
 
     def __init__(self) -> None:
         self._before = (time.monotonic(), self._used_s())
         self._temperature: tuple[float, float | None] = (-_HOT_READS_S, None)
 
     def read(self) -> dict[str, float | None]:
-        """cpu_percent: of one core, since the last reading; load: one minute's average; warmest
-        zone in degrees Celsius, where the machine tells it.
+        """cpu_percent: of one core, since the last call; load: one-minute average; temperature of
+        the warmest zone, degrees Celsius, None if unknown.
         """
         now, used = time.monotonic(), self._used_s()
         elapsed = max(now - self._before[0], 1e-3)
@@ -41,7 +41,7 @@ class MachineLoad:
 
 
 def warmest_c(zones: Path = _ZONES) -> float | None:
-    """The warmest thermal zone; None where none can be read."""
+    """Temperature of the warmest thermal zone; None if none can be read."""
     found = []
     for path in zones.glob("thermal_zone*/temp"):
         try:

@@ -1,4 +1,4 @@
-"""The console's orders to the flight, checked again here because a page may be anyone's."""
+"""Executes the console's orders in the flight process, after its own checks."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _OLDEST_S, _AHEAD_S = 10.0, 1.0  # of a picture that is pointed into
 
 
 class OrderError(CompanionError):
-    """Why an order is not carried out."""
+    """The reason why an order is not executed."""
 
 
 @dataclass(frozen=True)
 class OrderContext:
-    """What orders act on. report: tells the operator and the log; track: a click, its time that of
-    the frame that it points into; hint: (latitude_deg, longitude_deg, radius_m), raises
-    `OrderError` for a place off the map.
+    """Functions that orders call. report: alert to operator and log; track: a click, with the
+    exposure time of its frame; hint: (latitude_deg, longitude_deg, radius_m), raises `OrderError`
+    for a position off the map.
     """
 
     report: Callable[[Alert], None]
@@ -38,7 +38,7 @@ class OrderContext:
 
 
 class Orders:
-    """Carries out the console's orders, if `control` is on; each is reported."""
+    """Executes the console's orders if `control` is on, and reports each."""
 
     def __init__(
         self, control: bool, helm: OrderContext, clock: Callable[[], float] = time.monotonic
@@ -47,7 +47,7 @@ class Orders:
         self._taken: deque[float] = deque(maxlen=_MOST)
 
     def take(self, order: dict[str, Any]) -> str:
-        """Carry out an order; returns what was done. Raises `OrderError` with the reason."""
+        """Execute an order; returns a text. Raises `OrderError` with the reason."""
         if not self._control:
             raise OrderError("the console only reads: console.control is false")
         now = self._clock()

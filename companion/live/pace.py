@@ -19,5 +19,5 @@ class RateLimiter:
         return now_s >= self.due_s
 
     def went(self, now_s: float) -> None:
-        """An event was sent; missed ones are not made up for."""
+        """An event was sent; the next is due one period after this one was."""
         self.due_s = max(self.due_s + self.period_s, now_s)

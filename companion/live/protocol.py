@@ -1,8 +1,8 @@
 """Messages between flight and console over a local stream socket.
 
-One message: two big-endian uint32 (bytes of the head, bytes of the body), the head as JSON, the
-body as it is. A picture's body is not in the message: its head's "shared" is how many bytes of it
-lie in the memory that both share (`live.shared`). Both sides bound what they take.
+One message: two big-endian uint32 (bytes of head and body), the head as JSON, the body. A frame's
+body is in shared memory (`live.shared`); its head's "shared" is the number of bytes there. Both
+sides limit the sizes that they accept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SIZES = struct.Struct(">II")
 
 
 class LinkError(CompanionError):
-    """Bytes that are no message of the other side, or a socket that cannot be had."""
+    """Invalid bytes from the other side, or a socket that cannot be opened."""
 
 
 @dataclass(frozen=True)
@@ -39,20 +39,20 @@ class Message:
 
 
 def encode(head: dict[str, Any], body: bytes = b"") -> bytes:
-    """A message as bytes. NaN is refused: browsers do not read it."""
+    """Encode a message. ValueError for NaN, which browsers cannot read."""
     text = json.dumps(head, allow_nan=False, separators=(",", ":")).encode()
     return b"".join((_SIZES.pack(len(text), len(body)), text, body))
 
 
 class MessageDecoder:
-    """Bytes in, messages out."""
+    """Decodes messages from a byte stream."""
 
     def __init__(self, most_head: int = MOST_HEAD, most_body: int = MOST_BODY) -> None:
         self._most_head, self._most_body = most_head, most_body
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Every message that is whole now; `LinkError` for what cannot be one."""
+        """Yield every complete message; `LinkError` for invalid data."""
         self._buffer += data
         while len(self._buffer) >= _SIZES.size:
             head, body = _SIZES.unpack_from(self._buffer)
@@ -73,7 +73,7 @@ class MessageDecoder:
 
 
 def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
-    """Where a deployment's two processes meet: the same for both, in a folder of this user's.
+    """Socket path of a deployment, the same for both processes, in a folder of this user.
 
     A path of its own for each deployment; short, because such addresses end at 107 bytes.
     """
@@ -83,7 +83,7 @@ def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
 
 
 def runtime_folder() -> Path:
-    """A folder that only this user can enter; `LinkError` where somebody else made it."""
+    """A folder that only this user can enter; `LinkError` if another user made it."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(base) if base else Path(tempfile.gettempdir()) / f"companion-{os.getuid()}"
     if base:

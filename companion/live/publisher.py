@@ -1,8 +1,8 @@
-"""The flight's side of the console: a local socket, served by one thread.
+"""Serves the console from the flight process over a local socket, in one thread.
 
-It keeps at most one unfinished message per console: what does not fit is dropped, never queued.
-Pictures pass through memory that both share (`live.shared`), one at a time: before the console has
-read it, no other is given out, and then the newest. While nobody is connected it sleeps.
+At most one unfinished message per console is kept; others are dropped. Frames pass through shared
+memory (`live.shared`), one at a time: the next one, the newest, is written after the console has
+read the last. Without a console the thread sleeps.
 """
 
 from __future__ import annotations
@@ -90,35 +90,35 @@ class Publisher:
 
     @property
     def is_watched(self) -> bool:
-        """Whether anybody wants pictures; without, nothing is kept for them."""
+        """Whether a console requests frames."""
         return any(c.watching for c in tuple(self._consoles.values()))
 
     def start(self) -> None:
-        """Serve."""
+        """Start the thread."""
         self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
         self._selector.register(self._woken, selectors.EVENT_READ, self._drain)
         self._thread.start()
 
     def stop(self) -> None:
-        """Close every connection."""
+        """Close all connections."""
         self._stopping.set()
         self.wake()
         if self._thread.ident is not None:
             self._thread.join(2.0)
 
     def close(self) -> None:
-        """Undo the making."""
+        """Release the socket."""
         for end in (self._listening, self._woken, self._waker):
             end.close()
         with contextlib.suppress(OSError):
             self.path.unlink()
 
     def waiting(self) -> list[int]:
-        """Bytes that wait for each console."""
+        """Bytes queued for each console."""
         return [len(c.sending) for c in tuple(self._consoles.values())]
 
     def wake(self) -> None:
-        """There is a new picture. Never blocks."""
+        """A new frame is available. Never blocks."""
         with contextlib.suppress(OSError):
             self._waker.send(b"1")
 

@@ -18,7 +18,7 @@ from companion.live.protocol import MOST_BODY, LinkError
 
 
 class SharedMemory:
-    """The flight's side: one picture at a time. Its file descriptor goes to the console once."""
+    """The flight's side: holds one frame; its file descriptor is sent to the console once."""
 
     def __init__(self) -> None:
         # Without MFD_ALLOW_SEALING: else the other side could forbid that it is written.
@@ -28,7 +28,7 @@ class SharedMemory:
         self._given = False
 
     def write(self, parts: Sequence[np.ndarray]) -> int:
-        """One after the other, from the beginning; how many bytes."""
+        """Write the arrays one after the other; returns the number of bytes."""
         at = 0
         for part in parts:
             rest = np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
@@ -39,7 +39,7 @@ class SharedMemory:
         return at
 
     def send(self, connection: socket.socket, data: memoryview) -> int:
-        """As `socket.send`; with the first byte goes the descriptor."""
+        """As `socket.send`; sends the descriptor with the first byte."""
         if self._given:
             return connection.send(data)
         sent = socket.send_fds(connection, [data], [self._file])
@@ -52,7 +52,7 @@ class SharedMemory:
 
 
 class Arrivals:
-    """The console's side of the socket: its bytes, and the descriptor that came with them."""
+    """The console's side: receives socket data and the file descriptor."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
@@ -67,7 +67,7 @@ class Arrivals:
         return data
 
     def read(self, size: int) -> bytes:
-        """What lies in the memory. `LinkError` if not all of it is there."""
+        """Read `size` bytes of the shared memory. `LinkError` if there are fewer."""
         if self._file is None or not 0 <= size <= MOST_BODY:
             raise LinkError(f"a picture of {size} bytes without memory that holds it")
         data = os.pread(self._file, size, 0)

@@ -1,6 +1,6 @@
 """Data for the console: one state document, and frames with their poses.
 
-The flight's threads only leave references here; all formatting is the console link's thread's.
+The flight's threads only store references; the console's thread formats the data.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _TARGETS = 64
 
 @dataclass(frozen=True)
 class Instruments:
-    """What is asked for each state document. injecting: whether positions go out now;
-    mission: the places that the autopilot's flies to.
+    """Functions that give the data of a state document. injecting: whether positions are sent now;
+    mission: the autopilot's waypoints.
     """
 
     health: Callable[[], dict[str, Any]]
@@ -50,8 +50,8 @@ class Instruments:
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture as it is given out. parts: image (h, w, 3) uint8; of the map's view, if there is
-    one, rgb (h, w, 3) uint8 and depth (h, w) float32.
+    """A frame for the console. parts: image (h, w, 3) uint8 and, with a map view, its rgb (h, w, 3)
+    uint8 and depth (h, w) float32.
     """
 
     head: dict[str, Any]
@@ -59,7 +59,7 @@ class Shot:
 
 
 class Shown:
-    """Keeps the newest data. about: constants of a flight (mode, limits, map)."""
+    """Keeps the newest data for the console. about: constants of a flight (mode, limits, map)."""
 
     def __init__(
         self, frame: LocalFrame, geoid_m: float, instruments: Instruments, about: dict[str, Any]
@@ -79,14 +79,14 @@ class Shown:
     # --- from the flight's threads; none of them waits ----------------------------------------
 
     def add_frame(self, frame: Frame) -> None:
-        """Keep a reference to a picture until its estimate comes."""
+        """Keep a frame until its estimate arrives."""
         with self._lock:
             self._pictures[frame.exposure_time_ns] = frame
             while len(self._pictures) > _FRAMES:
                 self._pictures.popitem(last=False)
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle | None) -> None:
-        """Pair an estimate with its picture, if that was kept."""
+        """Pair an estimate with its frame, if that was kept."""
         self._estimate = estimate
         with self._lock:
             frame = self._pictures.pop(estimate.exposure_time_ns, None)
@@ -103,12 +103,12 @@ class Shown:
                 self._targets.popitem(last=False)
 
     def forget_target(self, name: str) -> None:
-        """It was ended by order."""
+        """A target was ended by an order."""
         with self._lock:
             self._targets.pop(name, None)
 
     def add_event(self, level: str, text: str) -> None:
-        """Something happened."""
+        """Add an event."""
         with self._lock:
             self._count += 1
             self._events.append((self._count, time.monotonic_ns(), level, text))
@@ -116,7 +116,7 @@ class Shown:
     # --- for the link's thread ----------------------------------------------------------------
 
     def hello(self) -> dict[str, Any]:
-        """The first message."""
+        """The first message for a console."""
         return {"kind": "hello", **self._about, "monotonic_ns": time.monotonic_ns()}
 
     def state(self, told: int) -> tuple[dict[str, Any], int]:
@@ -155,7 +155,7 @@ class Shown:
         return plain, count
 
     def take_frame(self) -> Shot | None:
-        """The newest picture with its pose and the map's view of it; None if none is new."""
+        """The newest frame with its pose and map view; None if there is no new one."""
         with self._lock:
             paired, self._paired = self._paired, None
             if paired is not None and time.monotonic_ns() - self._paired_ns > _FRESH_NS:

@@ -1,4 +1,4 @@
-"""The autopilot's data of a recorded flight, as known at a time."""
+"""The autopilot's telemetry of a recorded flight, replayed up to a time."""
 
 from __future__ import annotations
 
@@ -43,5 +43,5 @@ class RecordedAutopilot(VehicleTracker):
             self._next = next(self._messages, None)
 
     def state(self) -> VehicleState:
-        """What the vehicle said about itself."""
+        """The vehicle's state at the current replay time."""
         return self.snapshot(self._now_ns)

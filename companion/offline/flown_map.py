@@ -18,9 +18,8 @@ _SAME_FRAME_M = 1.0
 
 @dataclass(frozen=True)
 class FlownMap:
-    """What a record's folder knows of its map. sha256: of the map's manifest, None in a record from
-    before it was written. place, point: of one pose, in WGS84 and in metres about the map's origin;
-    None where no estimate says both.
+    """What a record tells about its map. sha256: of the map's manifest, None in old records. place,
+    point: one pose in WGS84 and in the map's ENU, m; None if not recorded.
     """
 
     folder: Path
@@ -29,8 +28,8 @@ class FlownMap:
     point: Array | None = None
 
     def require_frame(self, cache: TileCache) -> None:
-        """`RecordError` for a map about another origin than the flight's: a record has its poses in
-        metres about that, and every one of them would lie elsewhere, by the same way.
+        """`RecordError` if the map's origin is not the flight's, because all recorded positions
+        would be shifted.
         """
         if self.place is None or self.point is None:
             return
@@ -44,7 +43,7 @@ class FlownMap:
             )
 
     def doubt(self, cache: TileCache) -> str:
-        """Of a map about the same origin that is another all the same; empty for the flown one."""
+        """A warning if the map has the same origin but is another; empty for the flown one."""
         try:
             same = self.sha256 in (None, map_hash(cache.path))
         except ConfigError as error:

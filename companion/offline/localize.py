@@ -1,4 +1,4 @@
-"""Images localized without their true poses: photos with priors, or a video's frames."""
+"""Localizes images without their true poses: photos with priors, or a video's frames."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _PASSES = 3  # of an image that starts from a prior: the view from there shows a
 
 @dataclass(frozen=True)
 class Sigmas:
-    """How well priors are known, standard deviations per axis. attitude_deg, height_m: of roll and
-    pitch and of the height where sensors measured them; None: they only begin the registration.
+    """Standard deviations of priors per axis. attitude_deg, height_m: of roll and pitch and of the
+    height if sensors measured them; None: used as start values only.
     """
 
     position_m: float
@@ -33,13 +33,13 @@ class Sigmas:
     height_m: float | None = None
 
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
-        """The settings with what the sensors are known to."""
+        """The localizer's settings with the sigmas of these sensors."""
         known = None if self.attitude_deg is None else AttitudePrior.known_to(self.attitude_deg)
         return config.model_copy(update={"attitude": known, "height_sigma_m": self.height_m})
 
 
 def sensors_of(poses: Mapping[int, Pose]) -> AuxiliarySensors:
-    """Attitude and height of poses, by the time of their image in ns, as sensors measure them."""
+    """Attitude and height of poses as simulated sensor measurements. Keys: image time, ns."""
 
     def rotation_at(time_ns: int) -> Array | None:
         return poses[time_ns].rotation if time_ns in poses else None
@@ -52,7 +52,7 @@ def sensors_of(poses: Mapping[int, Pose]) -> AuxiliarySensors:
 
 @dataclass(frozen=True)
 class LocalizedImage:
-    """One image's outcome. estimate: None where there is none; `problem` says why then."""
+    """Result of one image. estimate: None if there is none; `problem` says why."""
 
     name: str
     estimate: PoseEstimate | None
@@ -73,7 +73,7 @@ def localize_images(
     priors: Mapping[str, Pose],
     sigmas: Sigmas,
 ) -> Iterator[LocalizedImage]:
-    """Localize images in their order.
+    """Yield the result of each image in order.
 
     An image named in `priors` starts from its own prior; the others continue from the image before,
     as frames of a video do. An image that cannot be used, or that is outside the map, is reported

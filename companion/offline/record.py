@@ -1,4 +1,4 @@
-"""A flight's record read: its tables, and its localized pictures as a `RecordedFlight`."""
+"""Reads a flight's record: tables, and localized frames as a `RecordedFlight`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _PLACE, _POINT = ("latitude_deg", "longitude_deg", "height_m"), ("east_m", "nort
 
 @dataclass(frozen=True)
 class RecordTables:
-    """A record's folder, read. health: the last health.json, {} without one; notes: what lacks.
+    """A record's contents. health: last health.json, {} without one; notes: missing parts.
 
     Of the settings only what a report needs is read, so that a record of an older or newer version,
     with keys that this one does not know, can still be shown.
@@ -70,35 +70,35 @@ class RecordTables:
 
     @property
     def start_ns(self) -> int:
-        """Of the record, CLOCK_MONOTONIC."""
+        """Start of the record, CLOCK_MONOTONIC."""
         return self._time_ns("monotonic_ns") or int(
             next(iter(self.estimates.get("exposure_time_ns", ())), 0)
         )
 
     @property
     def utc_ns(self) -> int:
-        """Of the start; 0 where the record does not say."""
+        """UTC of the start; 0 if unknown."""
         return self._time_ns("utc_ns")
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The deployment that was flown; {} where the record does not say."""
+        """The flown deployment; {} if unknown."""
         return mapping(self.manifest.get("config"))
 
     @property
     def versions(self) -> dict[str, Any]:
-        """Of the software; {} where the record does not say."""
+        """Software versions; {} if unknown."""
         return mapping(self.manifest.get("versions"))
 
     @property
     def map_path(self) -> Path | None:
-        """Of the map that was flown on; None where the record does not say."""
+        """Path of the flown map; None if unknown."""
         named = self._setting("map")
         return Path(named) if isinstance(named, str) else None
 
     @property
     def flown(self) -> FlownMap:
-        """What the record knows of that map."""
+        """What the record tells about its map."""
         named = self.manifest.get("map_sha256")
         sha256 = named if isinstance(named, str) else None
         columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]
@@ -113,7 +113,7 @@ class RecordTables:
 
     @property
     def camera(self) -> Camera | None:
-        """As it was calibrated; None where the record does not say."""
+        """The calibrated camera model; None if unknown."""
         try:
             return CameraModel.model_validate(self._setting("camera", "model")).camera()
         except (ValidationError, CameraError):
@@ -121,8 +121,8 @@ class RecordTables:
 
     @property
     def tlog(self) -> Path | None:
-        """The flight's MAVLink log, if one was kept: where the settings say, or, of a record that
-        was brought elsewhere, in it or beside it.
+        """Path of the flight's .tlog: as in the settings, otherwise in the record or beside it;
+        None without one.
         """
         named = self._setting("bridge", "tlog")
         if not isinstance(named, str):
@@ -133,12 +133,12 @@ class RecordTables:
 
     @property
     def delay_ms(self) -> float | None:
-        """The age at which a fix was sent."""
+        """Setting `bridge.injection.delay_ms`: age at which a fix was sent."""
         return self._number("bridge", "injection", "delay_ms")
 
     @property
     def alert_limit_m(self) -> float | None:
-        """The protection level beyond which nothing was injected."""
+        """Setting: protection level above which nothing was injected."""
         return self._number("bridge", "injection", "alert_limit_m")
 
     def _number(self, *keys: str) -> float | None:
@@ -159,8 +159,8 @@ class RecordTables:
 
 @dataclass(frozen=True)
 class RecordedEstimate:
-    """One row of ``estimates.csv``. known_ns: when it was published, CLOCK_MONOTONIC; focal_px: of
-    its frame, None in records from before it was written.
+    """One row of ``estimates.csv``. known_ns: time of publication, CLOCK_MONOTONIC; focal_px: of
+    its frame, None in old records.
     """
 
     exposure_time_ns: int
@@ -174,8 +174,8 @@ class RecordedEstimate:
 
 @dataclass(frozen=True)
 class FlightRecord:
-    """A record that can be localized again. flight: its localized pictures, one for each of
-    `estimates`, on CLOCK_MONOTONIC, and its log; a picture may be missing on the disk.
+    """A record that can be localized again. flight: frames, one for each of `estimates`, on
+    CLOCK_MONOTONIC, and the log; a frame's image may be missing.
     """
 
     tables: RecordTables
@@ -186,12 +186,12 @@ class FlightRecord:
 
     @property
     def folder(self) -> Path:
-        """Where it lies."""
+        """Folder of the record."""
         return self.tables.folder
 
 
 def read_record(folder: Path) -> RecordTables:
-    """Read what `companion run` left; `RecordError` for a folder that is no record."""
+    """Read the record of `companion run`; `RecordError` for another folder."""
     try:
         estimates = _table(folder / "estimates.csv", ("state", "status"))
         targets = _table(folder / "targets.csv", ("target_id", "visibility"))
@@ -219,7 +219,7 @@ def load_record(
     tlog: Path | None = None,
     map_cache: Path | None = None,
 ) -> FlightRecord:
-    """A record that `companion run` left. `RecordError` says what it lacks.
+    """Load a record to localize it again. `RecordError` says what is missing.
 
     kept_share: of the localized frames that must have their picture; tlog, map_cache: instead of
     the record's own.
@@ -262,7 +262,7 @@ def load_record(
 
 
 def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
-    """The rows of a record's ``estimates.csv``. `RecordError` says why it is none."""
+    """Read a record's ``estimates.csv``; `RecordError` for an invalid file."""
     try:
         return tuple(_estimates(read_columns(path, ("state", "status")), path))
     except (OSError, UnicodeDecodeError) as error:
@@ -293,7 +293,7 @@ def _estimates(columns: Columns, path: Path) -> Iterator[RecordedEstimate]:
 
 
 def document(path: Path) -> dict[str, Any]:
-    """A JSON file of a record; {} where it is missing or damaged."""
+    """Read a JSON file of a record; {} if it is missing or damaged."""
     try:
         return mapping(json.loads(plain_text(path)))
     except (OSError, ValueError, RecursionError):
@@ -314,10 +314,10 @@ def _table(path: Path, text: tuple[str, ...]) -> Columns:
 
 
 def mapping(value: Any) -> dict[str, Any]:
-    """The value, where it is one; else {}."""
+    """The value if it is a mapping, else {}."""
     return value if isinstance(value, dict) else {}
 
 
 def is_time_ns(text: str) -> bool:
-    """Whether a snapshot's name is the time of its exposure."""
+    """Whether a snapshot's file name is an exposure time."""
     return text.isascii() and text.isdigit() and len(text) <= _DIGITS

@@ -1,7 +1,7 @@
-"""A recorded flight localized again: the same frames and the same MAVLink, frame after frame.
+"""Localizes a recorded flight again with the same frames and MAVLink.
 
-Without threads, so that a machine of any speed gives the same result: each frame that was localized
-in flight is localized again, with what the autopilot had said by then.
+It uses no threads, so the result does not depend on the machine's speed. Each frame that was
+localized in flight is localized again, with the telemetry that had arrived by then.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ALIKE = 1e-3  # a share of the focal length that is no other lens
 
 @dataclass(frozen=True)
 class ReplayedFrame:
-    """One frame's two outcomes. replayed: None where its prediction left the map, or no prior."""
+    """Results of one frame. replayed: None without a prior or outside the map."""
 
     recorded: RecordedEstimate
     replayed: PoseEstimate | None
@@ -40,7 +40,7 @@ class ReplayedFrame:
 
 @dataclass(frozen=True)
 class ReplaySummary:
-    """How a replay compares. Differences are over frames accepted both times."""
+    """Comparison of record and replay. Differences are of frames accepted both times."""
 
     frames: int
     accepted_recorded: int
@@ -144,7 +144,7 @@ def _localize(
 
 
 def summarize(frames: list[ReplayedFrame]) -> ReplaySummary:
-    """Compare the two outcomes of every frame."""
+    """Compare both results of every frame."""
     again = [f.replayed is not None and f.replayed.accepted for f in frames]
     differences = [
         f.recorded.world_from_camera.distance_to(f.replayed.world_from_camera)

@@ -56,8 +56,8 @@ _SEARCH_EVERY_NS = 5_000_000_000
 
 @dataclass(frozen=True)
 class ToldLine:
-    """What the operator would have read. at_s: since the first image, negative before it, when the
-    log begins to be played; alert: its identifier.
+    """A text that the operator would have received. at_s: since the first image, negative before
+    it; alert: its identifier.
     """
 
     at_s: float
@@ -68,11 +68,11 @@ class ToldLine:
 
 @dataclass(frozen=True)
 class ShadowCheck:
-    """What came of it. frames, localized, accepted: of the images; judged: fixes that the monitor
-    was asked about, passed: those that it let pass; seconds: of the images; go_s: how long the
-    score was a go, and since when (s from the first image), None: never; score: the last one that
-    had enough fixes, else the last; held_s: how long output was held, by alert; lines: what the
-    operator would have been told; notes: what was assumed.
+    """Result of the check. frames, localized, accepted: numbers of images; judged: fixes that the
+    monitor checked, passed: those that it did not hold; seconds: duration of the images; go_s,
+    first_go_s: how long the shadow check was ready, and from when (s from the first image), None:
+    never; score: the last one with enough fixes; held_s: hold time by alert; lines: texts to the
+    operator; notes: assumptions.
     """
 
     frames: int
@@ -90,8 +90,8 @@ class ShadowCheck:
 
     @property
     def go(self) -> bool:
-        """Whether vision would have been let on: there was a go, and nothing spoke against it at
-        the end.
+        """Whether injection would have been allowed: the check was ready at some time and had no
+        objection at the end.
         """
         return self.first_go_s is not None and not self.score.against
 

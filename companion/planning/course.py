@@ -1,4 +1,4 @@
-"""The flown line: straight, a spline as ArduPilot flies it, or a circle."""
+"""Geometry of a flown leg: a straight line, a spline as ArduPilot flies it, or a circle."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _LONGEST = 4.0
 
 @dataclass(frozen=True)
 class Course:
-    """points: (N, 3) of the line, world metres; leaves: (3,) direction and strength with which it
-    ends, zero where it stops; nose_deg: of the vehicle, to the right of the way.
+    """points: (N, 3) of the path, world metres; leaves: (3,) direction and strength at its end,
+    zero for a stop; nose_deg: heading of the vehicle, clockwise from the path.
     """
 
     points: Array
@@ -29,11 +29,11 @@ class Course:
 
     @property
     def length_m(self) -> float:
-        """Over the ground."""
+        """Horizontal length."""
         return float(self._steps().sum())
 
     def at(self, share: float) -> tuple[Array, float]:
-        """Position (3,) and heading (degrees) after a share of the length."""
+        """Position (3,) and heading (degrees) after a share (0 to 1) of the length."""
         steps = self._steps()
         done = np.concatenate([[0.0], np.cumsum(steps)])
         way = share * done[-1]
@@ -51,15 +51,15 @@ class Course:
 
 
 def straight(start: Array, end: Array) -> Course:
-    """From one place (3,) to another."""
+    """A straight course between two positions (3,)."""
     return Course(np.stack([start, end]), end - start)
 
 
 def spline(
     start: Array, end: Array, arrives: Array, after: Array | None, *, curved_on: bool
 ) -> Course:
-    """From one place (3,) to another. arrives: (3,) how the course before it leaves; after: the
-    place after the end, None where it stops there; curved_on: whether that is flown to by a spline.
+    """A spline between two positions (3,). arrives: (3,) end direction of the previous course;
+    after: next position, None for a stop; curved_on: whether the next leg is a spline.
     """
     leaves = np.zeros(3)
     if after is not None:
@@ -78,8 +78,8 @@ def spline(
 
 
 def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
-    """One round about a place (3,), from where one who flies in the direction `arrives` (3,) meets
-    the circle.
+    """One circle about a position (3,), from the point where a vehicle flying in direction
+    `arrives` (3,) meets it.
     """
     begin = np.arctan2(-arrives[1], -arrives[0])
     turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)

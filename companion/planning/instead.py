@@ -36,8 +36,8 @@ class LegAlternative:
 
 @dataclass(frozen=True)
 class Instead:
-    """The best alternative for a leg. risk: the largest of its samples, 0 to 1; holds: whether all
-    its samples hold.
+    """The best alternative for a leg. risk: largest of its samples, 0 to 1; holds: whether vision
+    is sufficient at all of them.
     """
 
     leg: str
@@ -50,8 +50,8 @@ class Instead:
 def instead(
     surveyor: Surveyor, verdicts: Sequence[LegVerdict], fixed: bool, progress: Progress | None
 ) -> tuple[Instead, ...]:
-    """For each of the longest failing legs the alternative with the least risk, if one lowers it.
-    fixed: whether the camera turns only with the vehicle.
+    """Find the alternative with the lowest risk for each of the longest failing legs, if it is
+    better. fixed: the camera turns only with the vehicle.
     """
     bad = sorted(
         (v for v in verdicts if not v.holds), key=lambda v: -(1 - v.share) * v.leg.length_m
@@ -80,7 +80,7 @@ def instead(
 
 
 def changes(worst: JudgedSample, fixed: bool) -> list[LegAlternative]:
-    """What may be tried at a sample; only heights and headings of a fixed camera."""
+    """Alternatives to try at a sample; for a fixed camera only heights and headings."""
     sample, ground = worst.sample, worst.forecast.ground_m
     options = []
     above = ground * abs(float(np.sin(np.radians(sample.pitch_deg)))) if ground else 0.0

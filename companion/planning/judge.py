@@ -52,14 +52,14 @@ class JudgedSample:
 
     @property
     def holds(self) -> bool:
-        """Whether vision will do there."""
+        """Whether vision is sufficient there."""
         return self.reason is Reason.NONE
 
 
 @dataclass(frozen=True)
 class LegVerdict:
-    """A leg's samples, judged. holds: of all of them; share: of the samples that hold; times: that
-    the leg is flown.
+    """Results of a leg's samples. holds: at all of them; share: of samples that hold; times: how
+    often the leg is flown.
     """
 
     leg: FlightLeg
@@ -73,7 +73,7 @@ class LegVerdict:
 
     @property
     def share(self) -> float:
-        """Of the samples that hold."""
+        """Share of the samples that hold."""
         return float(np.mean([j.holds for j in self.judged]))
 
     @property
@@ -83,7 +83,7 @@ class LegVerdict:
 
     @property
     def sigma_m(self) -> float:
-        """Median over the samples that hold; NaN where none does."""
+        """Median sigma of the samples that hold; NaN without any."""
         held = [j.forecast.sigma_m for j in self.judged if j.holds]
         return float(np.median(held)) if held else math.nan
 
@@ -103,14 +103,14 @@ class VisionGap:
 
     @property
     def length_m(self) -> float:
-        """Of the way."""
+        """Length along the path."""
         return self.end_m - self.begin_m
 
 
 def judge(
     sample: PathSample, forecasts: Sequence[ViewForecast], limits: MissionLimits
 ) -> JudgedSample:
-    """The sample under the condition that it fares worst in."""
+    """The sample's result under its worst condition."""
     worst = max(forecasts, key=lambda f: (_reason(f, limits) is not Reason.NONE, f.risk, f.sigma_m))
     return JudgedSample(sample, worst, _reason(worst, limits))
 

@@ -1,5 +1,5 @@
-"""Missions as ground stations save them: QGroundControl's ``.plan`` (JSON) and ``.waypoints``
-(``QGC WPL 110``, also Mission Planner's), as the places that are flown to.
+"""Reads missions of ground stations: QGroundControl's ``.plan`` (JSON) and ``.waypoints`` (``QGC
+WPL 110``, also Mission Planner's).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _Items = list[MissionItem | UnreadItem]
 
 
 def read_mission(path: Path) -> PlannedMission:
-    """Read either format; MissionFileError says what is wrong with a file."""
+    """Read a mission of either format; `MissionFileError` for an invalid file."""
     try:
         text = plain_text(path, _MOST_BYTES)
         read = _plan if text.lstrip()[:1] in ("{", "[") else _waypoints

@@ -1,4 +1,4 @@
-"""A plan as one HTML page that needs no other file, and as plain data."""
+"""Writes a plan as one self-contained HTML page, and as JSON data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ INSTEAD_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
 
 
 def verdict_words(plan: MissionForecast) -> str:
-    """The answer in a sentence."""
+    """The result of a plan in a sentence."""
     bad = [v for v in plan.verdicts if not v.holds]
     limit = plan.question.limits.sigma_m
     circles = sum(v.leg.is_circle for v in plan.verdicts)
@@ -54,7 +54,7 @@ def verdict_words(plan: MissionForecast) -> str:
 
 
 def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
-    """A leg as cells; its worst place says why."""
+    """Table cells of a leg, with the reason at its worst sample."""
     worst = verdict.worst
     forecast = worst.forecast
     return (
@@ -71,7 +71,7 @@ def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
 
 
 def stretch_row(stretch: VisionGap) -> tuple[str, ...]:
-    """A stretch as cells."""
+    """Table cells of a stretch without vision."""
     return (
         f"{stretch.begin_m:.0f}",
         f"{stretch.end_m:.0f}",
@@ -83,7 +83,7 @@ def stretch_row(stretch: VisionGap) -> tuple[str, ...]:
 
 
 def instead_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
-    """What would do instead, as cells."""
+    """Table rows of the alternatives."""
     return [
         (
             i.leg,
@@ -97,7 +97,7 @@ def instead_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
 
 
 def as_data(plan: MissionForecast) -> dict[str, Any]:
-    """For other programs: what was asked, and every leg, sample and stretch."""
+    """JSON data of a plan: request, legs, samples and stretches."""
     q = plan.question
     return {
         "mission": str(q.mission_file),
@@ -144,7 +144,7 @@ def as_data(plan: MissionForecast) -> dict[str, Any]:
 
 
 def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
-    """Write the page. ReportError where it cannot be written."""
+    """Write the page; `ReportError` if it cannot be written."""
     q = plan.question
     shown = "".join(
         f'<h2>{escape(title)}</h2><img alt="{escape(title)}" src="{data_uri(rgb)}">'

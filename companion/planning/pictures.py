@@ -1,6 +1,4 @@
-"""The pictures of a plan: the track by colour over the map, and a heat map of what the camera sees
-where.
-"""
+"""Images of a plan: the path coloured over the map, and a heat map of the risk on the ground."""
 
 from __future__ import annotations
 
@@ -32,8 +30,8 @@ _LINE_PX = 7
 
 @dataclass(frozen=True)
 class MapSquare:
-    """A square of the map from above, north up. low: (2,) its south-west corner, east and north, m;
-    gsd_m: per pixel.
+    """Top view of a square of the map, north up. low: (2,) south-west corner, east and north, m;
+    gsd_m: metres per pixel.
     """
 
     rgb: Image
@@ -41,13 +39,13 @@ class MapSquare:
     gsd_m: float
 
     def pixels(self, places: Array) -> Array:
-        """(N, 2) columns and rows of (N, 2) places, east and north."""
+        """Pixels (N, 2), column and row, of positions (N, 2), east and north."""
         flat = (places - self.low) / self.gsd_m
         return np.stack([flat[:, 0], self.rgb.shape[0] - flat[:, 1]], axis=1)
 
 
 def sheet_of(plan: MissionForecast, cache: TileCache) -> MapSquare:
-    """The square about the plan's way, as the map shows it."""
+    """Render the square of the map about the plan's path."""
     places = _places(_all(plan))
     low, high = places.min(axis=0), places.max(axis=0)
     half = max(float((high - low).max()) * (0.5 + _MARGIN), _LEAST_HALF_M)
@@ -64,7 +62,7 @@ def sheet_of(plan: MissionForecast, cache: TileCache) -> MapSquare:
 
 
 def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
-    """The way in green (holds), amber (doubtful) and red (will not do), its waypoints numbered."""
+    """The path in green (holds), amber (doubtful) and red (fails), with numbered waypoints."""
     picture = sheet.rgb.copy()
     for verdict in plan.verdicts:
         pixels = sheet.pixels(_places(verdict.judged))
@@ -83,7 +81,7 @@ def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
 def heat_picture(
     sheet: MapSquare, plan: MissionForecast, cache: TileCache, camera: Camera, aim: Aim
 ) -> Image:
-    """The ground that is seen, coloured by the mean risk of the places that see it."""
+    """The seen ground, coloured by the mean risk of the samples that see it."""
     total = np.zeros(sheet.rgb.shape[:2], np.float32)
     count = np.zeros_like(total)
     for judged in _all(plan):
@@ -108,7 +106,7 @@ def heat_picture(
 
 
 def colour_of(judged: JudgedSample) -> tuple[int, int, int]:
-    """RGB of a sample."""
+    """RGB colour of a sample."""
     if not judged.holds:
         return _COLOURS[2]
     return _COLOURS[1] if judged.forecast.risk > _DOUBTFUL else _COLOURS[0]

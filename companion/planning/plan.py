@@ -59,12 +59,12 @@ class MissionForecast:
 
     @property
     def holds(self) -> bool:
-        """Whether the whole mission was judged, and vision will do on every leg."""
+        """Whether the whole mission was judged and vision is sufficient on every leg."""
         return not self.not_judged and all(v.holds for v in self.verdicts)
 
 
 def aim_of(deployment: CompanionConfig, pitch_deg: float) -> Aim:
-    """How the deployment's camera looks."""
+    """Direction of the deployment's camera."""
     camera = deployment.bridge.camera
     mount = Mount.from_degrees(
         camera.mount_roll_deg,

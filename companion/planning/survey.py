@@ -1,4 +1,4 @@
-"""The forecasts along a mission, on as many threads as there are to be used."""
+"""Computes the forecasts along a mission, in several threads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MOST_THREADS = 8
 
 
 class Surveyor:
-    """Judges samples; `surveyor` makes one.
+    """Judges path samples in threads; create it by `surveyor`.
 
     Each thread takes a forecaster for itself: renderers, networks and optimizers are used by one
     thread at a time.
@@ -50,7 +50,7 @@ class Surveyor:
     def judged(
         self, samples: Sequence[PathSample], progress: Progress | None = None
     ) -> list[JudgedSample]:
-        """The samples in their order; the same samples give the same."""
+        """Judge the samples, in their order; deterministic."""
         made = []
         with ThreadPoolExecutor(self._threads, "forecast") as pool:
             for done, judged in enumerate(pool.map(self._one, itertools.count(), samples), 1):
@@ -76,7 +76,7 @@ def surveyor(
     conditions: tuple[str, ...],
     limits: MissionLimits,
 ) -> Iterator[Surveyor]:
-    """A surveyor over an open map, with a thread for each processor that this process may use.
+    """Context manager: a surveyor over an open map, one thread per available processor.
 
     It computes on the CPU, so that every machine forecasts alike.
     """
@@ -96,7 +96,7 @@ def surveyor(
 
 
 def moved(sample: PathSample, rise_m: float, pitch_deg: float, turn_deg: float) -> PathSample:
-    """The sample flown higher or lower, looking elsewhere."""
+    """The sample at another height and with another camera direction."""
     position = sample.position.copy()
     position[2] += rise_m
     return replace(sample, position=position, pitch_deg=pitch_deg, turn_deg=turn_deg)

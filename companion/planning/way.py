@@ -45,8 +45,8 @@ class Aim:
 
 @dataclass(frozen=True)
 class PathSample:
-    """A place on the way. position: (3,) of the vehicle, world metres; way_m: flown until there;
-    turn_deg: of the camera to the right of the way.
+    """A sample of the path. position: (3,) of the vehicle, world metres; way_m: distance flown;
+    turn_deg: camera direction clockwise from the path.
     """
 
     position: Array
@@ -58,10 +58,9 @@ class PathSample:
 
 @dataclass(frozen=True)
 class FlightLeg:
-    """The way between two places. name: of their numbers, "home" and "take-off" too; step_m:
-    of the way that each sample stands for; speed_m_s: None where the mission does not say; first:
-    index of the first leg that is flown alike, its own where there is none before it; is_circle: a
-    round of loitering.
+    """The path between two positions. name: of their numbers, "home" or "take-off"; step_m:
+    distance between samples; speed_m_s: None if the mission has none; first: index of the first
+    identical leg; is_circle: a loiter circle.
     """
 
     name: str
@@ -74,7 +73,7 @@ class FlightLeg:
 
 
 class MapHeights:
-    """Heights of the map's surface."""
+    """Surface heights of the map."""
 
     def __init__(self, cache: TileCache) -> None:
         self._surface = MapSurface(cache)
@@ -82,7 +81,7 @@ class MapHeights:
         self._known: dict[tuple[float, float], float | None] = {}
 
     def height_m(self, east_m: float, north_m: float) -> float | None:
-        """World z (m) of the highest surface there; None beside the map and in its holes."""
+        """World z (m) of the highest surface; None outside the map and in holes."""
         place = east_m, north_m
         if place not in self._known:
             self._known[place] = self._measured(east_m, north_m)
@@ -97,8 +96,8 @@ class MapHeights:
 def legs_of(
     mission: PlannedMission, cache: TileCache, ground: MapHeights, aim: Aim, spacing_m: float
 ) -> tuple[FlightLeg, ...]:
-    """The legs in the order in which they are flown, those to places whose way is not known left
-    out; a sample every so many metres.
+    """The mission's legs in flight order with samples every spacing_m; legs with an unknown path
+    are left out.
 
     MissionFileError where the mission does not say how high it flies over the map.
     """
@@ -136,7 +135,7 @@ def legs_of(
 
 
 def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
-    """The camera's pose (world) of a level vehicle that flies along its way."""
+    """The camera's world pose at a sample, for a level vehicle that flies along its path."""
     to_ned = ned_from_world(cache.frame, cache.frame.position(sample.position))
     body = matrix_from_euler(0.0, 0.0, float(np.radians(sample.heading_deg)))
     turn = float(np.radians(sample.turn_deg))
@@ -292,5 +291,5 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
 
 
 def length_m(legs: Sequence[FlightLeg]) -> float:
-    """Of all legs."""
+    """Total length of legs."""
     return sum(leg.length_m for leg in legs)

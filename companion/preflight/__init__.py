@@ -1,1 +1,1 @@
-"""Is this deployment ready?"""
+"""Checks whether a deployment is ready for flight."""

@@ -1,4 +1,4 @@
-"""Is there a map under the mission, its places and straight ways, and under the EKF's origin?"""
+"""Checks map coverage of the mission, the vehicle's position and the EKF's origin."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NEEDED = "inside the map"
 
 
 def covered(cache: TileCache, points: Array) -> np.ndarray:
-    """Which points (N, 2), ENU metres, have a finest tile under them: (N,) bool."""
+    """Whether a finest tile covers each point (N, 2), ENU metres: (N,) bool."""
     index = cache.index
     leaves = (index.child_count == 0) & (index.tile_count > 0)
     low, high = index.box_min[leaves, :2], index.box_max[leaves, :2]
@@ -53,7 +53,7 @@ def _way(points: Array) -> Array:
 
 
 def check_mission(cache: TileCache, waypoints: Sequence[MissionWaypoint]) -> DoctorFinding:
-    """Advice where the mission leaves the map: vision ends there."""
+    """Advice if the mission leaves the map, where vision ends."""
     if not [w for w in waypoints if w.number > 0]:
         return DoctorFinding(_NAME, "none in the vehicle", _NEEDED, "nothing to check", True, False)
     points = _enu(cache.frame, waypoints)
@@ -79,9 +79,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def check_origin(origin: OriginConfig, cache: TileCache) -> DoctorFinding:
-    """An origin with a wrong digit puts the EKF on another continent or under the ground, and the
-    vehicle takes no second one.
-    """
+    """Check that the configured EKF origin is on the map; the vehicle accepts no second one."""
     m = cache.manifest
     ground = origin.altitude_amsl_m + m.geoid_separation_m
     away_km = _away_km(cache, origin.latitude_deg, origin.longitude_deg)
@@ -97,9 +95,8 @@ def check_origin(origin: OriginConfig, cache: TileCache) -> DoctorFinding:
 
 
 def check_stand(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
-    """Where the vehicle stands by its GNSS, beside the map: a map of another place has heights and
-    a geoid of its own, and everything else about it is in order. Empty where it stands on the map,
-    or does not know.
+    """Findings if the vehicle's GNSS position is off the map, which is then the wrong map; empty if
+    it is on the map or unknown.
     """
     latitude_deg, longitude_deg = state.gps_latitude_deg, state.gps_longitude_deg
     if latitude_deg is None or longitude_deg is None or state.gps_fix_type < _FIX_3D:

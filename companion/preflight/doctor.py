@@ -1,4 +1,4 @@
-"""Is this deployment ready? The bridge's examination plus map, model, camera, files and machine."""
+"""All checks of `companion doctor`: the bridge's, and map, model, camera, files and machine."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def examine_deployment(
     feed: bool = True,
     say: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Every check; `vehicle` false leaves out what needs the flight controller, `feed` the camera.
+    """Run all checks. vehicle, feed: false leaves out flight controller or camera.
 
     The feed is read while the vehicle is listened to: both are waiting. The localizer comes before,
     alone: its compilers hold the interpreter, and the link's round trip would be theirs. say: takes

@@ -1,4 +1,4 @@
-"""The map's heights against what the vehicle's own GNSS says."""
+"""Compares the map's heights with the vehicle's GNSS."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _ABOVE_M = 100.0  # the highest roof or tree that a ray from above should meet
 
 
 def check_heights(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
-    """The geoid separation, if the receiver says both heights, and the ground under the vehicle,
-    if it stands over the map.
+    """Check the geoid separation, if the receiver reports both heights, and the ground height below
+    the vehicle, if it is on the map.
     """
     if state.gps_fix_type < _FIX_3D:
         return []

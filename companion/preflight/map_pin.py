@@ -1,4 +1,4 @@
-"""Whether the map is the one that the deployment was made for, byte for byte."""
+"""Checks that the map is exactly the one that the deployment was made for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from localizer.plain_files import plain_bytes
 
 
 def map_hash(cache: Path) -> str:
-    """SHA-256 of the manifest, in hexadecimal.
+    """SHA-256 of the map's manifest, in hexadecimal.
 
     The manifest holds the index's hash and the index the tiles', so that it stands for all. The
     manifest itself (origin, datum, geoid separation) is guarded by nothing else. `ConfigError` if
@@ -25,7 +25,7 @@ def map_hash(cache: Path) -> str:
 
 
 def readable_map_hash(cache: Path) -> str | None:
-    """The same in flight; None where the manifest, which was open a moment ago, is not readable."""
+    """As `map_hash`; None if the manifest cannot be read."""
     try:
         return map_hash(cache)
     except ConfigError:
@@ -33,7 +33,7 @@ def readable_map_hash(cache: Path) -> str | None:
 
 
 def require_pinned(cache: Path, wanted: str | None) -> None:
-    """Raises `ConfigError` when the map is another than the pinned one; None pins nothing."""
+    """`ConfigError` if the map's hash differs from `wanted`; None accepts every map."""
     if wanted is None:
         return
     found = map_hash(cache)

@@ -1,4 +1,4 @@
-"""Settings of the right type that mean something else: another unit, another port's owner."""
+"""Finds settings that are valid but probably wrong: another unit, a port in use."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _SHORTEST_MS = 1.0  # less is no camera's, no link's and nobody's
 
 
 def check_meanings(config: CompanionConfig) -> list[DoctorFinding]:
-    """Advice for what can be right and seldom is; empty where nothing is odd."""
+    """Advice about unusual settings."""
     return [*_arm(config), *_mount(config), *_lens(config), *_milliseconds(config)]
 
 
 def check_ports(config: CompanionConfig) -> list[DoctorFinding]:
-    """Ports that another program has, which a start would be refused for."""
+    """Findings for ports that another program uses."""
     address = config.targets.detections
     if address is None:
         return []

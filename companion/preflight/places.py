@@ -1,4 +1,4 @@
-"""What a flight reads its keys from and writes its records to, seen without making any of it."""
+"""Checks key files and record folders without creating them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mavlink_bridge.preflight.doctor import DoctorFinding
 
 
 def check_places(config: CompanionConfig) -> list[DoctorFinding]:
-    """Folders of records and signing keys that a start would refuse; empty where none is named."""
+    """Findings for record folders and signing keys with which a flight would not start."""
     bridge = config.bridge
     written = {"bridge.tlog": bridge.tlog}
     faults = []

@@ -1,8 +1,7 @@
-"""A whole localization on a made map: compiles what a flight needs, and shows that it works here.
+"""Localizes over a generated map: compiles the kernels and tests this computer.
 
-A package runs it once at installation, so that the first frame of a flight waits for no compiler;
-on a new computer it tells whether the program works at all, and how fast. Map and picture share
-everything, so that its error says that the program computes rightly, and nothing about accuracy.
+A package runs it once at installation, so that no flight waits for the compiler. Map and image come
+from the same renderer: the error shows correct computation, not accuracy.
 """
 
 from __future__ import annotations
@@ -41,14 +40,13 @@ _GOOD_M = 0.5
 
 
 class SelfTestError(CompanionError):
-    """The program does not compute on this computer what it should."""
+    """A result of the self-test is wrong on this computer."""
 
 
 @dataclass(frozen=True)
 class SelfTestReport:
-    """error_m: of the tracked place, worst frame; found_error_m: of the one searched without a
-    prior; frame_ms: processor time a frame, median; compiled_s: until the first frame was done;
-    features: what computes the features.
+    """error_m: of the tracked positions, worst frame; found_error_m: of the search without a prior;
+    frame_ms: processor time per frame, median; compiled_s: time to the first result.
     """
 
     error_m: float
@@ -65,8 +63,7 @@ def self_test(
     *,
     timed: Callable[[BenchRow], None] | None = None,
 ) -> SelfTestReport:
-    """Build a map in `folder`, track frames over it and find one without a prior. timed: takes each
-    row of the measured speed, if it is to be measured.
+    """Build a map in `folder`, track frames over it and find one without a prior.
 
     Raises SelfTestError where a result is off by more than 0.5 m or none is accepted.
     """

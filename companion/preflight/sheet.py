@@ -1,4 +1,4 @@
-"""The doctor's one page that a pilot signs: what was found, how old it is, and what to do."""
+"""The doctor's one-page preflight sheet for the pilot's signature."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WHEN_VISION_ENDS = (
 
 @dataclass(frozen=True)
 class SheetRow:
-    """One line. good: None where it only tells."""
+    """One line of the sheet. good: None for information only."""
 
     name: str
     text: str
@@ -42,7 +42,7 @@ class SheetRow:
 
 @dataclass(frozen=True)
 class PreflightSheet:
-    """The page. fit: by the doctor; parameters: its lines that are not right, and how many are."""
+    """The preflight sheet. fit: the doctor's result; findings: its failed checks."""
 
     deployment: str
     day: datetime
@@ -54,7 +54,7 @@ class PreflightSheet:
 def make_sheet(
     path: Path, config: CompanionConfig, diagnosis: Diagnosis, plan: Path | None, now: datetime
 ) -> PreflightSheet:
-    """What is known of a deployment now. plan: ``plan.json`` of `companion plan`."""
+    """Collect the sheet's contents. plan: ``plan.json`` of `companion plan`."""
     rows = (
         _parameters(diagnosis),
         _calibration(config, now.date()),
@@ -178,7 +178,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def write_sheet(sheet: PreflightSheet, path: Path) -> tuple[Path, Path]:
-    """The page as HTML, and as text beside it."""
+    """Write the sheet as HTML, with a text file beside it; returns both paths."""
     text_path = path.with_suffix(".txt")
     with writing(path, "--page"):
         path.write_text(as_html(sheet), encoding="utf-8")
@@ -199,7 +199,7 @@ def _marked(finding: DoctorFinding) -> str:
 
 
 def as_text(sheet: PreflightSheet) -> str:
-    """For a terminal or a printer; 78 columns but for long findings."""
+    """The sheet as text of 78 columns; long findings may exceed them."""
     lines = [
         f"BEFORE THE FLIGHT: {_title(sheet)}",
         f"{sheet.deployment}   {sheet.day.isoformat(timespec='minutes')}", "",
@@ -232,7 +232,7 @@ padding-top:.2em}.sign span:first-child{flex:2}
 
 
 def as_html(sheet: PreflightSheet) -> str:
-    """One page that needs no other file, and prints on one sheet."""
+    """The sheet as one self-contained HTML page."""
 
     def row(mark: str, *cells: str) -> str:
         tail = "".join(f"<td>{escape(c)}</td>" for c in cells)

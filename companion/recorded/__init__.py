@@ -1,1 +1,1 @@
-"""Flights as they were recorded, by whatever program: frames, telemetry and camera in one form."""
+"""Recorded flights of any program in one form: frames, telemetry and camera."""

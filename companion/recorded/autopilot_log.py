@@ -1,7 +1,7 @@
-"""Logs beside video or photos: ArduPilot's .bin (dataflash), MAVLink's .tlog and PX4's .ulg.
+"""Reads logs beside video or photos: ArduPilot's .bin (dataflash), MAVLink's .tlog and PX4's .ulg.
 
-Position by the EKF, attitude of the body, and the camera's view: a gimbal's where one reports, else
-that of a camera which is fixed to the body.
+They give position by the EKF, attitude of the body, and the camera's direction, by the gimbal if
+one reports, otherwise of a camera fixed to the body.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ _LONGEST_NS = 30 * 86_400_000_000_000  # of one log: its samples would fill the 
 
 @dataclass(frozen=True)
 class LogTrack:
-    """What a log says. track: UTC nanoseconds; exposures: where the camera was and looked at each
-    (CAM, else TRIG; CAMERA_FEEDBACK), in order of time; has_gimbal: whether a gimbal's angles are
-    in it; notes: what was assumed.
+    """Telemetry of a log. track: UTC nanoseconds; exposures: camera pose at each exposure message
+    (CAM, else TRIG; CAMERA_FEEDBACK), in time order; has_gimbal: whether the log has gimbal angles;
+    notes: assumptions.
     """
 
     track: Track
@@ -87,7 +87,7 @@ class _LogRows:
 
 
 def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
-    """A log's telemetry. fixed_pitch_deg: of a camera on the body, where no gimbal reports.
+    """Read a log's telemetry. fixed_pitch_deg: of a camera on the body if no gimbal reports.
 
     `FootageError` where the log lacks positions or attitudes, or is none.
     """
@@ -189,7 +189,7 @@ def _position(
 
 
 def vehicle_messages(path: Path) -> Iterator[Dated]:
-    """Every message of a log, in its order: what is not in a .tlog is made of its rows.
+    """Yield every MAVLink message of a log in order; for .bin and .ulg they are made from its rows.
 
     `FootageError` where it is no log that can be read.
     """

@@ -1,4 +1,4 @@
-"""A camera model from what photos say of their lens, with how far its focal length may be off."""
+"""Camera models from photo tags or files, with the uncertainty of the focal length."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _SENSOR_WIDTH_MM: Mapping[str, float] = {
 
 
 def camera_of_tags(tags: PhotoTags) -> CameraGuess:
-    """The camera of a photo at its present size, by the most accurate tag that it has: the maker's
-    calibration first, the 35 mm equivalent last. `FootageError` if no usable tag gives the lens.
+    """Camera model of a photo at its present size, from its most accurate tag: the maker's
+    calibration first, the 35 mm equivalent last. `FootageError` if no tag gives the lens.
     """
     for guess in (_dewarp, _calibrated, _perspective, _by_sensor, _equivalent):
         try:
@@ -47,13 +47,13 @@ def camera_of_tags(tags: PhotoTags) -> CameraGuess:
 
 
 def camera_given(camera: Camera, source: str) -> CameraGuess:
-    """A model that the user gives."""
+    """A camera model that the user gives."""
     return CameraGuess(camera, _GIVEN, source)
 
 
 def camera_of_file(path: Path) -> CameraGuess:
-    """A model that the user gives as a file. A lens model that folds the corners, but else moves
-    nothing by more than the focal length's sigma, is left out: one coefficient too many makes it.
+    """Read a camera model from a file. A distortion that folds the image corners, and otherwise is
+    smaller than the focal length's sigma, is dropped as overfitted.
     """
     try:
         return camera_given(Camera.from_json(path), path.name)
@@ -71,8 +71,8 @@ def camera_of_file(path: Path) -> CameraGuess:
 
 
 def equivalent_camera(width: int, height: int, focal_35mm: float, *, small: bool) -> Camera:
-    """The pinhole of a 35 mm equivalent focal length. small: a 4:3 sensor, of which an image that
-    is wider shows the whole width. focal_35mm: that length, mm.
+    """Pinhole camera of a 35 mm equivalent focal length (mm). small: a 4:3 sensor, whose full width
+    a wider image shows.
     """
     aspect = min(width / height, _NATIVE_ASPECT) if small else width / height
     diagonal = math.hypot(width, width / aspect)

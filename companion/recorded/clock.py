@@ -1,7 +1,7 @@
-"""The offset between the clock of images and that of a log, by the log's exposures or by motion.
+"""Estimates the offset between the clocks of images and log, by exposure messages or by motion.
 
-Motion: between two images, features move as the log's attitudes and positions say, over flat ground
-below the take-off height. The offset under which they do so best is the clocks'.
+By motion: features move between two images as the log's attitudes and positions predict, over flat
+ground. The offset with the smallest residual is the result.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _TAG_NS = 600_000_000  # EXIF's times may be whole seconds
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """offset_s: to be added to the images' times to be the log's. residual_deg: of the features, as
-    an angle, there; second_deg: at the next best offset, infinite where there is none; pairs: of
-    images that told it; chance: of so low a residual at some offset of another flight's log.
+    """offset_s: to add to the images' times. residual_deg: of the features at this offset;
+    second_deg: at the next best offset, infinite without one; pairs: of images used; chance:
+    probability that another flight's log reaches so low a residual.
     """
 
     offset_s: float
@@ -50,14 +50,14 @@ class ClockOffset:
 
     @property
     def is_decisive(self) -> bool:
-        """Whether one offset alone fits, and that not by chance."""
+        """Whether only one offset fits, and not by chance."""
         fits = self.pairs >= _LEAST_PAIRS and self.residual_deg < _MOST_LEFT_DEG
         is_alone = self.residual_deg < _ALONE * self.second_deg
         return fits and is_alone and self.chance < _MOST_CHANCE
 
     @property
     def text(self) -> str:
-        """The figures."""
+        """The values as text."""
         return (
             f"{self.offset_s:+.2f} s by motion ({self.pairs} pairs of images, "
             f"{self.residual_deg:.2f} degrees left, {self.second_deg:.2f} at the next best offset; "
@@ -78,7 +78,7 @@ class _Pair:
 def find_offset(
     frames: Sequence[RecordedFrame], camera: Camera, track: Track, reach_s: tuple[float, float]
 ) -> ClockOffset | None:
-    """The offset within `reach_s` (least, greatest); None where too few images can be compared."""
+    """Estimate the offset within reach_s (least, greatest); None with too few images."""
     pairs = _pairs(frames, camera)
     if len(pairs) < 2:
         return None
@@ -227,9 +227,9 @@ def _camera(sample: Telemetry | None, frame: LocalFrame) -> tuple[Array, Array, 
 def exposures_of(
     times_ns: Sequence[int | None], exposures: Sequence[Telemetry]
 ) -> tuple[Telemetry, ...] | None:
-    """Which of a log's exposures each image is. Their intervals tell it, where only one offset of
-    the clocks lets all images find one; of images without times their order, where there are as
-    many. None where that is not so.
+    """Assign an exposure of a log to each image: by their intervals, if exactly one clock offset
+    fits all images; for images without times by their order, if the numbers are equal. Otherwise
+    None.
     """
     if all(t is None for t in times_ns):
         return tuple(exposures) if len(times_ns) == len(exposures) else None

@@ -1,4 +1,4 @@
-"""ArduPilot's dataflash log (.bin, .log) as the MAVLink messages of the same content."""
+"""Converts ArduPilot's dataflash log (.bin, .log) to MAVLink messages."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _KINDS = {"ArduCopter": 2, "ArduPlane": 1, "ArduRover": 10, "ArduSub": 12}  # MA
 
 
 def dataflash_messages(path: Path) -> Iterator[Dated]:
-    """Of a .bin or .log. `FootageError` where it is none; other errors are those of pymavlink's
-    reader, which has none of its own.
+    """Yield the messages of a .bin or .log. `FootageError` for another file; other errors are those
+    of pymavlink's reader.
     """
     is_text = path.suffix.lower() == ".log"
     with path.open("rb") as file:

@@ -1,7 +1,7 @@
-"""The one form in which recorded flights are used: `RecordedFlight`.
+"""`RecordedFlight`, the common form of recorded flights.
 
-Angles are those of a gimbal against north and the horizon: Rz(yaw) Ry(pitch) Rx(roll) from NED,
-pitch -90 looks down, yaw from true north clockwise. `None` means that nothing was recorded.
+Angles are those of a gimbal relative to north and the horizon: Rz(yaw) Ry(pitch) Rx(roll) from NED,
+pitch -90 looks down, yaw clockwise from true north. `None` means not recorded.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Kind = Literal["photos", "video", "sequence"]
 
 
 class Datum(Enum):
-    """What a height is above."""
+    """Reference surface of a height."""
 
     ELLIPSOID = "WGS84 ellipsoid"
     AMSL = "mean sea level"
@@ -35,7 +35,7 @@ class Datum(Enum):
 
 @dataclass(frozen=True)
 class Height:
-    """One recorded height, metres, with its standard deviation."""
+    """A recorded height and its standard deviation, metres."""
 
     value_m: float
     datum: Datum
@@ -44,8 +44,8 @@ class Height:
 
 @dataclass(frozen=True)
 class RecordedPosition:
-    """Where the camera was, WGS84 degrees. sigma_m: per horizontal axis. heights: all that were
-    recorded; which one is used depends on the map.
+    """Camera position, WGS84 degrees. sigma_m: per horizontal axis. heights: all that were
+    recorded; the map decides which one is used.
     """
 
     latitude_deg: float
@@ -56,9 +56,9 @@ class RecordedPosition:
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """Where the camera looked. ned_from_camera: (3, 3), axes OpenCV; heading_sigma_deg: None where
-    the heading is unknown; then the view is of heading 0. measured: whether gimbal or autopilot
-    measured roll and pitch; else they are assumed.
+    """Camera direction. ned_from_camera: (3, 3), OpenCV axes; heading_sigma_deg: None if the
+    heading is unknown (taken as 0). measured: whether roll and pitch were measured; otherwise they
+    are assumed.
     """
 
     ned_from_camera: Array
@@ -77,20 +77,20 @@ class RecordedView:
         *,
         measured: bool = True,
     ) -> RecordedView:
-        """From a gimbal's angles against north and the horizon."""
+        """From a gimbal's angles relative to north and the horizon."""
         angles = (float(a) for a in np.radians([roll_deg, pitch_deg, yaw_deg]))
         attitude = np.asarray(matrix_from_euler(*angles) @ GIMBAL_FROM_CAMERA)
         return cls(attitude, tilt_sigma_deg, heading_sigma_deg, measured)
 
     @property
     def nadir_angle_deg(self) -> float:
-        """Between the optical axis and straight down."""
+        """Angle between the optical axis and straight down."""
         return float(np.degrees(np.arccos(np.clip(self.ned_from_camera[2, 2], -1.0, 1.0))))
 
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What was recorded about one moment. time_ns: on the clock of its source, None if not dated.
+    """Telemetry of one time. time_ns: on the clock of its source, None if not dated.
 
     course_deg: direction of flight or of the aircraft's nose, from true north; zoom: multiple of
     the camera's focal length.
@@ -105,8 +105,8 @@ class Telemetry:
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One image on disk with what was recorded about it. time_ns: exposure, on the footage's own
-    clock; frames without a time are in the order of their names.
+    """One image file with its telemetry. time_ns: exposure, on the footage's clock; frames without
+    a time are ordered by name.
     """
 
     name: str
@@ -119,8 +119,8 @@ class RecordedFrame:
         return replace(self, telemetry=telemetry)
 
     def load(self, camera: Camera, time_ns: int, sequence: int = 0) -> Frame:
-        """The image as the localizer takes it, the camera at its size and zoom. StreamDecodeError
-        or StreamSizeError for an image that cannot be used.
+        """Load the image as a `Frame` with the camera at its size and zoom. StreamDecodeError or
+        StreamSizeError for an unusable image.
         """
         image = read_image(self.path)
         camera = fitted_camera(image.shape[1], image.shape[0], camera, self.name)
@@ -129,7 +129,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class CameraGuess:
-    """A camera model and how far its focal length may be off, one sigma. source: who says so."""
+    """A camera model and the sigma of its focal length in per cent. source: origin of the model."""
 
     camera: Camera
     focal_percent: float
@@ -138,8 +138,8 @@ class CameraGuess:
 
 @dataclass(frozen=True)
 class LogBeside:
-    """The autopilot's log of the flight. ahead_ns: its clock less that of the images;
-    fixed_pitch_deg: of the camera on the airframe, None where a gimbal's angles are in the log.
+    """The autopilot's log of the flight. ahead_ns: its clock minus that of the images;
+    fixed_pitch_deg: of a camera on the airframe, None if the log has gimbal angles.
     """
 
     path: Path
@@ -149,9 +149,8 @@ class LogBeside:
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """Frames in order of time, their telemetry and camera. kind: photos are independent of each
-    other; a sequence has overlapping frames; notes: what was assumed or left out, and why; log:
-    that its telemetry is from, if it is from one.
+    """Frames in time order, with telemetry and camera. kind: independent photos, or a sequence of
+    overlapping frames; notes: assumptions and omissions; log: source of the telemetry, if a log.
     """
 
     name: str
@@ -163,12 +162,12 @@ class RecordedFlight:
 
     @property
     def located(self) -> int:
-        """How many frames have a position."""
+        """Number of frames with a position."""
         return sum(frame.telemetry.position is not None for frame in self.frames)
 
 
 class Track:
-    """Telemetry over time, interpolated. Samples must be dated; gaps above `gap_s` give None."""
+    """Telemetry over time with interpolation; None in gaps above `gap_s`."""
 
     def __init__(self, samples: Sequence[Telemetry], gap_s: float = 2.5) -> None:
         dated = sorted((s.time_ns, k) for k, s in enumerate(samples) if s.time_ns is not None)
@@ -185,7 +184,7 @@ class Track:
         return self._times
 
     def at(self, time_ns: int) -> Telemetry | None:
-        """Telemetry at a time; None outside the record and in its gaps."""
+        """Telemetry at a time; None outside the record and in gaps."""
         if not len(self._times):
             return None
         after = int(np.searchsorted(self._times, time_ns))

@@ -1,4 +1,4 @@
-"""Whatever somebody recorded, as one `RecordedFlight`: photos, a video, telemetry beside them."""
+"""Reads any footage as a `RecordedFlight`: photos or a video, with telemetry beside them."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ _LEAST_STEP_NS, _PAIR_NS = 500_000_000, 1_000_000_000  # between frames of a vid
 
 @dataclass(frozen=True)
 class FootageOptions:
-    """What the user says beside the footage. frames: at most so many are read; places, log: files
-    of telemetry; fov_deg: horizontal; fixed_pitch_deg: of a camera on the airframe, for a log
-    without a gimbal; work: folder for the frames of a video; name: of a sequence in PiLoT's set.
+    """The user's options. frames: largest number; places, log: files of telemetry; fov_deg:
+    horizontal; fixed_pitch_deg: of a camera on the airframe, for a log without a gimbal; work:
+    folder for a video's frames; name: of a sequence in PiLoT's data set.
     """
 
     work: Path
@@ -76,7 +76,7 @@ class FootageOptions:
 def read_footage(
     path: Path, options: FootageOptions, progress: Progress = lambda _done, _total: None
 ) -> RecordedFlight:
-    """Read photos or a video with all telemetry that is in them or beside them.
+    """Read photos or a video with all telemetry in them or beside them.
 
     `FootageError` says what is missing and which option gives it.
     """

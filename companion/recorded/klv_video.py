@@ -1,4 +1,4 @@
-"""Telemetry in the video itself: KLV packets of MPEG-TS (ST 0601, or EG 0104's universal set)."""
+"""Telemetry in a video: KLV packets of MPEG-TS (ST 0601, or EG 0104's universal set)."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ Fields = dict[int, float | str | int]
 
 @dataclass(frozen=True)
 class KlvTrack:
-    """What a video's metadata say. samples: dated from its first frame, ns; packets: all that were
-    read; damaged: those that could not be; field_of_view_deg: horizontal, of the first that says.
+    """Telemetry of a video's KLV packets. samples: time from its first frame, ns; packets: number
+    read; damaged: number not decoded; field_of_view_deg: horizontal, first value.
     """
 
     samples: tuple[Telemetry, ...]
@@ -41,9 +41,8 @@ class KlvTrack:
 
 
 def read_klv_packets(path: Path) -> list[tuple[int, bytes]]:
-    """Packets with their time from the first frame, ns, in the order of the file. Packets without a
-    time of their own take that of the video packet before them. `FootageError` if the file is not a
-    video or damaged.
+    """Packets with their time from the first frame, ns, in file order. A packet without a time has
+    that of the video packet before it. `FootageError` if the file is no video or damaged.
     """
     packets: list[tuple[int | None, bytes]] = []
     first: int | None = None
@@ -67,7 +66,7 @@ def read_klv_packets(path: Path) -> list[tuple[int, bytes]]:
 
 
 def read_klv(path: Path) -> KlvTrack:
-    """Telemetry of a video's KLV packets; no samples where it carries none."""
+    """Telemetry of a video's KLV packets; no samples if it has none."""
     samples, damaged, packets, fov = [], 0, 0, None
     for time_ns, body in read_klv_packets(path):
         if body[:4] != tag.UNIVERSAL_LABEL[:4]:
@@ -85,14 +84,14 @@ def read_klv(path: Path) -> KlvTrack:
 
 
 def decode(packet: bytes) -> Fields:
-    """The fields of a packet of either standard, by ST 0601's tags. ValueError for none of them."""
+    """Decode a packet of either standard to ST 0601 tags; ValueError for others."""
     if packet.startswith(universal_set.UNIVERSAL_SET_LABEL):
         return universal_set.decode_universal(packet)
     return tag.decode(packet)
 
 
 def telemetry(fields: Fields, time_ns: int) -> Telemetry:
-    """Position and view that the fields say."""
+    """Position and camera direction of the fields."""
 
     def number(name: int) -> float | None:
         value = fields.get(name)

@@ -1,4 +1,4 @@
-"""MAVLink messages from what a log's rows say, as the vehicle would have sent them."""
+"""Makes MAVLink messages from log rows, as the vehicle would have sent them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Dated = tuple[int, Any]
 
 
 def autopilot(time_ns: int, message: Any) -> Iterator[Dated]:
-    """The message as from the autopilot 1/1; none where its numbers fit no message."""
+    """Yield the message as sent by the autopilot 1/1; nothing if its values do not fit."""
     try:
         message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
     except (struct.error, OverflowError, ValueError):
@@ -25,7 +25,7 @@ def autopilot(time_ns: int, message: Any) -> Iterator[Dated]:
 
 
 def position_message(ms: int, at_deg: tuple[float, float], amsl_m: float, above_m: float) -> Any:
-    """GLOBAL_POSITION_INT. above_m: the take-off."""
+    """GLOBAL_POSITION_INT. above_m: height above take-off."""
     latitude, longitude = (round(x * 1e7) for x in at_deg)
     return mavlink.MAVLink_global_position_int_message(
         ms, latitude, longitude, round(amsl_m * 1e3), round(above_m * 1e3), 0, 0, 0, 65535
@@ -36,7 +36,7 @@ def receiver_message(
     us: int, fix: int, at_deg: tuple[float, float], amsl_m: float, satellites: int,
     accuracy_m: float,
 ) -> Any:  # fmt: skip
-    """GPS_RAW_INT. accuracy_m: horizontal; 0 where it is not known."""
+    """GPS_RAW_INT. accuracy_m: horizontal; 0 if unknown."""
     latitude, longitude = (round(x * 1e7) for x in at_deg)
     return mavlink.MAVLink_gps_raw_int_message(
         us, min(fix, 8), latitude, longitude, round(amsl_m * 1e3), 65535, 65535, 65535, 65535,

@@ -1,7 +1,7 @@
-"""What a photo says about itself: EXIF and XMP of DJI, Autel, Parrot, Skydio and senseFly.
+"""Reads photo tags: EXIF and XMP of DJI, Autel, Parrot, Skydio and senseFly.
 
-XMP stands in the JPEG (an APP1 segment) or beside it as NAME.xmp, which takes precedence. Angles
-become those of `companion.recorded.flight`; each maker's convention stands in `_VIEWS`.
+XMP is in the JPEG (an APP1 segment) or beside it as NAME.xmp, which takes precedence. Angles are
+converted to those of `companion.recorded.flight`; `_VIEWS` has each maker's convention.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ class PhotoTags:
 
     @property
     def maker(self) -> str:
-        """Lower case; empty if not said."""
+        """Camera maker in lower case; empty if unknown."""
         return str(self.exif.get("Make") or self.xmp.get("Make") or "").strip("\x00 ").lower()
 
     @property
     def model(self) -> str:
-        """As the maker writes it; empty if not said."""
+        """Camera model; empty if unknown."""
         return str(self.exif.get("Model") or self.xmp.get("Model") or "").strip("\x00 ")
 
     def number(self, *names: str) -> float | None:
-        """The first of these XMP tags that is a finite number; fractions like 35/10 are read."""
+        """First of these XMP tags that is a finite number or a fraction such as 35/10."""
         for name in names:
             value = _number(self.xmp.get(name))
             if value is not None:
@@ -72,13 +72,13 @@ class PhotoTags:
         return None
 
     def exif_number(self, name: str) -> float | None:
-        """An EXIF number; None if it is missing, not finite or 0, which means unknown there."""
+        """An EXIF number; None if it is missing, not finite or 0 (unknown)."""
         value = _number(self.exif.get(name))
         return value if value else None
 
     @property
     def time_ns(self) -> int | None:
-        """Nanoseconds since 1970 on the photo's own clock, whose time zone is not known."""
+        """Nanoseconds since 1970 on the photo's clock, of unknown time zone."""
         text = str(self.exif.get("DateTimeOriginal") or self.exif.get("DateTime") or "")
         try:
             day = datetime.strptime(text.strip("\x00 "), "%Y:%m:%d %H:%M:%S")
@@ -91,18 +91,18 @@ class PhotoTags:
 
     @property
     def was_turned(self) -> bool:
-        """Whether another program turned the pixels: its tags are of the image before that."""
+        """Whether another program rotated the image, so that its tags do not fit."""
         width, height = self.exif_number("ExifImageWidth"), self.exif_number("ExifImageHeight")
         if width is None or height is None or width == height or self.width == self.height:
             return False
         return (width > height) != (self.width > self.height)
 
     def telemetry(self) -> Telemetry:
-        """Position, view and direction, as far as the tags say them."""
+        """Position and direction, as far as the tags have them."""
         return Telemetry(self.time_ns, self._position(), self.view(), self._course())
 
     def view(self) -> RecordedView | None:
-        """The measured view, by the first maker's convention whose tags are there."""
+        """The measured camera direction, by the first maker's convention that fits."""
         for names, convert in _VIEWS:
             angles = [self.number(name) for name in names]
             values = [a for a in angles if a is not None]
@@ -115,7 +115,7 @@ class PhotoTags:
 
     @property
     def has_zero_view(self) -> bool:
-        """Whether there are angles, and all of them are exactly zero: they were not measured."""
+        """Whether all angles are exactly zero, so that they were not measured."""
         return self.view() is None and any(
             all(self.number(name) == 0.0 for name in names) for names, _ in _VIEWS
         )
@@ -202,7 +202,7 @@ _VIEWS: tuple[tuple[tuple[str, str, str], Convert], ...] = (
 
 
 def looking_down(heading_deg: float | None) -> RecordedView:
-    """The view that is assumed where none was measured: straight down, the top of the image ahead.
+    """The assumed direction without a measurement: straight down, top of the image ahead.
 
     heading_deg: of the aircraft, None if unknown.
     """
@@ -211,7 +211,7 @@ def looking_down(heading_deg: float | None) -> RecordedView:
 
 
 def read_photo_tags(path: Path) -> PhotoTags:
-    """The tags of a photo, or of a sidecar alone. `FootageError` where it is no image."""
+    """Tags of a photo, or of a sidecar alone; `FootageError` if the file is no image."""
     if path.suffix.lower() == ".xmp":
         return PhotoTags(path, 0, 0, xmp=_read_xmp(path))
     try:

@@ -1,7 +1,7 @@
-"""Places of photos in a file beside them: CSV or text with one line a photo.
+"""Reads positions of photos from a file beside them: CSV or text, one line a photo.
 
-With a header, columns are found by their names. Without one, lines are ``name longitude latitude
-[altitude]``, which OpenDroneMap's geo.txt and this project's pose files have in common.
+With a header, columns are found by name. Without one, lines are ``name longitude latitude
+[altitude]``, as in OpenDroneMap's geo.txt and this project's pose files.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _LIMITS = {  # degrees; seconds since 1970, whose nanoseconds fit 64 bits; metre
 
 
 def read_places(path: Path) -> dict[str, Telemetry]:
-    """Telemetry by the photo's name. `FootageError` where the file holds no place."""
+    """Telemetry by photo name. `FootageError` if the file has no position."""
     try:
         lines = plain_text(path).removeprefix("\ufeff").splitlines()
     except (OSError, UnicodeDecodeError) as error:

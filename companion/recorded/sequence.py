@@ -42,7 +42,7 @@ def is_sequence(folder: Path) -> bool:
 
 
 def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
-    """A sequence of either layout; `name` chooses one of several in PiLoT's. `SequenceError` if the
+    """Read a sequence of either layout; `name` selects one of PiLoT's. `SequenceError` if the
     folder or an image is missing, or exposure times do not increase.
     """
     if not folder.is_dir():
@@ -67,7 +67,7 @@ def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
 
 
 def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Sequence:
-    """The flight with what was recorded as the truth. `SequenceError` where that is no pose."""
+    """The flight as a `Sequence` with the recorded poses as truth, else `SequenceError`."""
     truth = [_pose(one.telemetry, frame, geoid_m) for one in flight.frames]
     whole = tuple(pose for pose in truth if pose is not None)
     if len(whole) < len(truth) or not whole:
@@ -84,7 +84,7 @@ def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Se
 
 
 def load_sequence(folder: Path, frame: LocalFrame, name: str | None = None) -> Sequence:
-    """A sequence folder in a map's frame."""
+    """Read a sequence folder in a map's frame."""
     return sequence_of(read_sequence(folder, name), frame, 0.0)
 
 

@@ -41,8 +41,8 @@ _TILT_DEG, _HEADING_DEG = 2.0, 6.0
 
 @dataclass(frozen=True)
 class Subtitles:
-    """What a file says. samples: dated from the video's begin, ns; focal_35mm: of the lens; day:
-    of the recording by the camera's clock; last_s: begin of the last subtitle.
+    """Telemetry of a file. samples: time from the video's start, ns; focal_35mm: of the lens; day:
+    of the recording by the camera's clock; last_s: start of the last subtitle.
     """
 
     samples: tuple[Telemetry, ...]
@@ -52,7 +52,7 @@ class Subtitles:
 
 
 def read_subtitles(path: Path) -> Subtitles:
-    """Telemetry of a .SRT file. `FootageError` where it holds none."""
+    """Read telemetry of a .SRT file; `FootageError` without any."""
     try:
         text = plain_bytes(path).decode("utf-8-sig", "replace")
     except OSError as error:

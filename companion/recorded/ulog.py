@@ -1,4 +1,4 @@
-"""PX4's log (.ulg) as the MAVLink messages of the same content. Needs the extra ``ulog``."""
+"""Converts PX4's log (.ulg) to MAVLink messages. Needs the extra ``ulog``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Row = Mapping[str, Any]
 
 
 def ulog_messages(path: Path) -> Iterator[Dated]:
-    """Of a .ulg. `FootageError` without `pyulog`, or for a file that it does not read."""
+    """Yield the messages of a .ulg. `FootageError` without `pyulog` or for another file."""
     try:
         from pyulog import ULog
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Images out of a video file, with their times from its first frame."""
+"""Extracts images from a video file, with their times from its first frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _QUALITY_SUFFIX = ".jpg"
 
 @dataclass(frozen=True)
 class ExtractedFrame:
-    """An image that was written. time_ns: from the video's first frame."""
+    """An extracted image file. time_ns: from the video's first frame."""
 
     path: Path
     time_ns: int
@@ -38,9 +38,9 @@ class ExtractedFrame:
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """What a video file says. width, height: of its frames; has_dji_track: whether it holds DJI's
-    own telemetry (protobuf, a layout for each model); assumed: about its times, empty if it has
-    some; day: of the recording, UTC, None where it does not say.
+    """Properties of a video file. width, height: of its frames; has_dji_track: whether it has DJI's
+    own telemetry (protobuf, different for each model); assumed: about its times, empty if it has
+    some; day: of the recording, UTC, None if unknown.
     """
 
     width: int
@@ -53,7 +53,7 @@ class VideoFacts:
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Size, duration and orientation. `FootageError` where it is no video."""
+    """Size, duration and orientation; `FootageError` if the file is no video."""
     try:
         with av.open(str(path)) as container:
             stream = video_stream(container, str(path))
@@ -104,7 +104,7 @@ def _length_s(path: Path) -> float:
 def extract_frames(
     path: Path, folder: Path, times_ns: list[int], progress: Callable[[int, int], None]
 ) -> list[ExtractedFrame]:
-    """Write the frames nearest after each of the ascending times, at most `_LARGEST_PX` wide.
+    """Write the first frame at or after each of the ascending times, at most `_LARGEST_PX` wide.
     `FootageError` if no frame can be decoded.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The autopilot's and the receiver's tracks from the .tlog of a flight, if it was recorded."""
+"""EKF and receiver tracks from the .tlog of a flight."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FIX_3D = 3
 
 @dataclass(frozen=True)
 class TimedTrack:
-    """time_ns: (N,), CLOCK_MONOTONIC, when it was received; points: (N, 2) east, north, m."""
+    """time_ns: (N,), reception time, CLOCK_MONOTONIC; points: (N, 2) east, north, m."""
 
     time_ns: np.ndarray
     points: np.ndarray
@@ -42,7 +42,7 @@ class TimedTrack:
 
 @dataclass(frozen=True)
 class AutopilotTracks:
-    """None where nothing was recorded."""
+    """EKF and GNSS tracks; None if not recorded."""
 
     ekf: TimedTrack | None = None
     gnss: TimedTrack | None = None
@@ -51,7 +51,7 @@ class AutopilotTracks:
 def read_autopilot(
     tlog: Path | None, start_ns: int, utc_ns: int, pictures: MapPictures
 ) -> AutopilotTracks:
-    """From the record's `bridge.tlog`; a flight without one has none.
+    """Read the tracks from the record's `bridge.tlog`; none without one.
 
     start_ns, utc_ns: the record's begin on CLOCK_MONOTONIC and in UTC, 0 if unknown.
     """

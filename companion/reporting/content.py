@@ -1,4 +1,4 @@
-"""What a report shows, whatever it is about: plain data, ready to be laid out."""
+"""Contents of a report as plain data, independent of layout."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ NOTHING = "nothing"  # that went wrong: how the page's headline begins then
 
 @dataclass(frozen=True)
 class CriterionResult:
-    """One target of the flight. value, needed: as text with units; meaning, look: what a miss means
-    and where to look.
+    """Result of one criterion. value, needed: as text with units; meaning, look: what a failure
+    means and where to look.
     """
 
     name: str
@@ -34,7 +34,7 @@ RIM = 1.5  # of dark about a track, both sides together
 
 @dataclass(frozen=True)
 class MapTrack:
-    """A way in the map's frame. points: (N, 2) east, north, m; a NaN ends a stretch."""
+    """A path in the map's frame. points: (N, 2) east, north, m; NaN interrupts the line."""
 
     name: str
     colour: str
@@ -44,8 +44,8 @@ class MapTrack:
 
 @dataclass(frozen=True)
 class MapMark:
-    """A place in the map's frame. kind: "target" is one that was located, "truth" where one truly
-    is, else an event's; sigma_m: radius of its circle, 0: none.
+    """A position in the map's frame. kind: "target" (located), "truth" (true), or an event's;
+    sigma_m: radius of its circle, 0: none.
     """
 
     name: str
@@ -57,8 +57,8 @@ class MapMark:
 
 @dataclass(frozen=True)
 class MapSheet:
-    """Top view with tracks. rgb: (n, n, 3), None where the map is not to be had; west to north: its
-    edges, m. key: what circles and crosses are.
+    """Top view with tracks. rgb: (n, n, 3), None without a map; west to north: its edges, m. key:
+    legend.
     """
 
     rgb: Image | None
@@ -81,7 +81,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves over one abscissa. limit: a line that should not be crossed."""
+    """Curves over one abscissa. limit: horizontal line."""
 
     title: str
     x: np.ndarray
@@ -91,7 +91,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Stanford:
-    """Error against protection level, both (N,) m; alert_limit_m: beyond it nothing is used."""
+    """Stanford diagram: error against protection level, both (N,) m, and alert limit."""
 
     error_m: np.ndarray
     level_m: np.ndarray
@@ -100,7 +100,7 @@ class Stanford:
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of the timeline, seconds."""
+    """A time span of the timeline, seconds."""
 
     begin_s: float
     end_s: float
@@ -109,7 +109,7 @@ class Span:
 
 @dataclass(frozen=True)
 class ReportEvent:
-    """Something that happened. alert: the identifier of its alert, if any."""
+    """An event. alert: the identifier of its alert, if any."""
 
     time_s: float
     level: str
@@ -119,7 +119,7 @@ class ReportEvent:
 
 @dataclass(frozen=True)
 class Overlay:
-    """A frame and the map at its estimated pose, both (H, W, 3)."""
+    """A frame and the map rendered at its estimated pose, both (H, W, 3)."""
 
     video: Image
     render: Image
@@ -128,9 +128,7 @@ class Overlay:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Rows of text under their headings. bad: numbers of the rows that miss their target; note: how
-    the columns are to be read.
-    """
+    """Headings and rows. bad: indices of rows that fail; note: explains the columns."""
 
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -140,7 +138,8 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Report:
-    """All of it. first: what went wrong first, in words; abscissa: of the plots and the timeline.
+    """All contents of a report. first: the first fault as text; abscissa: label of the plots and
+    timeline.
 
     spans: named lanes of stretches (states, GNSS denied); notes: what the report could not show;
     overlays_of: the frames of which the overlays show the worst; verdict: the result in one

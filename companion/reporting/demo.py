@@ -1,4 +1,4 @@
-"""The report of a demo flight: the record beside the truth."""
+"""Report of a demo flight, with the truth."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _TARGET_LIMIT_M = 3.0
 
 
 def demo_report(folder: Path, say: Say = silent) -> Report:
-    """The report of `python -m sitl demo --out folder`. `RecordError` for another folder."""
+    """Make the report of `python -m sitl demo --out folder`. `RecordError` for another folder."""
     record = read_record(folder / "companion")
     try:
         document = json.loads(plain_text(folder / "report.json"))

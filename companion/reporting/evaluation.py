@@ -1,4 +1,4 @@
-"""The report of `companion eval`: a sequence with its truth."""
+"""Report of `companion eval`: a sequence with true poses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TEXT = ("name", "state", "status", "problem")
 
 
 def evaluation_report(folder: Path, say: Say = silent) -> Report:
-    """The report of `companion eval --report folder`. `RecordError` for another folder, or one
+    """Make the report of `companion eval --report folder`. `RecordError` for another folder, or
     without frames.
     """
     try:

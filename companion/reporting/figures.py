@@ -1,4 +1,4 @@
-"""From a record's columns to what a report shows: pure functions over arrays."""
+"""Computes a report's contents from a record's columns: pure functions over arrays."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _EVERY_FIX = (
 
 
 def seconds(time_ns: np.ndarray, start_ns: int) -> np.ndarray:
-    """Since the start."""
+    """Seconds since the start."""
     return np.asarray((np.asarray(time_ns) - start_ns) * 1e-9, dtype=np.float64)
 
 
 def track(name: str, colour: str, width: float, columns: Columns, prefix: str = "") -> MapTrack:
-    """The way of a table's positions."""
+    """The path of a table's positions."""
     points = np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north")])
     return MapTrack(name, colour, width, points)
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray, within_ns: int = _NEAR_NS) -> np.ndarray:
-    """For each wanted time the number of the nearest of `times` (sorted), -1 where none is near."""
+    """For each wanted time the index of the nearest of `times` (sorted), or -1."""
     if not len(times):
         return np.full(len(wanted), -1)
     right = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
@@ -55,7 +55,7 @@ def nearest(times: np.ndarray, wanted: np.ndarray, within_ns: int = _NEAR_NS) ->
 
 
 def state_spans(time_s: np.ndarray, states: np.ndarray) -> tuple[Span, ...]:
-    """Stretches of one state; where no estimate came there is none."""
+    """Time spans of each tracking state; gaps without estimates."""
     spans: list[Span] = []
     for i, (t, state) in enumerate(zip(time_s, states, strict=True)):
         until = time_s[i + 1] if i + 1 < len(time_s) else t
@@ -78,7 +78,7 @@ def events(columns: Columns, start_ns: int) -> tuple[ReportEvent, ...]:
 
 
 def stage_table(estimates: Columns) -> ReportTable:
-    """Median, 95 % and largest of each stage, over all of the record."""
+    """Median, 95th percentile and maximum latency of each stage."""
     rows = []
     for name in STAGES:
         values = np.asarray(estimates[f"{name}_ms"])
@@ -102,9 +102,8 @@ def first_fault(
     estimates: Columns, time_s: np.ndarray, happened: Sequence[ReportEvent], large_error: str = "",
     since_s: float | None = None,
 ) -> str:  # fmt: skip
-    """What went wrong first once the place was known, in words. large_error: the first time that
-    the position was off, where the truth is known, with its time in front. since_s: what came
-    before counts only where nothing came after, as what it is.
+    """Text: the first fault after localization began. large_error: text of the first large error,
+    if the truth is known. since_s: earlier faults are reported only if there is no later one.
     """
     states = np.asarray(estimates.get("state", np.empty(0)))
     began = np.flatnonzero(states == "tracking")
@@ -146,7 +145,7 @@ def _first_since(
 
 
 def target_marks(targets: Columns) -> tuple[MapMark, ...]:
-    """Where each target was located last, with its sigma."""
+    """Last position of each target, with its sigma."""
     marks = []
     for name, rows in by_name(targets).items():
         i = rows[-1]
@@ -158,7 +157,7 @@ def target_marks(targets: Columns) -> tuple[MapMark, ...]:
 
 
 def by_name(targets: Columns) -> dict[str, np.ndarray]:
-    """Each target's row numbers, in the order in which they were first seen."""
+    """Row indices of each target, in order of first appearance."""
     if not targets:
         return {}
     names = np.asarray(targets["target_id"])
@@ -168,7 +167,7 @@ def by_name(targets: Columns) -> dict[str, np.ndarray]:
 def target_table(
     targets: Columns, errors: Mapping[str, np.ndarray] | None = None, limit_m: float | None = None
 ) -> ReportTable | None:
-    """Each target on its own line: its last place, and its errors where the truth is known."""
+    """One row for each target: last position and, if the truth is known, errors."""
     grouped = by_name(targets)
     known = errors or {}
     names = [*grouped, *(n for n in known if n not in grouped)]

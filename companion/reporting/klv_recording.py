@@ -1,4 +1,4 @@
-"""``companion klv``: the metadata of a flight's record put into a recording of its video."""
+"""``companion klv``: adds the metadata of a flight's record to a recording of its video."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _TARGET_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Written:
-    """What came of it: pictures of the video, and how many of them got metadata."""
+    """Result. pictures: frames of the video; described: frames with metadata."""
 
     path: Path
     pictures: int
@@ -51,7 +51,7 @@ def describe_recording(
     mission: str = "",
     progress: Callable[[], None] = lambda: None,
 ) -> Written:
-    """Write `video` again as MPEG-TS with ST 0601 metadata beside each picture that was localized.
+    """Write `video` as MPEG-TS with ST 0601 metadata for each localized frame.
 
     begin_s: when its first picture was taken, seconds since the record's start; None: the pictures
     carry MISP time stamps. Raises `RecordError`, `StreamOpenError`.

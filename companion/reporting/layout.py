@@ -1,4 +1,4 @@
-"""A report as one HTML file that needs nothing else: no network, no other file."""
+"""Writes a report as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ _COLOURS = {
 
 
 def write_report(report: Report, path: Path) -> Path:
-    """Write the page. `ReportError` where the disk does not take it."""
+    """Write the page; `ReportError` if the disk does not accept it."""
     with writing(path):
         path.write_text(render(report), encoding="utf-8")
     return path
 
 
 def render(report: Report) -> str:
-    """The page's text."""
+    """The HTML text of a report."""
     page = resources.files("companion.reporting") / "page"
     body = "\n".join(part for part in _sections(report) if part)
     data = {"plots": [_plot_data(p) for p in report.plots], "abscissa": report.abscissa}
@@ -323,7 +323,7 @@ def _settings(report: Report) -> str:
 
 
 def data_uri(rgb: Image) -> str:
-    """A picture inside the page. `ReportError` if it cannot be encoded."""
+    """An image as a data URI. `ReportError` if it cannot be encoded."""
     done, jpeg = cv2.imencode(
         ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     )

@@ -1,4 +1,4 @@
-"""The pictures of a report: the map from above, and frames beside the map as it was seen there."""
+"""Images of a report: the map from above, and frames beside the rendered map."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _MARGIN_M = 60.0
 
 
 def silent(_: str) -> None:
-    """Nobody is told."""
+    """A progress callback that does nothing."""
 
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """A recorded picture with the pose that was estimated for it."""
+    """A recorded frame with its estimated pose."""
 
     path: Path
     world_from_camera: Pose
@@ -44,7 +44,7 @@ class ShownFrame:
 
 @dataclass(frozen=True)
 class MapPictures:
-    """Draws from one map. notes: what could not be drawn, and why; say: told what is drawn now."""
+    """Renders images of one map. notes: what could not be drawn; say: gets progress."""
 
     cache: TileCache | None
     renderer: MapRenderer | None
@@ -52,7 +52,7 @@ class MapPictures:
     say: Say = silent
 
     def sheet(self, tracks: Sequence[MapTrack], marks: Sequence[MapMark]) -> MapSheet | None:
-        """The square about all tracks and marks; None without any."""
+        """Top view of the square about all tracks and marks; None without any."""
         places = [t.points[np.isfinite(t.points).all(axis=1)] for t in tracks]
         points = np.vstack([*places, *([[m.east_m, m.north_m]] for m in marks), np.empty((0, 2))])
         if not len(points):
@@ -76,8 +76,8 @@ class MapPictures:
     def overlays(
         self, frames: Sequence[ShownFrame], camera: Camera, size: Camera | None = None
     ) -> tuple[Overlay, ...]:
-        """Each frame, freed of its distortion, and the map rendered at its pose. size: of the
-        pictures that are shown, else the camera's own.
+        """Each frame, undistorted, and the map rendered at its pose. size: camera at the images'
+        size, otherwise `camera`.
         """
         if self.renderer is None:
             return ()
@@ -104,8 +104,8 @@ class MapPictures:
 def map_pictures(
     path: Path | None, say: Say = silent, flown: FlownMap | None = None
 ) -> Iterator[MapPictures]:
-    """Pictures of the map in that folder; without one, the report says so and goes on. flown: what
-    the record knows of it: over a map about another origin everything would be drawn elsewhere.
+    """Context manager: images of the map in that folder; a note in the report if it cannot be used.
+    flown: what the record tells about its map, to reject a map with another origin.
     """
     if path is None:
         yield MapPictures(None, None, ["the map is not named: no pictures of it"])

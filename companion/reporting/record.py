@@ -1,4 +1,4 @@
-"""The report of a flight's record: what the companion knew, without the truth."""
+"""Report of a flight's record, without the truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ GNSS = "#ffffff"
 
 
 def record_report(folder: Path, say: Say = silent) -> Report:
-    """The report of one record."""
+    """Make the report of one record."""
     tables = read_record(folder)
     camera, estimates = tables.camera, tables.estimates
     start_ns = tables.start_ns
@@ -79,7 +79,8 @@ def record_report(folder: Path, say: Say = silent) -> Report:
 def worst_frames(
     tables: RecordTables, goodness: np.ndarray, what: str, time_s: np.ndarray
 ) -> list[ShownFrame]:
-    """The kept pictures in which `goodness` (per estimate) was least, worst first; NaN is worst.
+    """Recorded frames with the lowest `goodness` (one value per estimate), worst first; NaN is
+    worst.
 
     Frames of a refused estimate take at most half the places, if others are there.
     """
@@ -122,7 +123,7 @@ def _refused(status: str) -> str:
 
 
 def uncertainty_plots(estimates: Columns, time_s: np.ndarray) -> tuple[Plot, ...]:
-    """Sigma, protection level and quality over time."""
+    """Plots of sigma, protection level and quality over time."""
     horizontal = np.hypot(estimates["sigma_east_m"], estimates["sigma_north_m"])
     accepted = np.asarray(estimates["accepted"]) > 0
     curves = [Curve("sigma horizontal", np.where(accepted, horizontal, np.nan))]

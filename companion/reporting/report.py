@@ -1,4 +1,4 @@
-"""Which kind of folder it is, and its report in it."""
+"""Detects the kind of a folder and writes its report."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ NAME = "report.html"
 
 
 def write_page(folder: Path, out: Path | None = None, say: Say = silent) -> Path:
-    """Write the report of a record, a demo or an evaluation; returns its path. say: told what is
-    done now.
+    """Write the report of a record, a demo or an evaluation; returns its path. say: receives
+    progress.
     """
     report = report_of(folder, say)
     path = out or folder / NAME
@@ -27,7 +27,7 @@ def write_page(folder: Path, out: Path | None = None, say: Say = silent) -> Path
 
 
 def report_of(folder: Path, say: Say = silent) -> Report:
-    """The folder's report; `RecordError` for a folder that is none of the three, or damaged."""
+    """Make the folder's report; `RecordError` for another or a damaged folder."""
     try:
         return _report_of(folder, say)
     # What a damaged or a foreign file raises where a report takes it apart.

@@ -1,4 +1,4 @@
-"""What it means when a target is missed, and where to look first."""
+"""Explains failed criteria, and where to look first."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Advice:
-    """meaning: of a miss, to somebody who flies; look: what to open first."""
+    """meaning: of the failure, for the pilot; look: what to open first."""
 
     meaning: str
     look: str
@@ -63,8 +63,8 @@ _ADVICE = {
 
 
 def compared(value: float | None, limit: float, unit: str, *, at_least: bool) -> tuple[str, str]:
-    """A value and what it needs as text, with as many digits, two or more, as show who is right:
-    never "0.25 m, needed <= 0.25 m: missed".
+    """A value and its limit as text, with enough digits to show the difference: never "0.25 m,
+    needed <= 0.25 m: missed".
     """
     needed = f"{'>=' if at_least else '<='} {limit:g} {unit}"
     if value is None or not math.isfinite(value):
@@ -78,5 +78,5 @@ def compared(value: float | None, limit: float, unit: str, *, at_least: bool) ->
 
 
 def advice(name: str) -> Advice:
-    """Of the target with that name."""
+    """Explanation of the criterion with that name."""
     return next((a for begin, a in _ADVICE.items() if name.startswith(begin)), _UNKNOWN)

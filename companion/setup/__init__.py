@@ -1,1 +1,1 @@
-"""From nothing to a deployment file: what differs from the defaults, and the full reference."""
+"""Makes deployment files, and the reference of all settings."""

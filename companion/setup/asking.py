@@ -1,4 +1,4 @@
-"""What vehicle, stream and map say of themselves, for a deployment file."""
+"""Reads settings from vehicle, stream and map, for a deployment file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _ANY_GREY = (0, 65535)  # of a size, levels do not matter
 
 @dataclass(frozen=True)
 class Seen:
-    """Size of a stream's pictures, pixels."""
+    """Frame size of a stream, pixels."""
 
     width: int
     height: int
 
 
 def first_picture(source: str) -> Seen:
-    """The size of the stream's pictures; StreamError where none comes in time."""
+    """Read the frame size of a stream; `StreamError` if no frame arrives in time."""
     if "://" not in source and Path(source).is_dir():  # pictures are taken at their own size there
         height, width = read_image(list_images(Path(source))[0], _ANY_GREY).shape[:2]
         return Seen(width, height)

@@ -1,4 +1,4 @@
-"""What of a configuration differs from the defaults: all that a deployment file need hold."""
+"""Selects the settings of a configuration that differ from the defaults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Settings = dict[str, Any]
 
 
 def differing(model: BaseModel) -> Settings:
-    """The settings of a model that are not its defaults, as plain data; required ones, too."""
+    """The settings of a model that are required or differ from their defaults, as plain data."""
     found: Settings = {}
     for name, field in settings(type(model)).items():
         value = getattr(model, name)

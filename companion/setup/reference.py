@@ -1,4 +1,4 @@
-"""Every setting with its true default and what it means, generated from the schema."""
+"""Generates the list of every setting with default and description."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A deployment file that holds what differs from the defaults, and nothing else."""
+"""Writes a deployment file with only the settings that differ from the defaults."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from companion.setup.difference import differing
 def deployment_text(
     config: CompanionConfig, notes: Sequence[str], by: str = "companion init"
 ) -> str:
-    """The file's text. by: the command that writes it; notes: what whoever flies it should know,
-    as comments at its head.
-    """
+    """The file's text. by: the command that writes it; notes: comments for the user at its head."""
     lines = [
         f"# Written by `{by}`: only what differs from the defaults. Every other setting:",
         "# `companion init --reference`. Check it with `companion doctor` before each flight.",
@@ -28,7 +26,7 @@ def deployment_text(
 
 
 def write_deployment(text: str, path: Path, overwrite: bool) -> None:
-    """ConfigError where a file is there already, or where it cannot be written."""
+    """Write the file; `ConfigError` if it exists already or cannot be written."""
     try:
         with path.open("w" if overwrite else "x", encoding="utf-8") as file:
             file.write(text)

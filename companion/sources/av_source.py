@@ -80,8 +80,8 @@ class _Input:
 
 
 class VideoDecoder:
-    """One open container: packets in, pictures out. Single-threaded, because FFmpeg's frame threads
-    add a frame of delay each.
+    """Decodes one open container, single-threaded, because FFmpeg's frame threads add a frame of
+    delay each.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class VideoDecoder:
             tap.begin(self.stream)
 
     def pictures(self) -> Iterator[tuple[av.VideoFrame | None, int]]:
-        """(picture, arrival time in ns) per picture, (None, time) per packet that gave none."""
+        """Yield (frame, arrival time in ns), and (None, time) for a packet without a frame."""
         for packet in self._container.demux(self.stream):
             arrival_ns = time.monotonic_ns()
             try:
@@ -153,7 +153,7 @@ class VideoDecoder:
 
 
 class VideoFileSource:
-    """Every picture of a video file, in order; exposure times are now plus presentation time."""
+    """Every frame of a video file; exposure time: start time plus presentation time."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class VideoFileSource:
 
     @property
     def counters(self) -> SourceCounters:
-        """Received is delivered here: nothing is dropped."""
+        """Counters; nothing is dropped."""
         return self._counters
 
     @property
@@ -187,7 +187,7 @@ class VideoFileSource:
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """Every picture; raises `StreamDecodeError` when the file holds none."""
+        """Every frame; raises `StreamDecodeError` if the file has none."""
         try:
             decoder = VideoDecoder(_Input(str(self._path), {}), None, self._tap)
         except av.error.FFmpegError as error:
@@ -204,7 +204,7 @@ class VideoFileSource:
             decoder.close()
 
     def close(self) -> None:
-        """Ends `frames` after the present picture."""
+        """End `frames` after the present frame."""
         self._closed.set()
         self._report(StreamState.CLOSED, f"{self._path}: closed")
 
@@ -284,8 +284,8 @@ class VideoFileSource:
 
 
 class LiveVideoSource:
-    """A live stream, decoded by a reader thread; the newest picture wins. A stream that stops is
-    reported and opened again, after a longer wait with each failure.
+    """A live stream, decoded by a reader thread; only the newest frame is kept. A stream that stops
+    is reported and reopened, with longer waits after failures.
 
     Above 200 lines: what the reader's thread finds and what the taker's does are one state to tell.
     """
@@ -316,7 +316,7 @@ class LiveVideoSource:
 
     @property
     def counters(self) -> SourceCounters:
-        """Live counters; `dropped` are the pictures that a newer one overtook."""
+        """Counters; `dropped` are frames replaced by a newer one."""
         with self._lock:
             datagrams = self._input.datagrams
             foreign = 0 if datagrams is None else datagrams.foreign
@@ -324,11 +324,11 @@ class LiveVideoSource:
 
     @property
     def state(self) -> StreamState:
-        """Where the stream stands."""
+        """State of the stream."""
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """The newest picture each time; ends only when closed.
+        """Yield the newest frame; ends only when closed.
 
         Raises `StreamSizeError` when the first picture has another shape than the camera model. A
         stream that changes its shape later is reported as MISFIT until it fits again.
@@ -348,7 +348,7 @@ class LiveVideoSource:
             yield Frame(image, exposure_ns, camera, sequence)
 
     def close(self) -> None:
-        """Ends `frames`; waits for the reader, at most about two open time-outs.
+        """End `frames`; waits for the reader, at most about two open timeouts.
 
         FFmpeg's opening and its probing have one each. A reader still in them when the interpreter
         ends would call back into it: a segmentation fault.

@@ -1,4 +1,4 @@
-"""What every camera feed offers, whatever it comes from."""
+"""Interface of all camera feeds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _SHAPE_TOLERANCE = 0.005
 
 
 class StreamState(Enum):
-    """Where a feed stands; `SourceSettings` says when a live one counts as stalled.
+    """State of a feed; `SourceSettings` says when a live one is stalled.
 
     SCALED: its pictures have another size than the calibration but the same shape, and are used.
     MISFIT: they have another shape, and are not.
@@ -59,11 +59,10 @@ StateCallback = Callable[[StreamState, str], None]
 
 @dataclass(frozen=True)
 class SourceCounters:
-    """received: pictures decoded; delivered: handed out by `frames`; dropped: overwritten by a
-    newer one before they were fetched; undecodable: packets that gave no whole picture, or one
-    that was predicted from a picture that never came (`companion.sources.references`); misfits:
-    pictures whose shape is not the calibration's; reconnects: connections after the first; foreign:
-    datagrams of others than the feed's sender, which are not taken.
+    """received: frames decoded; delivered: passed on by `frames`; dropped: replaced by a newer one
+    first; undecodable: packets without a complete frame, or with one predicted from a lost frame
+    (`companion.sources.references`); misfits: frames whose shape is not the calibration's;
+    reconnects: connections after the first; foreign: datagrams of other senders, which are ignored.
     """
 
     received: int = 0
@@ -79,7 +78,7 @@ Count = Annotated[int, Field(ge=0, le=65535)]  # of a 16-bit sensor
 
 
 class SourceSettings(BaseModel):
-    """The keys of a camera feed in a deployment's configuration."""
+    """Settings of a camera feed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -143,25 +142,23 @@ class SourceSettings(BaseModel):
 
 
 class PacketTap(Protocol):
-    """Takes a video's packets as they came, beside the decoding. Called on the reader's thread;
-    must not block.
-    """
+    """Receives a video's packets before decoding, on the reader's thread; must not block."""
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A connection was made: the packets that follow are of this stream."""
+        """A connection was opened; the following packets are of this stream."""
         ...
 
     def packet(self, packet: av.Packet) -> None:
-        """The next packet, in the order of decoding; it is the tap's to keep."""
+        """The next packet in decoding order; the tap may keep it."""
         ...
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """When the picture of that presentation time (seconds) was taken, once it is known."""
+        """Exposure time of the frame with that presentation time (s)."""
         ...
 
 
 class PacketTaps:
-    """Several taps as one."""
+    """Combines several taps."""
 
     def __init__(self, taps: Sequence[PacketTap]) -> None:
         self._taps = tuple(taps)
@@ -183,8 +180,8 @@ class PacketTaps:
 
 
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
-    """The video among a container's streams, not a cover picture or a track of thumbnails, wherever
-    they stand; of several FFmpeg's choice, which is logged. `StreamOpenError` where there is none.
+    """The video stream of a container, not a cover image or thumbnails; of several FFmpeg's choice,
+    which is logged. `StreamOpenError` without one.
     """
     films = [
         s for s in container.streams.video
@@ -205,7 +202,7 @@ def video_stream(container: av.container.InputContainer, where: str) -> av.Video
 
 
 def has_times(container: av.container.InputContainer) -> bool:
-    """Whether its format says when pictures were taken, unlike raw H.264."""
+    """Whether the container's format has presentation times, unlike raw H.264."""
     return not container.format.flags & Flags.no_timestamps.value
 
 
@@ -213,29 +210,29 @@ class FrameSource(Protocol):
     """A camera feed. One consumer iterates `frames`; `close` may be called from any thread."""
 
     def frames(self) -> Iterator[Frame]:
-        """Frames in order of exposure. Ends when a file ends or the source is closed.
+        """Frames in order of exposure, until a file ends or the source is closed.
 
         A live stream that stops does not end it: it reports its state and connects again.
         """
         ...
 
     def close(self) -> None:
-        """Ends `frames` and frees the device or socket; harmless when called again."""
+        """End `frames` and free device or socket; harmless when called again."""
         ...
 
     @property
     def counters(self) -> SourceCounters:
-        """What was received, delivered and lost so far."""
+        """Counters so far."""
         ...
 
     @property
     def state(self) -> StreamState:
-        """Where the feed stands."""
+        """State of the feed."""
         ...
 
 
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
-    """The camera of a picture of this size: the calibrated one, or that scaled.
+    """Camera model of a frame of this size: the calibrated one, scaled if necessary.
 
     Raises `StreamSizeError` when the picture's shape shows that it was cropped or padded.
     """
@@ -256,7 +253,7 @@ def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera
 
 
 def scaling_text(width: int, height: int, camera: Camera, where: str) -> str:
-    """What an operator is told of pictures that are used although their size is not calibrated."""
+    """Warning for the operator about frames of another size than calibrated."""
     return (
         f"{where}: delivers {width}x{height}, taken as the calibrated "
         f"{camera.width}x{camera.height} scaled down or up (wrong if the camera crops or zooms)"

@@ -1,7 +1,6 @@
-"""The socket of a UDP feed: one interface, one sender, read by FFmpeg as if it were a file.
+"""UDP socket of a video feed: one interface, one sender, read by FFmpeg as a file.
 
-FFmpeg's own ``udp://`` binds every interface whatever its HOST says, and mixes the packets of all
-who send to the port: two streams become one picture sequence.
+FFmpeg's own ``udp://`` binds every interface and mixes the packets of all senders to the port.
 """
 
 from __future__ import annotations
@@ -29,9 +28,7 @@ Address = tuple[str, int]
 
 
 class SilentSenderError(Exception):
-    """Nothing that is read came from the sender within the patience. instead: what came, "" where
-    nothing did.
-    """
+    """The sender sent nothing for patience_s. instead: what other senders sent, or empty."""
 
     def __init__(self, patience_s: float, instead: str) -> None:
         super().__init__(instead or f"no data for {patience_s:g} s")
@@ -40,7 +37,7 @@ class SilentSenderError(Exception):
 
 @dataclass(frozen=True)
 class UdpAddress:
-    """What ``udp://HOST:PORT?localaddr=ADDRESS`` means.
+    """Parsed ``udp://HOST:PORT?localaddr=ADDRESS``.
 
     host: of this computer's interface to listen on, or a multicast group. interface: by which a
     group is joined; empty: the system's choice.
@@ -52,7 +49,7 @@ class UdpAddress:
 
     @classmethod
     def parse(cls, location: str) -> UdpAddress:
-        """Raises `StreamOpenError` for what cannot be listened on."""
+        """Raises `StreamOpenError` for an address that cannot be listened on."""
         try:
             parts = urlsplit(location)
             port = parts.port
@@ -71,11 +68,11 @@ class UdpAddress:
 
     @property
     def everywhere(self) -> bool:
-        """Whether that is every interface of this computer."""
+        """Whether it means every interface of this computer."""
         return self.host in ("0.0.0.0", "::")
 
     def bound(self) -> socket.socket:
-        """A socket that listens there and does not block; OSError where that is impossible."""
+        """A non-blocking socket bound to it; OSError if that is impossible."""
         family, kind, _, _, where = socket.getaddrinfo(
             self.host, self.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )[0]
@@ -103,7 +100,7 @@ class UdpAddress:
 
 
 class SenderLock:
-    """Whose datagrams are taken: one sender's, the configured one's or the first one's.
+    """Accepts the datagrams of one sender: the configured one or the first one.
 
     A sender that is followed is kept for good once a picture of it was decoded. It may come back
     from another port (a camera that restarts takes a new one) after `quiet_ns` of silence, and
@@ -122,20 +119,20 @@ class SenderLock:
 
     @property
     def sender(self) -> Address | None:
-        """Who is followed; None before the first."""
+        """The accepted sender; None before the first."""
         return self._sender
 
     @property
     def has_chosen(self) -> bool:
-        """Whether others are strangers: a sender is followed or configured."""
+        """Whether a sender is accepted or configured, so that others are refused."""
         return self._sender is not None or self._only is not None
 
     def prove(self) -> None:
-        """A picture of the followed sender was decoded."""
+        """A frame of the accepted sender was decoded."""
         self._proven = True
 
     def admits(self, sender: Address, data: bytes, now_ns: int) -> bool:
-        """Whether a datagram that came now is taken."""
+        """Whether a datagram that arrived now is accepted."""
         if sender == self._sender or self._may_follow(sender, data, now_ns):
             self._heard_ns = now_ns
             return True
@@ -161,7 +158,8 @@ class SenderLock:
 
 
 class VideoDatagrams:
-    """The feed's socket, kept bound from the first open to `close`, so that the sender is, too.
+    """The feed's socket. It stays bound from the first open to `close`, so the accepted sender
+    stays, too.
 
     FFmpeg reads it as a file (`read`) in the decoding thread; `close` may be called from any. What
     comes is MPEG-TS, RTP (its pictures are put together here) or H.264, H.265 by itself.
@@ -195,7 +193,7 @@ class VideoDatagrams:
         self._waker = WakePipe()
 
     def begin(self, patience_s: float) -> None:
-        """Bind it if it is not yet, and leave behind what came while nobody read.
+        """Bind the socket if necessary, and drop old datagrams.
 
         Raises OSError while the address cannot be bound.
         """
@@ -209,16 +207,16 @@ class VideoDatagrams:
                 return
 
     def format(self) -> str:
-        """FFmpeg's name of what comes, once something comes; `SilentSenderError` otherwise."""
+        """FFmpeg's name of the received format; `SilentSenderError` if nothing arrives."""
         self._pending = self._next()
         return FORMATS[self._kind or "mpegts"]  # None: closed
 
     def prove(self) -> None:
-        """A picture was decoded: who is followed stays."""
+        """A frame was decoded: the sender stays accepted."""
         self._lock.prove()
 
     def read(self, size: int) -> bytes:
-        """What has come from the sender, at most `size` bytes, as soon as there is something.
+        """Data of the sender, at most `size` bytes, as soon as there are any.
 
         b"" after `close`; raises `SilentSenderError` when nothing came within `patience_s`, and
         gives b"" from then on until `begin`: the demuxer asks again, and PyAV would print the trace
@@ -232,12 +230,12 @@ class VideoDatagrams:
         return given
 
     def close(self) -> None:
-        """End a `read` that waits. The socket is freed by `release`, in the reading thread."""
+        """End a waiting `read`. `release` frees the socket in the reading thread."""
         self._closed.set()
         self._waker.wake()
 
     def release(self) -> None:
-        """Free the socket; nothing reads any more."""
+        """Free the socket; call it after the last read."""
         self._waker.close()
         if self._socket is not None:
             self._socket.close()

@@ -1,4 +1,4 @@
-"""A folder of images as a camera feed: every image is delivered, in order of name."""
+"""A folder of images as a camera feed: every image in order of name."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ TIMESTAMPS_NAME = "timestamps.txt"
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The folder's images by name, numbers in names counted as numbers (img2 before img10).
-    `StreamOpenError` if the folder does not exist or holds none.
+    """The folder's images in natural order (img2 before img10). `StreamOpenError` if the folder
+    does not exist or has none.
     """
     if not folder.is_dir():
         raise StreamOpenError(f"{folder}: no such folder; give a folder of images")
@@ -86,8 +86,8 @@ def read_timestamps(path: Path) -> dict[str, int]:
 
 
 def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | None:
-    """Exposure times, ns, of its images by ``timestamps.txt`` in it; None without that file.
-    `StreamOpenError` if it lacks an image.
+    """Exposure times (ns) of a folder's images by its ``timestamps.txt``; None without that file.
+    `StreamOpenError` if an image is missing in it.
     """
     file = folder / TIMESTAMPS_NAME
     if not file.exists():
@@ -103,8 +103,8 @@ def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | Non
 
 
 class FolderSource:
-    """Frames from a folder. Times come from ``timestamps.txt`` in it, else from a fixed rate that
-    starts now; played in real time the recorded ones start now, too, as a video file's do.
+    """Frames from a folder. Times are those of ``timestamps.txt``, or of a fixed rate that starts
+    now; in real time the recorded ones are shifted to start now.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class FolderSource:
 
     @property
     def counters(self) -> SourceCounters:
-        """Received is delivered here: nothing is dropped."""
+        """Counters; nothing is dropped."""
         return SourceCounters(received=self._delivered, delivered=self._delivered)
 
     @property
@@ -152,7 +152,7 @@ class FolderSource:
         self._report(StreamState.ENDED, f"{self._folder}: all {len(self._images)} images delivered")
 
     def close(self) -> None:
-        """Ends `frames` after the present image."""
+        """End `frames` after the present image."""
         self._closed.set()
         self._report(StreamState.CLOSED, f"{self._folder}: closed")
 

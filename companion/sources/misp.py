@@ -1,9 +1,9 @@
-"""MISP precision time stamps in H.264 (MISB ST 0604): the exposure time inside the picture itself.
+"""MISP precision time stamps in H.264 (MISB ST 0604): the exposure time inside the frame.
 
-The stamp travels as an SEI message "user data unregistered" (ITU-T H.264, D.1.7) whose UUID is the
-ASCII text ``MISPmicrosectime``. Its payload is a status byte and eight bytes of microseconds since
-1970-01-01 (the MISP time system; a POSIX clock's reading here), with 0xFF after every second byte
-so that no start code can appear in it.
+The stamp is an SEI message "user data unregistered" (ITU-T H.264, D.1.7) whose UUID is the ASCII
+text ``MISPmicrosectime``. Its payload is a status byte and eight bytes of microseconds since
+1970-01-01 (the MISP time system; a POSIX clock's value here), with 0xFF after every second byte so
+that no start code can appear in it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _FILLER = slice(3, None, 3)  # of the 12 bytes from the status on: 0xFF at 3, 6 
 
 @dataclass(frozen=True)
 class MispTime:
-    """One stamp. time_us: microseconds since 1970-01-01; locked: to an absolute reference."""
+    """time_us: microseconds since 1970-01-01; locked: to an absolute reference."""
 
     time_us: int
     locked: bool
 
 
 def sei_nal(stamp: MispTime) -> bytes:
-    """The stamp as a NAL unit with its start code, to stand before a picture's slices."""
+    """Encode the stamp as a NAL unit with start code, to precede a frame's slices."""
     t = stamp.time_us.to_bytes(8, "big")
     status = _STATUS_RESERVED | (0 if stamp.locked else _NOT_LOCKED)
     message = UUID + bytes([status]) + b"\xff".join((t[0:2], t[2:4], t[4:6], t[6:8]))
@@ -35,7 +35,7 @@ def sei_nal(stamp: MispTime) -> bytes:
 
 
 def parse_message(message: bytes) -> MispTime | None:
-    """The stamp in an SEI message (UUID and payload); None when it is something else."""
+    """The stamp in an SEI message (UUID and payload); None for other messages."""
     if len(message) < _MESSAGE_SIZE or not message.startswith(UUID):
         return None
     body = message[len(UUID) : _MESSAGE_SIZE]

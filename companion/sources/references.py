@@ -78,7 +78,7 @@ class _Slice:
 
 
 class Damage:
-    """Follows what a decoder says of its pictures, in order, whatever the codec."""
+    """Tracks damage through a decoder's frames in order, for any codec."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None

@@ -1,8 +1,7 @@
-"""What the datagrams of a video feed carry, and RTP's video (RFC 3550, 6184, 7798) as one stream.
+"""Detects the format of UDP video, and assembles RTP video (RFC 3550, 6184, 7798) into a stream.
 
-FFmpeg reads RTP only from sockets of its own, which listen on every interface; here the datagrams
-of one sender are put together and handed to it in IVF (H.264) or MPEG-TS (H.265), which keep RTP's
-times and add no delay.
+FFmpeg reads RTP only from its own sockets, which listen on every interface. Here the datagrams of
+one sender are assembled to IVF (H.264) or MPEG-TS (H.265), which keep RTP's times without delay.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _WRAP = 1 << 32
 
 
 def kind_of(data: bytes) -> Kind | None:
-    """What a datagram is of; None for no video that is read."""
+    """Format of a datagram; None if it is no supported video."""
     if data[:1] == bytes([_SYNC]) and _is_transport(data):
         return "mpegts"
     payload = payload_of(data)
@@ -49,7 +48,7 @@ def kind_of(data: bytes) -> Kind | None:
 
 
 def named(data: bytes) -> str:
-    """What a datagram is that is not read, for an operator."""
+    """Name of an unsupported datagram format, for the operator."""
     if data[:1] in (b"\xfd", b"\xfe") and len(data) >= 8:
         return "MAVLink: is this the autopilot's port?"
     if payload_of(data):
@@ -70,7 +69,7 @@ def _is_transport(data: bytes) -> bool:
 
 
 def payload_of(data: bytes) -> bytes:
-    """RTP's payload, b"" where it is no RTP packet, or RTCP."""
+    """RTP's payload; b"" for RTCP or no RTP packet."""
     if len(data) <= _HEADER or data[0] >> 6 != 2 or 72 <= data[1] & 0x7F <= 76:
         return b""
     begin = _HEADER + 4 * (data[0] & 0x0F)
@@ -91,7 +90,7 @@ def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
 
 @dataclass
 class RtpPictures:
-    """Puts RTP packets of H.264 or H.265 together: IVF or MPEG-TS, each picture with its time.
+    """Assembles RTP packets of H.264 or H.265 to IVF or MPEG-TS, each frame with its time.
 
     A picture that lacks a packet is left out: a decoder would show the hole for seconds. sets:
     parameter sets that an SDP gives, put before the first picture.
@@ -127,7 +126,7 @@ class RtpPictures:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether a picture was begun."""
+        """Whether a frame is incomplete."""
         return self._time is not None
 
     def _add(self, payload: bytes) -> None:

@@ -1,6 +1,6 @@
-"""A session description (SDP, RFC 8866) of an RTP video feed: where it comes, and its parameters.
+"""Reads a session description (SDP, RFC 8866) of an RTP video feed: address and parameter sets.
 
-QGroundControl, GStreamer and FFmpeg (``-sdp_file``) write such files for who receives.
+QGroundControl, GStreamer and FFmpeg (``-sdp_file``) write such files for receivers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class SdpSession:
 
     @classmethod
     def read(cls, path: Path) -> SdpSession:
-        """`StreamOpenError` for a file without RTP video of H.264 or H.265."""
+        """Read a file; `StreamOpenError` if it has no RTP video of H.264 or H.265."""
         try:
             text = plain_text(path, _MOST_BYTES)
         except (OSError, UnicodeDecodeError) as error:

@@ -1,12 +1,10 @@
-"""From what a stream says about time to the exposure time on CLOCK_MONOTONIC.
+"""Converts a stream's time stamps to exposure times on CLOCK_MONOTONIC.
 
-Three sources, best first:
-
-1. A device's own monotonic stamp (V4L2 on Linux): it is the time already.
-2. MISP stamps of a camera whose clock is locked to the companion's (NTP, PTP): exact.
-3. Presentation times, or MISP stamps of a free-running clock: only their differences mean anything.
-   The sender's clock is laid under ours by the smallest lag seen (as ArduPilot's JitterCorrection
-   does for MAVLink), less a fixed latency that has to be measured glass to glass once per camera.
+Three sources, best first: 1. A device's monotonic time stamp (V4L2 on Linux): used as it is. 2.
+MISP stamps of a camera whose clock is synchronized with the companion's (NTP, PTP): exact. 3.
+Presentation times, or MISP stamps of a free-running clock: only their differences are used. The
+smallest lag seen gives the clock offset (as ArduPilot's JitterCorrection does for MAVLink), minus a
+fixed latency that must be measured once per camera.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ _STEP_NS = 20_000_000  # what a clock that is only slewed does not do between tw
 
 @dataclass
 class MinimumLag:
-    """Maps a sender's clock of unknown epoch to CLOCK_MONOTONIC by the smallest lag seen.
+    """Converts a sender's clock of unknown epoch to CLOCK_MONOTONIC by the smallest lag seen.
 
     The results never run backwards while arrival times do not: a new smallest lag gives the arrival
     time itself. latency_ns: the part of the lag that every frame has.
@@ -45,7 +43,7 @@ class MinimumLag:
     _last_sender: int = field(default=-(2**63))
 
     def map(self, sender_ns: int, arrival_ns: int) -> int:
-        """CLOCK_MONOTONIC nanoseconds of `sender_ns`, of a message that arrived at `arrival_ns`."""
+        """CLOCK_MONOTONIC (ns) of `sender_ns`, for a message that arrived at `arrival_ns`."""
         lag = arrival_ns - sender_ns
         if self._is_discontinuity(lag, sender_ns):
             self._current = self._previous = None
@@ -66,14 +64,14 @@ class MinimumLag:
 
 @dataclass(frozen=True)
 class FrameTimestamps:
-    """What a decoded picture says about time. pts_ns: presentation time, epoch unknown."""
+    """Time stamps of a decoded frame. pts_ns: presentation time, unknown epoch."""
 
     pts_ns: int | None
     misp: MispTime | None
 
 
 class ExposureClock:
-    """Gives each frame of one stream its exposure time; start a new one for each connection."""
+    """Computes the exposure times of one stream; make a new one for each connection."""
 
     def __init__(self, latency_ns: int, timing: Timing = "auto", *, device: bool = False) -> None:
         self._timing = timing
@@ -138,7 +136,7 @@ class ExposureClock:
 
 
 def system_minus_monotonic() -> int:
-    """The system's clock minus CLOCK_MONOTONIC, ns.
+    """The system clock minus CLOCK_MONOTONIC, ns.
 
     From the closest of a few pairs of readings: another thread may have its turn between two.
     """

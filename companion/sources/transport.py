@@ -1,6 +1,6 @@
-"""MPEG-TS (ISO/IEC 13818-1) of one H.265 stream: FFmpeg's IVF knows no H.265.
+"""Writes MPEG-TS (ISO/IEC 13818-1) of one H.265 stream, because FFmpeg's IVF has no H.265.
 
-An empty PES packet follows each picture: FFmpeg gives a picture out when the next packet begins.
+An empty PES packet follows each frame: FFmpeg outputs a frame when the next packet begins.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ _PES = b"\x00\x00\x01\xe0"
 
 
 class TransportStream:
-    """Pictures as MPEG-TS, the tables before each."""
+    """Encodes frames as MPEG-TS, with the tables before each."""
 
     def __init__(self) -> None:
         self._counts = {0: 0, _PMT: 0, _VIDEO: 0}
 
     def picture(self, data: bytes, time: int) -> bytes:
-        """One picture. data: Annex B; time: in 1/90000 s since the first."""
+        """One frame. data: Annex B; time: in 1/90000 s since the first."""
         video = 0xE000 | _VIDEO
         pat = struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 1, 0xE000 | _PMT)
         pmt = struct.pack(">HBBBHHBHH", 1, 0xC1, 0, 0, video, 0xF000, _HEVC, video, 0xF000)

@@ -1,9 +1,8 @@
-"""The focal length of a camera that zooms: a table over the zoom level that the camera reports.
+"""Focal length of a zoom camera from the zoom level that it reports.
 
-CAMERA_SETTINGS (260) gives `zoomLevel`, a per cent of the range: no focal length. The table says
-what it means for this lens. Between its points the logarithm of the factor is linear, so that a
-longer level never gives a shorter focal length. What the registration finds beside the pose
-corrects it slowly, and never beyond a bound.
+CAMERA_SETTINGS (260) has `zoomLevel`, per cent of the range, and no focal length. A table of the
+deployment gives the focal length; the logarithm of the factor is interpolated. The registration's
+estimate corrects it slowly, within a bound.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _AGAIN_NS = 10_000_000_000  # the same trouble is reported so often
 
 
 class ZoomTable(BaseModel):
-    """Which focal length each zoom level has."""
+    """Table of the focal length by zoom level."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     points: tuple[tuple[Level, Factor], ...] = Field(
@@ -63,7 +62,7 @@ class ZoomTable(BaseModel):
         return points
 
     def factor(self, level: float) -> float | None:
-        """Multiple of the model's focal length; None beyond the table, where nothing is known."""
+        """Multiple of the model's focal length; None outside the table."""
         levels, factors = zip(*self.points, strict=True)
         if not levels[0] <= level <= levels[-1]:
             return None
@@ -71,16 +70,13 @@ class ZoomTable(BaseModel):
 
 
 def longer(camera: Camera, factor: float) -> Camera:
-    """The same picture's camera behind a lens of another focal length: principal point and
-    distortion (of the ray's tangent) as they were.
-    """
+    """The camera with another focal length; principal point and distortion are unchanged."""
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
 class FocalCorrection:
-    """The zoom table's error at this zoom as images show it: the logarithm of the true focal length
-    over the table's. Its sigma is the bound until images measure it, and again once the lens has
-    moved, because the table's error differs from zoom to zoom.
+    """Estimates the zoom table's error from images: the logarithm of true over table focal length.
+    Its sigma is the bound at first, and again after the zoom changes.
     """
 
     def __init__(self, bound: float) -> None:
@@ -89,13 +85,13 @@ class FocalCorrection:
         self.value = 0.0
 
     def moved(self, by: float) -> None:
-        """The lens is at another zoom: the logarithm of its factor changed by so much."""
+        """The zoom changed; by: change of the logarithm of its factor."""
         other = min(abs(by) / _ELSEWHERE, 1.0)
         self._variance = min(self._variance + other * self._first, self._first)
 
     def learn(self, seen: float, sigma: float) -> None:
-        """A picture's logarithm. The errors of neighbours are correlated, so each counts as one of
-        so many.
+        """Add a frame's logarithm of true over table focal length. Errors of consecutive frames are
+        correlated, so its weight is reduced.
         """
         noise = _ALIKE_PICTURES * sigma**2
         gain = self._variance / (self._variance + noise)
@@ -105,7 +101,8 @@ class FocalCorrection:
 
 
 class ZoomedFrames:
-    """Gives every frame the camera of its zoom; the feed's thread, `factor` from any.
+    """Sets the camera model of every frame by its zoom, on the feed's thread; `factor` may be
+    called from any.
 
     level_at: the reported level at a time, None where it is not known. report: takes an alert for
     the operator when the trouble begins and every ten seconds of it.
@@ -148,7 +145,7 @@ class ZoomedFrames:
         return replace(frame, camera=longer(frame.camera, factor))
 
     def before(self, take: Callable[[Frame], object]) -> Callable[[Frame], None]:
-        """Hands on what is known, with its camera."""
+        """A receiver of frames that passes those with known zoom to `take`, with their camera."""
 
         def hand_on(frame: Frame) -> None:
             known = self(frame)
@@ -158,7 +155,7 @@ class ZoomedFrames:
         return hand_on
 
     def learn(self, estimate: PoseEstimate) -> None:
-        """Take in what a registered picture says of its focal length; any thread, never blocks."""
+        """Use a registered frame's focal length; any thread, never blocks."""
         fit = estimate.focal
         if fit is None or not self._table.refine:
             return
@@ -170,7 +167,7 @@ class ZoomedFrames:
 
     @property
     def factor(self) -> float | None:
-        """Of the newest frame whose zoom was known."""
+        """Focal length factor of the newest frame with known zoom."""
         with self._lock:
             return self._factor
 

@@ -1,1 +1,1 @@
-"""Who notices that the flight process died: told, marked, restarted."""
+"""Supervises the flight process: reports its death and restarts it."""

@@ -1,4 +1,4 @@
-"""The deployment as the supervisor read it: a restart in the air has it where its file is gone."""
+"""Keeps the deployment in memory for a restart in flight, if its file is gone by then."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from companion.errors import ConfigError
 
 
 def keep(config: CompanionConfig) -> int:
-    """A descriptor for the processes that are to know the deployment: of memory, which goes with no
-    disk.
-    """
+    """File descriptor of the deployment in memory, for child processes."""
     with open(os.memfd_create("deployment"), "wb") as file:
         # Escaped: a folder's name may be no UTF-8.
         file.write(json.dumps(config.model_dump(mode="json")).encode())
@@ -23,7 +21,7 @@ def keep(config: CompanionConfig) -> int:
 
 
 def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:
-    """The deployment in a file; of one that cannot be read any more, what was kept of it, and why.
+    """The deployment of a file; if that cannot be read, the kept one and the reason.
 
     kept: the descriptor that `keep` gave, None at a first start, which a wrong file ends.
     """

@@ -1,4 +1,4 @@
-"""Flight processes as the supervisor handles them."""
+"""Flight processes, as the supervisor starts and ends them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ ENDING = "ending"  # the last word of a process whose end is in order
 
 @dataclass(frozen=True)
 class Beat:
-    """A sign of life: which part's last turn is longest ago, and how long."""
+    """Sign of life of a flight process: the component whose last cycle is oldest, and its age."""
 
     part: str
     age_s: float
 
 
 class FlightProcess:
-    """A command that flies. standby: with ``--standby`` it prepares, and waits for a line.
-    hands_on: descriptors that it may read, under the same numbers.
+    """A flight process. standby: started with ``--standby``, it prepares and waits. hands_on:
+    inherited file descriptors.
 
     It takes a process group of its own: the terminal's interrupt comes through the supervisor
     alone. Not a session: Linux schedules each as one, whatever priority the supervisor was given.
@@ -54,27 +54,27 @@ class FlightProcess:
         return self._process.pid
 
     def release(self) -> None:
-        """Let a standby fly; harmless where it died meanwhile: then its death is seen."""
+        """Let a standby fly; harmless if it has died."""
         if self._process.stdin is not None:
             with contextlib.suppress(OSError, ValueError):
                 self._process.stdin.write(b"fly\n")
                 self._process.stdin.flush()
 
     def wait(self, timeout_s: float) -> int | None:
-        """Its exit code, negative of a signal; None while it runs."""
+        """Exit code, negative for a signal; None while it runs."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             return None
 
     def close(self) -> None:
-        """Nothing is read of it any more."""
+        """Close the pipes."""
         if self._beats >= 0:
             os.close(self._beats)
             self._beats = -1
 
     def beats(self) -> tuple[Beat, ...]:
-        """What it said since the last look."""
+        """Signs of life since the last call."""
         try:
             while data := os.read(self._beats, _READ):
                 self._unread += data
@@ -85,17 +85,17 @@ class FlightProcess:
         return tuple(beat for line in lines if (beat := _beat(line)) is not None)
 
     def kill(self) -> None:
-        """End one that hangs; it may be stopped, or wait for a disk."""
+        """Kill a process that hangs."""
         self._process.kill()
         self.wait(_KILL_S)
 
     def interrupt(self, number: int) -> None:
-        """Pass a signal on; harmless when it has ended."""
+        """Pass a signal on; harmless if it has ended."""
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
 
     def dismiss(self) -> None:
-        """End a standby: its line never comes."""
+        """End an unused standby."""
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()

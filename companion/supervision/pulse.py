@@ -1,7 +1,7 @@
-"""A sign of life of every part, four times a second, for the supervisor that restarts what hangs.
+"""Sends signs of life four times a second to the supervisor, which restarts a hanging process.
 
-A process whose threads wait for ever is not dead, and its heartbeat may go on. So each thread that
-a position needs notes the time of its every turn, and this part tells the oldest of them.
+A process whose threads hang is not dead, and its heartbeat may continue. So each thread that a
+position needs notes the time of its last cycle; the oldest is sent.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _PERIOD_S = 0.25
 
 
 class Pulse:
-    """Writes ``NAME MILLISECONDS`` lines: the part whose last turn is longest ago, and how long.
+    """Writes ``NAME MILLISECONDS`` lines: the component whose last cycle is oldest, and its age.
 
     beats: the CLOCK_MONOTONIC times of the parts' last turns, ns; none is older than the start: the
     parts are made long before on a slow computer, and each begins with a wait. descriptor: of a
@@ -34,13 +34,13 @@ class Pulse:
         self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
 
     def start(self) -> None:
-        """Start telling."""
+        """Start the thread."""
         self._begun_ns = monotonic_ns()
         self._thread.start()
 
     def stop(self, *, clean_shutdown: bool) -> None:
-        """Say that the end begins, and end. One in order (stopped, the feed is over) is given the
-        time that a recording takes; after an error another process should fly soon.
+        """Announce the end and stop. After a clean shutdown the supervisor allows time to close a
+        recording; after an error it restarts soon.
         """
         self._stop.set()
         ended = joined(self._thread)
@@ -61,7 +61,7 @@ class Pulse:
 
 
 def line(beats: Mapping[str, int], now_ns: int) -> bytes:
-    """The line of a moment; ``all 0`` without any part."""
+    """The line for a time; ``all 0`` without components."""
     if not beats:
         return b"all 0\n"
     name = min(beats, key=lambda one: beats[one])

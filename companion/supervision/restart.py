@@ -1,8 +1,7 @@
-"""What a restart in the air leaves out: disks that went, or stand still, since the flight began.
+"""Removes settings whose disks failed in flight from the deployment of a restart.
 
-At a first start a folder that cannot be written to is a wrong setting, and ends it. At a restart it
-was right when the flight began: a stick that shook loose must not keep the aircraft on the ground's
-rules while it flies without GNSS.
+At a first start, a folder that cannot be written to is an error. At a restart in flight it was
+right before, so the flight continues without it.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ def _lost(folders: Iterable[Path], probe: Callable[[Path], str]) -> dict[Path, s
 
 
 def written_to(folder: Path) -> str:
-    """Why nothing can be written in a folder; empty if something can, and of a full disk."""
+    """Why a folder cannot be written to; empty if it can, or if the disk is full."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=".again-", dir=folder)

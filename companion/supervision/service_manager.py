@@ -1,4 +1,4 @@
-"""What systemd is told over NOTIFY_SOCKET (sd_notify(3)): ready, alive, and how it goes."""
+"""Reports to systemd over NOTIFY_SOCKET (sd_notify(3)): ready, alive, status."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _LONGEST = 200  # characters of a status
 
 
 class ServiceManager:
-    """Tells the service manager; without one (an empty address) nobody is told. Never blocks.
+    """Reports to the service manager; does nothing with an empty address. Never blocks.
 
     address: of a datagram socket, a path, or ``@`` and a name in the abstract name space.
     """
@@ -25,25 +25,25 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> ServiceManager:
-        """Of the process that was started with this environment; its children are not asked."""
+        """From NOTIFY_SOCKET, which is removed so that child processes do not use it."""
         return cls(environment.pop(_VARIABLE, ""))
 
     def close(self) -> None:
-        """Nobody is told any more."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def ready(self) -> None:
-        """The service does what it is for."""
+        """Report that the service works."""
         self._say("READY=1")
 
     def alive(self) -> None:
-        """The service is watched, and nothing in it hangs (WatchdogSec)."""
+        """Report a sign of life (WatchdogSec)."""
         self._say("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """A line for `systemctl status`."""
+        """Set the line for `systemctl status`."""
         self._say(f"STATUS={text[:_LONGEST]}")
 
     def _say(self, text: str) -> None:

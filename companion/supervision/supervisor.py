@@ -1,9 +1,9 @@
-"""Keeps the flight process alive: a process of its own that does nothing else.
+"""Keeps the flight process alive; a separate process that does nothing else.
 
-It waits for the flight process to end, and for the signs of life of its parts: one that hangs is
-ended. A death is told to the operator and marked in ``health.json`` within a second, and a standby
-process, with map and network in memory, takes over. Deaths that come fast never end it, since the
-aircraft may fly without GNSS: cold starts wait longer and longer, and each is reported.
+It waits for the flight process to end, and kills one that hangs. A death is reported to the
+operator and written to ``health.json`` within a second, and a standby process, with map and network
+in memory, takes over. It never gives up, because the aircraft may fly without GNSS: repeated cold
+starts wait longer, and each is reported.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ class Process(Protocol):
         """Let a standby fly."""
 
     def wait(self, timeout_s: float) -> int | None:
-        """Its exit code, negative of a signal; None while it runs."""
+        """Exit code, negative for a signal; None while it runs."""
 
     def beats(self) -> Sequence[Beat]:
-        """Its signs of life since the last look."""
+        """Signs of life since the last call."""
 
     def kill(self) -> None:
-        """End one that hangs."""
+        """Kill a process that hangs."""
 
     def close(self) -> None:
-        """Nothing is asked of it any more."""
+        """Close the pipes."""
 
     def interrupt(self, number: int) -> None:
-        """Pass a signal on; harmless when it has ended."""
+        """Pass a signal on; harmless if it has ended."""
 
     def dismiss(self) -> None:
         """End a standby that is not needed, and reap it."""
@@ -90,20 +90,20 @@ class RestartPolicy:
 
 
 class Manager(Protocol):
-    """Who started the supervisor, and restarts it where it says nothing for long."""
+    """The service manager, which restarts the supervisor if it is silent for long."""
 
     def ready(self) -> None:
-        """A process flies: its every part took a turn. Said of each process."""
+        """A flight process works: each component has completed a cycle."""
 
     def alive(self) -> None:
-        """It is watched, and nothing in it hangs."""
+        """The flight process is supervised and does not hang."""
 
     def status(self, text: str) -> None:
-        """How it goes."""
+        """Report the status as text."""
 
 
 class Supervisor:
-    """`run` until the flight is over.
+    """Starts, watches and restarts flight processes; `run` until the flight is over.
 
     spawn: makes a process, flying at once or as a standby. tell: an alert to the
     operator; mark: what the ``health.json`` of the process (id) is to say. manager: told on the
@@ -135,8 +135,8 @@ class Supervisor:
         self._stopping = False
 
     def run(self) -> int:
-        """The exit code of the flight process that ended in order, or of the last before an order
-        to end.
+        """Supervise; returns the exit code of the process that ended normally, or of the last one
+        after `stop`.
         """
         self._fly(self._spawn(False), self._policy.cold_s)
         try:
@@ -162,7 +162,7 @@ class Supervisor:
                 self._standby.dismiss()
 
     def stop(self, number: int) -> None:
-        """Pass a signal on and end with what flies; for a signal handler."""
+        """Pass a signal on and end with the flight process; for a signal handler."""
         self._stopping = True
         if self._flying is not None:
             self._flying.interrupt(number)
@@ -314,7 +314,7 @@ def _do_in_time(name: str, do: Callable[[], None]) -> None:
 
 
 def described(code: int) -> str:
-    """An exit code in a word or two."""
+    """An exit code in words."""
     if code >= 0:
         return f"exit {code}"
     try:
@@ -324,7 +324,8 @@ def described(code: int) -> str:
 
 
 def mark_dead(folder: Path, pid: int, text: str) -> None:
-    """Let the ``health.json`` of the process say so, in the record at `folder` or beside it.
+    """Write the death into the ``health.json`` of process `pid`, in the record at `folder` or
+    beside it.
 
     Where no record has one of this process, there is nothing to say it in.
     """

@@ -1,1 +1,1 @@
-"""An operator's clicks and a detector's pixels become target coordinates."""
+"""Locates targets: pixels of operator clicks and detectors become coordinates."""

@@ -1,8 +1,7 @@
-"""The ground station's clicks: which frame they point into, and when they are refused.
+"""Assigns a ground station's clicks to frames, and refuses invalid ones.
 
-Each click is a target of its own: what was clicked before says nothing about it. The operator
-points into the picture that he sees, which is older than the one that the camera takes: the click
-belongs to the frame `targets.operator_delay_ms` before it came.
+Each click is a new target. The operator sees an older frame than the camera's newest: the click
+belongs to the frame `targets.operator_delay_ms` before it arrived.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _MOST = 8  # clicked targets at a time
 
 
 class ClickPolicy:
-    """Finds each click's frame in the poses that were flown, and begins or ends its target.
+    """Finds each click's frame among the past poses, and begins or ends its target.
 
     report: tells the operator.
     """
@@ -46,7 +45,7 @@ class ClickPolicy:
         self._lock = threading.Lock()  # two links may both have a ground station
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle | None = None) -> None:
-        """Note an estimate; clicks that waited for it are placed. Never blocks."""
+        """Add an estimate; waiting clicks of that time are processed. Never blocks."""
         if estimate.accepted:
             self._history.add(estimate)
         if not self._waiting:
@@ -57,7 +56,7 @@ class ClickPolicy:
             ]
 
     def on_request(self, request: TrackRequest) -> None:
-        """Take the operator's wish. Never blocks."""
+        """Process a click. Never blocks."""
         with self._lock:
             if request.kind == "stop":
                 self._stop(request.number)
@@ -65,7 +64,7 @@ class ClickPolicy:
                 self._waiting.append(request)
 
     def on_gone(self, name: str) -> None:
-        """A target ended by itself."""
+        """A target has ended."""
         with self._lock:
             self._alive = [c for c in self._alive if c.name != name]
 

@@ -1,9 +1,9 @@
-"""Pixel detections from outside: an operator's click or an object detector, as JSON over UDP.
+"""Receives pixel detections of an external object detector or click, as JSON over UDP.
 
 One datagram is one detection: ``{"target_id": "car", "time_ns": 123, "u": 320.5, "v": 240.5}``;
-time_ns is the frame's exposure on CLOCK_MONOTONIC, (u, v) the pixel in the video as streamed.
-A detector that does not know it names its frame: ``"sequence"`` is the frame's number, ``"pts_s"``
-the presentation time in the stream, seconds.
+time_ns is the frame's exposure on CLOCK_MONOTONIC, (u, v) the pixel in the streamed video. Instead
+of time_ns a detector may give the frame: ``"sequence"`` is its number, ``"pts_s"`` its presentation
+time in the stream, seconds.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _PAUSE_S = 0.001  # at most a thousand detections a second: a flood must not tak
 
 
 def clicked_name(number: int, asked_by: str = GROUND_STATION) -> str:
-    """What the target of the click with that number is called."""
+    """Name of the target of the click with that number."""
     return f"{asked_by} {number}"
 
 
 def clicked_number(name: str) -> int | None:
-    """The number of the click that a target is called after; None for a detector's."""
+    """Number of the click in a target's name; None for a detector's target."""
     return int(name.rpartition(" ")[2]) if name.startswith(CLICKED) else None
 
 
@@ -55,14 +55,14 @@ class Detection:
 
 @dataclass(frozen=True)
 class FrameName:
-    """How a detector names a frame whose exposure it does not know; one of the two is set."""
+    """Identifies a frame by number or presentation time; exactly one is set."""
 
     sequence: int | None = None
     pts_s: float | None = None
 
 
 def parse_detection(data: bytes) -> tuple[Detection, FrameName | None]:
-    """Decode one datagram; `DetectionError` says what is wrong with it.
+    """Decode one datagram; `DetectionError` for an invalid one.
 
     The name of its frame is None where it tells the exposure; else the detection's time is 0.
     """
@@ -99,12 +99,12 @@ def parse_detection(data: bytes) -> tuple[Detection, FrameName | None]:
 
 
 def encode_detection(detection: Detection) -> bytes:
-    """A datagram of a detection whose exposure is known."""
+    """Encode a detection with known exposure time as a datagram."""
     return json.dumps(detection.__dict__).encode()
 
 
 def parse_host_port(text: str) -> tuple[str, int]:
-    """``host:port`` as a socket address. `ConfigError` for another text."""
+    """``host:port`` as a socket address; `ConfigError` for other texts."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
         raise ConfigError(f"expected host:port, got {text!r}")
@@ -112,8 +112,8 @@ def parse_host_port(text: str) -> tuple[str, int]:
 
 
 class DetectionListener:
-    """Receives detections on a thread; bad datagrams are counted and ignored. Two senders of one
-    name are two (`Senders`).
+    """Receives detections on a thread; invalid datagrams are counted and ignored. Targets of two
+    senders with the same name are kept apart (`Senders`).
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Which frame a detector means: by its number or its presentation time instead of its exposure."""
+"""Finds the exposure time of a frame that a detector names by number or presentation time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME_S = 0.001  # presentation times that differ by less are of one picture
 
 
 class FrameTimes:
-    """Gives each detection its frame's exposure time, at once or when the frame comes.
+    """Gives each detection its frame's exposure time, at once or when the frame arrives.
 
     A `PacketTap` that looks at presentation times alone. on_detection: takes what is timed; must
     not block. unmatched counts what named a frame that never came. Safe to use from any thread.
@@ -34,7 +34,7 @@ class FrameTimes:
         self.unmatched = 0
 
     def add_detection(self, detection: Detection, name: FrameName | None = None) -> None:
-        """Hand a detection on, or keep it until the frame it names comes."""
+        """Pass a detection on, or keep it until its frame arrives."""
         if name is None:
             self._on_detection(detection)
             return
@@ -49,7 +49,7 @@ class FrameTimes:
         self._on_detection(replace(detection, time_ns=time_ns))
 
     def add_frame(self, frame: Frame) -> None:
-        """Note a frame's number. Never blocks."""
+        """Note a frame's number and exposure time. Never blocks."""
         with self._lock:
             self._by_sequence[frame.sequence] = frame.exposure_time_ns
             if len(self._by_sequence) > _KEPT:
@@ -57,9 +57,7 @@ class FrameTimes:
         self._release()
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A new connection counts its presentation times anew: what waits for one of the old
-        would be given another picture's exposure.
-        """
+        """A new connection restarts the presentation times: drop waiting detections."""
         with self._lock:
             self._by_pts.clear()
             kept = deque((d, n) for d, n in self._waiting if n.pts_s is None)
@@ -67,10 +65,10 @@ class FrameTimes:
             self._waiting = kept
 
     def packet(self, packet: av.Packet) -> None:
-        """Packets say nothing here."""
+        """Does nothing."""
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """Note a picture's presentation time. Never blocks."""
+        """Note a frame's presentation time. Never blocks."""
         with self._lock:
             self._by_pts[pts] = exposure_time_ns
             if len(self._by_pts) > _KEPT:

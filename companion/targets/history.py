@@ -1,4 +1,4 @@
-"""The poses of the last seconds: where the camera was when a picture was taken."""
+"""Camera poses of the last seconds, by exposure time."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _LEAST_CHANGE = np.repeat([0.5, 0.05], 3)
 
 
 class PoseHistory:
-    """Accepted estimates in the order of their exposure. Safe to use from several threads."""
+    """Accepted estimates in order of exposure. Thread-safe."""
 
     def __init__(self) -> None:
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._lock = threading.Lock()
 
     def add(self, estimate: PoseEstimate) -> None:
-        """Keep an accepted estimate; one that is no newer than the last is left out."""
+        """Add an accepted estimate; one that is not newer than the last is ignored."""
         with self._lock:
             last = self._estimates[-1] if self._estimates else None
             if last is None or estimate.exposure_time_ns > last.exposure_time_ns:
@@ -37,12 +37,12 @@ class PoseHistory:
 
     @property
     def newest(self) -> PoseEstimate | None:
-        """The last one; None before the first."""
+        """The newest estimate; None before the first."""
         with self._lock:
             return self._estimates[-1] if self._estimates else None
 
     def at(self, time_ns: int) -> PoseEstimate | None:
-        """The estimate at a time, between two neighbours where it has no frame of its own.
+        """The estimate at a time, interpolated between two neighbours if there is none.
 
         Between two, the worse covariance and state of both are told, and by how much the motion
         may have changed between them. None outside of what is kept, and in a gap of more than a

@@ -1,4 +1,4 @@
-"""The numbers that targets have in MAVLink."""
+"""MAVLink numbers of targets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MOST = 256  # names; many times as many as are followed at a time
 
 
 class TargetNumbers:
-    """A number for each target's name: a click's own, or the next one of what was detected.
+    """Gives each target's name a number: the click's own, or the next one for detections.
 
     No number is two targets' of now, and none is given again before a million others. A name that
     256 others came after is forgotten, since a detector makes new ones as long as it flies.
@@ -27,7 +27,7 @@ class TargetNumbers:
 
     @property
     def known(self) -> int:
-        """How many names of detected things are remembered."""
+        """Number of remembered names of detected targets."""
         return len(self._numbers)
 
     def of(self, name: str) -> int:

@@ -1,4 +1,4 @@
-"""The newest pictures, as many as memory allows: one of 4K takes sixteen times one of 960 x 540."""
+"""Queue of the newest frames with a memory limit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class RecentPictures(Generic[Item]):
         self.nbytes = 0
 
     def append(self, item: Item) -> None:
-        """Add the newest."""
+        """Add the newest item."""
         self._kept.append(item)
         self.nbytes += self._size(item)
         while len(self._kept) > self._most or (
@@ -34,7 +34,7 @@ class RecentPictures(Generic[Item]):
             self.nbytes -= self._size(self._kept.popleft())
 
     def keep(self, wanted: Callable[[Item], bool]) -> None:
-        """Drop all others."""
+        """Drop all items that are not wanted."""
         self._kept = deque(item for item in self._kept if wanted(item))
         self.nbytes = sum(self._size(item) for item in self._kept)
 

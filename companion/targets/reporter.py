@@ -1,4 +1,4 @@
-"""Clicks, detections and estimates become target coordinates, on a thread of its own."""
+"""Computes target coordinates from clicks, detections and estimates, on its own thread."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
 
 
 class TargetReporter:
-    """Pairs detections with accepted estimates, and lets the population of targets live on them.
+    """Pairs detections with accepted estimates and updates the targets (`TargetManager`).
 
     on_gone: called on the targets' thread with each name that ended, after the last on_target of
     that name. report_alert: tells the operator. failed counts what raised an error, of
@@ -59,17 +59,17 @@ class TargetReporter:
 
     @property
     def missed(self) -> int:
-        """Clicks and detections that show no map: beside the picture, or in the sky."""
+        """Number of clicks and detections whose ray does not hit the map."""
         return self._population.missed
 
     @property
     def doubted(self) -> int:
-        """Detections whose place may not be reported (`TargetTrack.refusal`)."""
+        """Number of detections whose position may not be reported (`TargetTrack.refusal`)."""
         return self._population.doubted
 
     @property
     def refused(self) -> int:
-        """Detections of targets beyond the 32nd."""
+        """Number of detections of targets beyond the 32nd."""
         return self._population.refused
 
     def start(self) -> None:
@@ -98,18 +98,18 @@ class TargetReporter:
             self._condition.notify()
 
     def begin(self, click: Click) -> None:
-        """Begin a clicked target. Never blocks."""
+        """Start a clicked target. Never blocks."""
         with self._condition:
             self._clicks.append(click)
             self._condition.notify()
 
     def add_frame(self, frame: Frame) -> None:
-        """Offer a picture; it is looked at once its frame has an estimate. Never blocks."""
+        """Offer a frame; clicked targets are tracked in it. Never blocks."""
         with self._condition:
             self._pictures.append(frame)
 
     def forget(self, names: tuple[str, ...]) -> None:
-        """End these targets: what was seen of them is dropped. Never blocks."""
+        """End these targets and drop their waiting detections. Never blocks."""
         with self._condition:
             self._forgotten += names
             kept = (d for d in self._detections if d.target_id not in names)

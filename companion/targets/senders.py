@@ -1,4 +1,4 @@
-"""Whose target it is: two detectors that give the same name mean two things."""
+"""Keeps targets of different detectors with the same name apart."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Named:
 
 
 class Senders:
-    """Keeps the targets of several senders apart. Not thread-safe.
+    """Gives targets of several senders different names. Not thread-safe.
 
     Another sender of a name takes it over, as a detector that was started again does, or one that
     opens a socket for every datagram. If the one before it is heard once more, there are two of
@@ -36,7 +36,7 @@ class Senders:
         self._names: OrderedDict[str, _Named] = OrderedDict()
 
     def name_of(self, target_id: str, sender: Address, now_ns: int) -> str:
-        """What a sender's target of that name is called. now_ns: CLOCK_MONOTONIC."""
+        """The name of a sender's target. now_ns: CLOCK_MONOTONIC."""
         named = self._names.setdefault(target_id, _Named())
         self._names.move_to_end(target_id)
         if len(self._names) > _NAMES:

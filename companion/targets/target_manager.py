@@ -1,6 +1,6 @@
-"""All targets that are alive: each has one identity, one track and one end.
+"""All active targets, each with one identity and one track.
 
-No thread and no clock: what time it is, the frames' exposures say.
+It has no thread and no clock; the frames' exposure times are the time.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ def _off(a: Array, b: Array) -> float:
 
 @dataclass(frozen=True)
 class Click:
-    """What the operator pointed at. estimate: of the frame that he saw; pixel: in it; around: the
-    estimates one sigma of his delay before and after it, where they are known; extent: width and
-    height of his rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
+    """A click of the operator. estimate: of the frame that he saw; pixel: in it; around: the
+    estimates one sigma of his delay before and after, if known; extent: width and height of his
+    rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
     """
 
     number: int
@@ -79,20 +79,20 @@ class Click:
 
     @property
     def name(self) -> str:
-        """Of its target."""
+        """Name of its target."""
         return clicked_name(self.number, self.asked_by)
 
 
 @dataclass(frozen=True)
 class TargetEstimate:
-    """A target's fix, and the estimate of the frame that it is told for."""
+    """A target's position, and the pose estimate of its frame."""
 
     fix: TargetFix
     estimate: PoseEstimate
 
     @property
     def velocity(self) -> Array | None:
-        """(3,) m/s, world axes; None of what stands or was located once."""
+        """(3,) m/s, world axes; None for a static target or after one detection."""
         return self.fix.velocity
 
 
@@ -140,7 +140,7 @@ def _number(name: str) -> int:
 
 
 class TargetManager:
-    """The living targets, by name. Not thread-safe.
+    """The active targets, by name. Not thread-safe.
 
     tell: takes each fix. gone: takes the name of each target that ended. report_alert: tells the
     operator. missed counts detections that show no map: beside the picture, or in the
@@ -178,7 +178,7 @@ class TargetManager:
         self.refused = 0
 
     def begin(self, click: Click) -> None:
-        """A clicked target begins; the operator is told where it is, or why it is not."""
+        """Start a clicked target and report its position, or why there is none."""
         name, time_ns = click.name, click.estimate.exposure_time_ns
         track = TargetTrack(name, replace(self._settings, confirm_s=0.0), self._cast)
         fix = track.see(click.estimate, click.pixel, drift=self._drift(click))
@@ -201,7 +201,7 @@ class TargetManager:
         self._follow(name, life, click, fix)
 
     def see(self, detection: Detection, estimate: PoseEstimate) -> None:
-        """A detection in its frame, at most `rate_hz` times a second."""
+        """Process a detection in its frame, at most `rate_hz` times a second."""
         name, time_ns = detection.target_id, estimate.exposure_time_ns
         life = self._lives.get(name)
         if life is not None and time_ns - life.seen_ns < self._period_ns(life):
@@ -226,13 +226,13 @@ class TargetManager:
         self._report(life, fix, estimate)
 
     def look(self, estimate: PoseEstimate, gray: Gray) -> None:
-        """Every clicked target is looked for in the picture of an accepted frame, (H, W) grey."""
+        """Track every clicked target in the image (H, W) grey of an accepted estimate."""
         self._pictures.append((estimate, gray))
         for name, life in [(n, x) for n, x in self._lives.items() if x.follower is not None]:
             self._look_for(name, life, estimate, gray)
 
     def hold(self, estimate: PoseEstimate) -> None:
-        """Every clicked target as a newer frame shows it; those out of sight too long end."""
+        """Predict every clicked target to a newer frame; end those hidden too long."""
         for name, life in [(n, x) for n, x in self._lives.items() if x.is_clicked]:
             time_ns = estimate.exposure_time_ns
             if not self._is_due(life, time_ns):
@@ -252,7 +252,7 @@ class TargetManager:
             self._report(life, fix, estimate)
 
     def end(self, names: tuple[str, ...]) -> None:
-        """End these targets; their names are told, if they were alive."""
+        """End these targets and report the names of those that were active."""
         for name in names:
             if self._lives.pop(name, None) is not None:
                 self._gone(name)

@@ -1,1 +1,1 @@
-"""What a person sees of a running command: its log, its steps, its progress."""
+"""Terminal output of a command: log, steps, progress."""

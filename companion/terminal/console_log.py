@@ -1,8 +1,7 @@
-"""The console's log, written on a thread of its own.
+"""Writes the log to the terminal on its own thread.
 
-A terminal may be stopped (Ctrl-S), hung up with its radio link, or a pipe whose reader ends; a log
-file's disk may be full. A thread that flies must neither wait for it nor end with it: rich, for
-one, answers a closed pipe with SystemExit in whatever thread was logging.
+A terminal may be stopped (Ctrl-S) or hang with its radio link, a pipe may close, and a disk may be
+full. A flight thread must neither wait for it nor end because of it.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _LAST_WORDS_S = 2.0
 
 
 class Descriptor:
-    """Text to a file descriptor, without buffers; what it does not take is lost."""
+    """Unbuffered text output to a file descriptor; text that it does not accept is lost."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -40,7 +39,7 @@ class Descriptor:
         return len(text)
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Does nothing: output is unbuffered."""
 
     def isatty(self) -> bool:
         """Whether it is a terminal."""
@@ -61,7 +60,7 @@ class _Queue(QueueHandler):
 
 @contextlib.contextmanager
 def console_log(verbose: bool, descriptor: int = 1) -> Iterator[None]:
-    """Log to a descriptor, standard output, for as long as this lasts.
+    """Context manager: log to a file descriptor, by default standard output.
 
     verbose: of our own packages, because numba's own log is endless.
     """

@@ -1,7 +1,7 @@
-"""The console's process beside a flight: begun with it, ended with it, and nothing more.
+"""Runs the console's process beside a flight, from its start to its end.
 
-When it crashes it is told once and stays down: `companion console` begins it again by hand. Its
-lifeline is a pipe: whatever ends the flight's process closes it.
+A crash is reported once and not restarted: `companion console` starts it again. A pipe ends it if
+the flight process ends for any reason.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NEEDED = ("starlette", "uvicorn", "websockets")
 
 @contextlib.contextmanager
 def running_console(deployment: Path, config: ConsoleConfig | None) -> Iterator[None]:
-    """Serve the page while this lasts; a flight goes on without it."""
+    """Context manager: serve the web page; a flight continues without it."""
     ending = threading.Event()
     process = None if config is None else _begun(deployment, config, ending)
     try:

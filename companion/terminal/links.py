@@ -1,4 +1,4 @@
-"""Paths that a terminal opens by a click."""
+"""Clickable file paths in a terminal."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from rich.text import Text
 
 
 def file_link(path: Path) -> Text:
-    """The path as text that leads to the file (OSC 8), where the terminal knows such links."""
+    """The path as text that links to the file (OSC 8), if the terminal supports it."""
     full = path.resolve()
     return Text(str(path), Style(color="green", link=full.as_uri()))

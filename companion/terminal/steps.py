@@ -1,4 +1,4 @@
-"""What a command is doing: a spinner on a terminal, a line now and then in a log."""
+"""Shows the progress of a command: a spinner on a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ READING = "reads the source"
 
 @contextmanager
 def shown_steps(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[Say]:
-    """A callback that shows what is done from now on. Where there is no terminal, each step is a
-    line with the seconds since the begin, so that a log shows where the time went.
+    """Context manager: a callback that shows the present step. In a log each step is a line with
+    the seconds since the start.
     """
     if not console.is_terminal:
         begun_s = clock()
@@ -36,8 +36,8 @@ def shown_steps(console: Console, clock: Callable[[], float] = time.monotonic) -
 def shown_count(
     console: Console, what: str, every_s: float = 5.0, begins: str = "begun"
 ) -> Iterator[Callable[..., None]]:
-    """A callback (done, total) for work that is counted: a bar, or a line every few seconds where
-    there is no terminal. What has counted nothing after two seconds says what it is at: `begins`.
+    """Context manager: a callback (done, total) for counted work: a bar, or a line every few
+    seconds in a log. begins: shown if nothing was counted after two seconds.
     """
     if console.is_terminal:
         from rich.progress import Progress
@@ -58,8 +58,8 @@ def shown_count(
 
 @contextmanager
 def shown_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[None]:
-    """Says what is at work where that cannot be counted: a spinner, or in a log a line once it has
-    taken two seconds, and then every ten.
+    """Context manager for work that cannot be counted: a spinner, or in a log a line after two
+    seconds and then every ten.
     """
     if console.is_terminal:
         with console.status(escape(what)):
@@ -74,7 +74,7 @@ def shown_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[N
 
 
 def tally(show: Callable[..., None], total: int | None = None) -> Callable[..., None]:
-    """For work that only tells that one more is done."""
+    """A callback that counts its calls and passes the count to `show`."""
     count = itertools.count(1)
     return lambda *_: show(next(count), total)
 

@@ -1,1 +1,1 @@
-"""``companion try``: recorded footage over a map, and the verdict whether vision works there."""
+"""``companion try``: localize recorded footage over a map and judge whether vision works there."""

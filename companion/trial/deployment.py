@@ -21,7 +21,7 @@ _SOURCE, _CONNECTION = "udp://0.0.0.0:5600", "serial:/dev/ttyTHS1:921600"
 
 
 def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
-    """Write the file; what the footage does not tell stands in it as a note to check."""
+    """Write the file; values that the footage does not give are marked for checking."""
     settings = _settings(trial, map_cache)
     config = parse_config(settings, str(path))
     text = deployment_text(config, _notes(trial), "companion try")
@@ -54,8 +54,8 @@ def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
 def footage_settings(
     map_cache: Path, camera: Camera, mount_deg: Array, *, fixed: bool
 ) -> dict[str, Any]:
-    """A deployment's settings. mount_deg: (3,) roll, pitch, yaw of the camera on its gimbal, or,
-    fixed, on the airframe.
+    """A deployment's settings. mount_deg: (3,) roll, pitch, yaw of the camera on its gimbal, or on
+    the airframe if `fixed`.
     """
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     angles = {name: round(float(a), 2) for name, a in zip(names, mount_deg, strict=True)}

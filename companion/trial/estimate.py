@@ -1,4 +1,4 @@
-"""Gimbal bias, focal length and map offset of footage, by `companion.calibrate`'s least squares."""
+"""Estimates gimbal bias, focal length and map offset of footage, by `companion.calibrate`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LEAST_TILT_DEG = 0.5
 
 @dataclass(frozen=True)
 class Estimated:
-    """What the footage says about its camera and the map.
+    """Estimated errors of camera, gimbal and map.
 
     focal_percent, focal_sigma_percent: against the camera as given, which is kept within three
     sigmas; None where this map cannot tell it. mount_deg: (3,) about the boresight, up, right;
@@ -57,14 +57,14 @@ class Estimated:
 
     @property
     def frames(self) -> int:
-        """How many were used."""
+        """Number of frames used."""
         return len(self.poses)
 
 
 @dataclass(frozen=True)
 class Tools:
-    """What reads images over the map. width: of the working image, pixels; has_buildings: whether
-    the map's heights hold them.
+    """Renderer and extractor for images over the map. width: of the working image, pixels;
+    has_buildings: whether the map's heights contain them.
     """
 
     renderer: MapRenderer
@@ -82,7 +82,7 @@ def estimate(
     loader: FrameLocalizer,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Estimated | None:
-    """None where too few frames lie on the map consistently."""
+    """Estimate the errors; None if too few frames are consistent."""
     used = consistent(priors, localized)
     if len(used) > _MOST_FRAMES:
         used = [used[int(k)] for k in np.linspace(0, len(used) - 1, _MOST_FRAMES).round()]
@@ -121,8 +121,8 @@ def estimate(
 
 
 def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> list[int]:
-    """Frames whose ground at the optical axis lies where most have it: recorded place plus one
-    offset of the map and one of the camera's tilt. A registration at a wrong place does not.
+    """Indices of frames whose ground point on the optical axis is consistent with most others:
+    recorded position plus one map offset and one tilt error.
 
     The point on the optical axis is used because position and tilt err together, and it does not.
     """

@@ -1,4 +1,4 @@
-"""Each frame localized for itself: from its prior, or by a search."""
+"""Localizes each frame independently: from its prior, or by a search."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
 
 @dataclass(frozen=True)
 class Localized:
-    """One frame's result. pose: the registration's, also where it was not accepted; covariance:
-    (6, 6) as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose; beside_map: its
-    view does not meet the map.
+    """One frame's result. pose: the registration's, also if it was not accepted; covariance: (6, 6)
+    as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose; beside_map: its view does not
+    meet the map.
     """
 
     name: str
@@ -43,8 +43,8 @@ class Localized:
 
 
 class FrameLocalizer:
-    """Localizes recorded frames independently of each other. camera: of the footage; told: takes
-    each complete prior by its time, for a localizer whose sensors say it (`sensors_of`).
+    """Localizes recorded frames independently. camera: of the footage; told: receives each complete
+    prior by its time, for the localizer's sensors (`sensors_of`).
     """
 
     def __init__(
@@ -57,13 +57,13 @@ class FrameLocalizer:
         self._height_m: float | None = None
 
     def load(self, recorded: RecordedFrame) -> Frame:
-        """The image with the camera's model, zoom included. Stream errors for an unusable one."""
+        """Load the image with its camera model, zoom included. Raises stream errors."""
         self._loaded += 1
         # One sequence number, which seeds the hypotheses: the order of photos changes nothing.
         return recorded.load(self._camera, self._loaded * _STEP_NS)
 
     def from_prior(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
-        """By its own telemetry; what that lacks (heading, height) is searched about its place."""
+        """Localize from telemetry; unknown heading or height is searched."""
         if prior.pose is None:
             return Localized(recorded.name, None, problem="has no position")
         try:
@@ -79,7 +79,7 @@ class FrameLocalizer:
         return self._found(recorded.name, frame, self._at_likely_height(prior), region)
 
     def anywhere(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
-        """On the whole map, without its position."""
+        """Search the whole map, without the frame's position."""
         try:
             frame = self.load(recorded)
         except (StreamDecodeError, StreamSizeError, OSError) as error:
@@ -125,7 +125,7 @@ class FrameLocalizer:
 
 
 def horizontal_m(a: Pose, b: Pose) -> float:
-    """Horizontal distance of two cameras, m."""
+    """Horizontal distance between two cameras, m."""
     return float(np.hypot(*(a.translation - b.translation)[:2]))
 
 

@@ -1,4 +1,4 @@
-"""The report of a trial: one HTML page, its figures as JSON, and the positions as files."""
+"""Report of a trial: an HTML page, figures as JSON, positions as files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What telemetry says about a camera's pose over a map: priors with their sigmas.
+"""Pose priors with sigmas from telemetry, over a map.
 
-A flight records several heights of different worth. Which of them can be used depends on the map:
-one that puts cameras below the ground is of another datum, or not measured.
+A flight may record several heights of different accuracy. The map shows which are usable: a height
+that puts cameras below the ground has another datum, or was not measured.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
 
 @dataclass(frozen=True)
 class FramePrior:
-    """One frame's. pose: None where no position is known. sigma_m: horizontal; height_m: world z
-    and its sigma, half of the range where it is not known; clearance_m: above the map's ground;
-    was_searched: whether it is a search's result instead of telemetry.
+    """Prior of one frame. pose: None if no position is known. sigma_m: horizontal; height_m: world
+    z and its sigma, half of the range if unknown; clearance_m: above the map's ground;
+    was_searched: from a search instead of telemetry.
     """
 
     pose: Pose | None
@@ -61,11 +61,11 @@ class FramePrior:
 
     @property
     def is_complete(self) -> bool:
-        """Whether registration can start from it, without a search."""
+        """Whether registration can start from it without a search."""
         return self.pose is not None and self.height_known and self.heading_sigma_deg is not None
 
     def pose_prior(self, time_ns: int) -> PosePrior:
-        """As the localizer takes it. ValueError where it is not complete."""
+        """As a `PosePrior`; ValueError if it is incomplete."""
         if self.pose is None or self.heading_sigma_deg is None:
             raise ValueError("the prior is not complete")
         tilt, heading = np.radians([self.tilt_sigma_deg, self.heading_sigma_deg])
@@ -75,8 +75,8 @@ class FramePrior:
 
 @dataclass(frozen=True)
 class Correction:
-    """What was found to be wrong with the telemetry. mount: (3, 3), turns the camera in its own
-    axes; shift: (3,) m east, north, up, map less GNSS; tilt_sigma_deg: what is left.
+    """Estimated errors of the telemetry. mount: (3, 3), rotation in the camera's axes; shift: (3,)
+    m east, north, up, map minus GNSS; tilt_sigma_deg: remaining error.
     """
 
     mount: Array
@@ -84,7 +84,7 @@ class Correction:
     tilt_sigma_deg: float
 
     def applied(self, prior: FramePrior) -> FramePrior:
-        """The prior without these errors."""
+        """The prior, corrected by these errors."""
         rotation = prior.rotation @ self.mount
         pose = prior.pose
         if pose is not None:
@@ -96,7 +96,7 @@ class Correction:
 
 
 class Ground:
-    """Heights of the map's surface."""
+    """Surface heights of the map."""
 
     def __init__(self, cache: TileCache) -> None:
         self._surface = MapSurface(cache)
@@ -104,7 +104,7 @@ class Ground:
         self._top = float(cache.index.box_max[:, 2].max()) + _ABOVE_M
 
     def height(self, east: float, north: float) -> float | None:
-        """World z, m; None beside the map."""
+        """World z, m; None outside the map."""
         down = np.array([[0.0, 0.0, -1.0]])
         try:
             eye = np.array([east, north, self._top])
@@ -116,8 +116,8 @@ class Ground:
 
 @dataclass(frozen=True)
 class FlightPriors:
-    """Priors of all frames, in their order. datum: of the heights that are used, None where they
-    are not known; notes: what was decided, and why.
+    """Priors of all frames in order. datum: of the heights used, None if unknown; notes: decisions
+    and reasons.
     """
 
     priors: tuple[FramePrior, ...]
@@ -126,7 +126,7 @@ class FlightPriors:
 
 
 def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
-    """What the flight's telemetry says over this map."""
+    """Priors of a flight's frames over this map."""
     _check_near(flight, cache)
     ground, frame = Ground(cache), cache.frame
     geoid_m = cache.manifest.geoid_separation_m

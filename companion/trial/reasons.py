@@ -1,4 +1,4 @@
-"""Why a frame was not localized, as far as image, map and telemetry tell it."""
+"""Finds the likely reason why a frame was not localized, from image, map and telemetry."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ImageState:
 
 
 def image_state(image: Image) -> ImageState:
-    """Of an RGB image (H, W, 3)."""
+    """Image quality of an RGB image (H, W, 3)."""
     height = round(image.shape[0] * _WIDTH_PX / image.shape[1])
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
@@ -48,7 +48,7 @@ def image_state(image: Image) -> ImageState:
 
 
 def states_of(frames: Sequence[RecordedFrame]) -> list[ImageState | None]:
-    """Of each frame's image; None for one that cannot be read."""
+    """Image quality of each frame; None if it cannot be read."""
     found: list[ImageState | None] = []
     for one in frames:
         try:
@@ -65,7 +65,7 @@ def reasons(
     estimated: Estimated | None,
     kind: MapKind | None = None,
 ) -> dict[int, str]:
-    """The likely reason for each frame that was not accepted, by its number."""
+    """The likely reason by index, for each frame that was not accepted."""
     failed = [k for k, one in enumerate(localized) if not one.accepted]
     if not failed:
         return {}

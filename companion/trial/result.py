@@ -1,4 +1,4 @@
-"""What a trial found, its figures and its verdict in one sentence."""
+"""Results of a trial, its figures and its verdict."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _STILL_MPS = (0.0, 0.0)  # of photos: time stamps are no part of their positions
 
 @dataclass(frozen=True)
 class Trial:
-    """All of it. priors: corrected ones; first: localized with the telemetry as recorded; second:
-    with what was estimated; searched: without positions, by frame; reasons: of failed frames.
+    """All results. priors: corrected; first: localized with the telemetry as recorded; second: with
+    estimated corrections; searched: without positions, by frame; reasons: of failed frames.
     """
 
     flight: RecordedFlight
@@ -40,12 +40,12 @@ class Trial:
 
     @property
     def accepted(self) -> int:
-        """Frames that were localized from their telemetry."""
+        """Number of frames localized from telemetry."""
         return sum(one.accepted for one in self.second)
 
     @property
     def best(self) -> tuple[Localized, ...]:
-        """Of each frame its result from telemetry, else that of the search."""
+        """For each frame the result from telemetry, otherwise that of the search."""
         return tuple(
             one if one.accepted or not found.accepted else found
             for k, one in enumerate(self.second)
@@ -53,8 +53,8 @@ class Trial:
         )
 
     def errors_m(self) -> Array:
-        """(F,) horizontal distance of accepted positions from the recorded ones, the estimated
-        offset taken off; NaN where there is none of both.
+        """(F,) horizontal distance of accepted positions from the recorded ones, without the
+        estimated offset; NaN if unknown.
         """
         found = np.full(len(self.best), np.nan)
         for k, (one, prior) in enumerate(zip(self.best, self.priors, strict=True)):
@@ -63,7 +63,7 @@ class Trial:
         return found
 
     def levels_m(self, config: ProtectionConfig | None = None) -> Array:
-        """(F,) horizontal protection level of accepted positions, m; NaN of others."""
+        """(F,) horizontal protection level of accepted positions, m; NaN for others."""
         config = config or ProtectionConfig()
         levels = np.full(len(self.best), np.nan)
         for k, (one, prior) in enumerate(zip(self.best, self.priors, strict=True)):
@@ -75,8 +75,8 @@ class Trial:
         return levels
 
     def search_outcome(self) -> tuple[int, int, int]:
-        """Frames that were searched without their position, found there, and found elsewhere: far
-        from where they were recorded and from where their telemetry led, which may be off itself.
+        """Numbers of frames that were searched without position, found correctly, and found far
+        from both the recorded and the telemetry-based position.
         """
         right = wrong = 0
         for k, one in self.searched.items():
@@ -97,14 +97,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Judgement:
-    """kind: one of the four words; sentence: the verdict; exit_code: 0 works, else 1."""
+    """kind: one of four words; sentence: the verdict; exit_code: 0 works, else 1."""
 
     kind: str
     sentence: str
 
     @property
     def exit_code(self) -> int:
-        """Of the command."""
+        """Exit code of the command."""
         return 0 if self.kind == WORKS else 1
 
 
@@ -140,7 +140,7 @@ def _kind(share: float, trial: Trial, known: Array) -> str:
 
 
 def spread_limit_m(trial: Trial) -> float:
-    """What positions may differ from GNSS by in the median: its own error, and 3 m of ours."""
+    """Limit of the median difference from GNSS: its own error plus 3 m."""
     sigmas = [p.sigma_m for p in trial.priors if p.pose is not None]
     own = float(np.median(sigmas)) if sigmas else 0.0
     return float(np.hypot(2.0 * own, 3.0))

@@ -1,4 +1,4 @@
-"""One trial: localize with telemetry, estimate what is wrong with it, again, and without places."""
+"""Runs a trial: localize with telemetry, estimate corrections, repeat, search."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """width: of the working image, pixels; searches: frames that are searched without a place."""
+    """width: of the working image, pixels; searches: number of frames searched without position."""
 
     width: int = 320
     searches: int = 20
@@ -52,7 +52,7 @@ def run_trial(
     options: TrialOptions | None = None,
     stage: Stage = lambda _what: nullcontext(lambda _done, _total: None),
 ) -> Trial:
-    """Localize the footage over the map. stage: given what is done now, it counts it.
+    """Localize the footage over the map. stage: context manager for the progress of a step.
 
     Errors of the map and of images that cannot be used are named ones.
     """

@@ -1,4 +1,4 @@
-"""Which map footage needs, where there is none yet."""
+"""Describes the map that footage needs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WORKING_PX = 320  # of the image that is registered
 
 @dataclass(frozen=True)
 class WantedMap:
-    """Bounds in degrees and the ground sampling distance, m, that the footage can use."""
+    """Bounds in degrees, and the finest useful ground sampling distance, m."""
 
     south: float
     west: float
@@ -31,7 +31,7 @@ class WantedMap:
 
     @property
     def sentence(self) -> str:
-        """For the user."""
+        """Description for the user."""
         return (
             f"It needs a map of latitude {self.south:.5f} to {self.north:.5f}, longitude "
             f"{self.west:.5f} to {self.east:.5f}, with pixels of {self.gsd_m:.2g} m or finer and, "
@@ -39,13 +39,13 @@ class WantedMap:
         )
 
     def command(self, out: str) -> str:
-        """What fetches one, where open data exist."""
+        """Command that fetches such a map from open data."""
         box = f"{self.west:.5f},{self.south:.5f},{self.east:.5f},{self.north:.5f}"
         return f"companion map fetch --rectangle {box} --out {out}"
 
 
 def wanted_map(flight: RecordedFlight) -> WantedMap:
-    """What the footage shows. `FootageError` where no position says where it was taken."""
+    """The map that the footage needs. `FootageError` without any position."""
     told = [f.telemetry for f in flight.frames if f.telemetry.position is not None]
     if not told:
         raise FootageError(

@@ -1,1 +1,1 @@
-"""An object detector in the companion's own process: a network in, named detections out."""
+"""An object detector in the companion's process: network, and detections with names."""

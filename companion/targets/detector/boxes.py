@@ -26,7 +26,7 @@ _MOST = 64  # boxes of a picture
 
 @dataclass(frozen=True)
 class Box:
-    """Something that a network saw. left to bottom: pixels of the network's input."""
+    """A detected object. left to bottom: pixels of the network's input."""
 
     left: float
     top: float
@@ -39,8 +39,8 @@ class Box:
 def layout_of(
     shape: tuple[int, ...], classes: int | None, size: tuple[int, int]
 ) -> tuple[Layout, int]:
-    """(layout, number of classes) by the output's shape; `DetectorError` where that is no such
-    network, or may be two. classes: where the network names them; size: its input, width, height.
+    """(layout, number of classes) by the output's shape; `DetectorError` if it fits no layout, or
+    two. classes: number by the network's names; size: its input, width, height.
     """
     if len(shape) != 3 or shape[0] != 1:
         raise DetectorError(f"an output of shape {shape} is none of a YOLO network")
@@ -66,7 +66,7 @@ def layout_of(
 
 
 def decode(output: NDArray[np.float32], layout: Layout, threshold: float) -> list[Box]:
-    """The boxes of at least that score, the best first; one for each thing."""
+    """Boxes with at least that score, best first, after non-maximum suppression."""
     rows = output[0].T if layout == "v8" else output[0]
     if layout == "end2end":
         corners, scores, labels = rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64)

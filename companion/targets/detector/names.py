@@ -1,7 +1,7 @@
-"""Which of a detector's boxes is the same thing as before: decided on the ground, by the pose.
+"""Associates a detector's boxes with earlier objects by their ground positions.
 
-In the picture everything moves as the camera does, and a slow detector sees a car ten lengths
-further on. On the ground what stands stays, and a car goes on as it went.
+In the image everything moves with the camera. On the ground, static objects stay, and moving ones
+keep their velocity.
 """
 
 from __future__ import annotations
@@ -61,15 +61,15 @@ class _Thing:
 
 
 class ObjectNames:
-    """Gives each sighting the name of its thing: ``car 1``, ``car 2``. Not thread-safe."""
+    """Gives each detected object a name: ``car 1``, ``car 2``. Not thread-safe."""
 
     def __init__(self) -> None:
         self._things: list[_Thing] = []
         self._count: dict[str, int] = {}
 
     def name(self, sights: list[LocatedBox], time_ns: int) -> list[str | None]:
-        """A name for each sight of one picture; None for what is seen for the first time: one
-        picture alone may show a thing that is none.
+        """A name for each box of one frame; None for an object seen for the first time, which may
+        be a false detection.
         """
         self._things = [t for t in self._things if time_ns - t.time_ns <= _KEPT_NS]
         names: list[str | None] = [None] * len(sights)

@@ -1,4 +1,4 @@
-"""A detection network in onnxruntime: pictures in, boxes in the picture's own pixels out."""
+"""A detection network in onnxruntime: frames in, boxes in the frame's pixels out."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DetectorNetwork:
         self._layout = self._find_layout(config)
 
     def detect(self, image: Image) -> list[Box]:
-        """What is wanted and seen in an (H, W, 3) RGB picture, in its pixels, the best first."""
+        """Wanted objects in an (H, W, 3) RGB frame, in its pixels, best first."""
         blob, scale, (left, top) = _letterboxed(image, self._size)
         boxes = decode(self._run(blob), self._layout, self._threshold)
         return [
@@ -61,7 +61,7 @@ class DetectorNetwork:
         ]
 
     def name_of(self, label: int) -> str:
-        """What the network calls a class."""
+        """The network's name of a class."""
         return self.labels.get(label, f"class {label}")
 
     def _run(self, blob: Float32) -> Float32:

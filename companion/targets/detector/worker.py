@@ -1,7 +1,7 @@
-"""The detector at work: at most `rate_hz` pictures a second, on a thread of its own.
+"""Runs the detector on at most `rate_hz` frames a second, on its own thread.
 
-It looks at a picture only when its pose is known, never at two at once, and rests after each, so
-that it takes no more than a share of one processor. What goes wrong is counted and reported once.
+It processes a frame only if its pose is known, one at a time, and pauses after each, to limit its
+share of one processor. Errors are counted and reported once.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MOST_AWAY_M = 5000.0
 
 
 class BoxDetector:
-    """Looks for things in the camera's pictures and hands them on as detections.
+    """Detects objects in the camera's frames and passes them on as detections.
 
     on_detection: takes each; must not block. report: tells the operator. A model
     that cannot be loaded, or fails three times in a row, ends the detector and not the flight.
@@ -68,14 +68,14 @@ class BoxDetector:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread; a picture that is being looked at is looked at to its end."""
+        """Stop the thread after the present frame."""
         self._stopping.set()
         with self._condition:
             self._condition.notify()
         joined(self._thread)
 
     def add_frame(self, frame: Frame) -> None:
-        """Offer a picture. Never blocks."""
+        """Offer a frame. Never blocks."""
         with self._condition:
             self._frames.append(frame)
 
