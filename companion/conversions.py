@@ -200,4 +200,5 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
         None if seen is None else seen.height_m,
         float(np.sqrt(estimate.covariance[0, 0] + estimate.covariance[1, 1])),
         float(np.sqrt(estimate.covariance[2, 2])),
+        (camera.horizontal_fov_deg, camera.vertical_fov_deg),
     )

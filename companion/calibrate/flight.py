@@ -40,7 +40,7 @@ _OURS = ("inject", "rc")
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CalibrationResult:
     """Result of a calibration flight. solution: see `solve`; before, after: mean distance of the
     image patches from their map positions, px of the stream, poses free; frames, parts: numbers
     used. gnss_bias_m: constant error of the receiver, already in `covariance`. notes: sentences for
@@ -86,7 +86,7 @@ def calibrate(
     record: FlightRecord,
     frames: int = 200,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> Calibrated:
+) -> CalibrationResult:
     """Estimate the values of the record's deployment from its images over its map.
 
     frames: at most so many pictures are read, spread over the flight. progress: told how many are
@@ -134,7 +134,7 @@ def calibrate(
     covariance = solution.covariance.copy()
     covariance[u.SHIFT, u.SHIFT] += np.eye(3) * bias_m**2
     covariance[u.LATE, u.LATE] += _CLOCKS_S**2
-    return Calibrated(
+    return CalibrationResult(
         camera, mount, arm_m, solution, covariance, before_px, solution.pixel_sigma, len(sighted),
         len(evidence.owner), bias_m, _notes(evidence, config),
     )  # fmt: skip

@@ -21,7 +21,7 @@ from companion.live.orders import OrderError, Orders
 from companion.live.pace import RateLimiter
 from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, encode
 from companion.live.shared import SharedMemory
-from companion.live.shown import Shot, Shown
+from companion.live.shown import ConsoleFrame, Shown
 
 _log = logging.getLogger(__name__)
 _MOST_CONSOLES = 3
@@ -220,7 +220,7 @@ class Publisher:
         if console.is_idle:
             self._next_answer(console)
 
-    def _show(self, console: _Console, shot: Shot) -> None:
+    def _show(self, console: _Console, shot: ConsoleFrame) -> None:
         try:
             if console.memory is None:
                 console.memory = SharedMemory()

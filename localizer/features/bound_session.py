@@ -1,4 +1,4 @@
-"""Runs a network with its outputs left in device memory (onnxruntime's I/O binding)."""
+"""Runs a network and keeps its outputs in device memory (onnxruntime's I/O binding)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Knowledge about the camera pose from other sensors, as residuals of the registration.
+"""Other sensors' knowledge of the camera pose, as constraints of the registration.
 
-Each function gives a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
-(docs/explanation/registration.md, section 9). All are optional and none is used unless it is given.
-`fused` takes one into a registered pose afterwards: there each has its honest weight, because the
-pose's covariance says what the image cannot tell.
+Each function makes a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
+(docs/explanation/registration.md, section 9). `fused` applies one to a registered pose afterwards,
+weighted by the pose's covariance.
 """
 
 from __future__ import annotations
@@ -109,7 +108,7 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
-    """The pose after another sensor's knowledge of it. covariance: (6, 6).
+    """The pose after a constraint of another sensor was applied. covariance: (6, 6).
 
     Such a sensor's error (mounting, gimbal, air pressure) stays from frame to frame and does not
     average out. So it is used only where less is known than it knows, and then no better is known

@@ -40,7 +40,9 @@ _ARMING_TRIES = 3
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
     """Fly a scenario on a vehicle. `SimulationError` if it could not be flown."""
     with ExitStack() as stack:
-        setup = VehicleSetup(parameters=case.vehicle.all_parameters(), seed=seed)
+        setup = VehicleSetup(
+            parameters=case.vehicle.all_parameters(), seed=seed, px4=case.vehicle.px4
+        )
         vehicle = open_vehicle(kind, HOME, setup)
         return _CaseFlight(case, stack.enter_context(vehicle), stack, seed).run()
 

@@ -44,7 +44,7 @@ def draw_look(rng: np.random.Generator) -> VisitLook:
     )
 
 
-def surveyed_and_lived(config: WorldConfig) -> tuple[Visit, Visit]:
+def survey_and_flight_visits(config: WorldConfig) -> tuple[Visit, Visit]:
     """The survey that a map is made from, and a day on which the place is flown over, drawn from
     the world's seed.
     """

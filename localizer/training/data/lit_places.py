@@ -14,7 +14,7 @@ from localizer.training.data.pairs import (
     SceneConfig,
     draw_place,
     draw_visit,
-    lived_scene,
+    flight_day_scene,
     survey_scene,
 )
 from localizer.training.data.shards import PhotoSource
@@ -40,11 +40,11 @@ def make_place(
     for _ in range(flight_days):
         visit = draw_visit(rng)
         fixed = None if scenes.light_variety else survey.light
-        days.append((visit, *lived_scene(rng, place, visit, fixed)))
+        days.append((visit, *flight_day_scene(rng, place, visit, fixed)))
     return PlaceVisits(survey, tuple((lit, visit, season) for visit, lit, season in days), source)
 
 
-def be_modest() -> None:
+def be_nice() -> None:
     """How a process that makes places begins: it yields to the training, and uses one core."""
     os.nice(5)
     cv2.setNumThreads(1)

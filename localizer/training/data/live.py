@@ -30,7 +30,7 @@ from localizer.training.data.batches import (
     tamed,
     window_pair,
 )
-from localizer.training.data.lit_places import PlaceVisits, be_modest, make_place
+from localizer.training.data.lit_places import PlaceVisits, be_nice, make_place
 from localizer.training.data.pairs import Pair, SceneConfig, draw_views
 from localizer.training.data.shards import PhotoSource
 from localizer.training.losses import Batch
@@ -81,7 +81,7 @@ class LiveStream:
         self._loader, self._seed, self._rank, self._count = loader, seed, rank, count
         self._ahead = workers
         # Forked processes would inherit a GPU's context, which does not work in them.
-        self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=be_modest)
+        self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=be_nice)
         self._views = plan.flight_days + 1  # slots of a place: its survey and its days
         self._pool = ScenePool(plan.active * self._views, scenes.cells, device)
         self._coming: dict[int, Future[PlaceVisits]] = {}

@@ -108,7 +108,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             else:
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
-            lived, season = lived_scene(rng, place, visit, fixed)
+            lived, season = flight_day_scene(rng, place, visit, fixed)
         pair = draw_views(rng, survey, lived, config)
         if pair is None:
             continue
@@ -167,7 +167,7 @@ def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneCo
     return coarse_mesh(lit, rng) if rng.random() < _COARSE_MESH else lit
 
 
-def lived_scene(
+def flight_day_scene(
     rng: np.random.Generator,
     place: TrainingPlace,
     visit: FlightDay,
