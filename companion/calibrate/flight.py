@@ -87,11 +87,11 @@ def calibrate(
     frames: int = 200,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> CalibrationResult:
-    """Estimate the values of the record's deployment from its images over its map.
+    """Estimate calibration values from a record's images over its map, starting from its
+    deployment.
 
-    frames: at most so many pictures are read, spread over the flight. progress: told how many are
-    read, and of how many (each twice). `RecordError` where the
-    record does not suffice, with what it lacks.
+    frames: largest number of images, spread over the flight. progress: called with the numbers read
+    and total (twice the frames). `RecordError` says what the record lacks.
     """
     config = record.config
     stack = MapStack(config.map, config.localizer)
@@ -220,11 +220,11 @@ def _unzoomed(camera: FeedConfig, autopilot: RecordedAutopilot, time_ns: int) ->
 
 
 def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
-    """Error of a flight's mean position because of the receiver, m, 1 sigma.
+    """Error of a flight's mean position caused by the GNSS receiver, m, 1 sigma.
 
-    accuracies_m: what the receiver said of itself at each picture whose place counts; None where it
-    did not say. Errors that last all flight do not average out: the sigma of their mean is the mean
-    of their sigmas.
+    accuracies_m: accuracy that the receiver stated for each image used, None if it stated none.
+    Errors that last all flight do not average out: the sigma of their mean is the mean of their
+    sigmas.
     """
     window = [max(_GNSS_BIAS_M, a) for a in accuracies_m if a is not None]
     return float(np.mean(window)) if window else _GNSS_BIAS_M

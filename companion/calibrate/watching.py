@@ -28,10 +28,10 @@ class BoardViewing:
 
 
 def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> BoardViewing:
-    """Watch for at most this time, to the end of a file or folder, or until all views are there.
+    """Collect views of the board until all are there, the source ends, or `seconds` have passed.
 
-    told: views, the newest picture's fate and what is missing, whenever that changes. keep: folder
-    for the pictures that were taken. seconds: that time.
+    told: called with the views, the result of the newest image and the missing views, after each
+    change. keep: folder for the images used.
     """
     size = read_stream_size(source)
     views = BoardViews(size.width, size.height)

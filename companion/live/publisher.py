@@ -68,10 +68,10 @@ class _Console:
 
 
 class Publisher:
-    """Serves the console's process at `path`.
+    """Serves the console's process at the socket `path`.
 
-    shown: makes the messages; orders: carries out what the console asks. Nothing here is called by
-    the flight but `start`, `stop` and `wake`, which only sets a flag.
+    shown: makes the messages; orders: executes the console's orders. The flight calls only `start`,
+    `stop` and `wake`, which sets a flag.
     """
 
     def __init__(self, path: Path, shown: Shown, orders: Orders, frames_hz: float) -> None:

@@ -42,11 +42,11 @@ def examine_deployment(
     feed: bool = True,
     say: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Run all checks. vehicle, feed: false leaves out flight controller or camera.
+    """Run all checks.
 
-    The feed is read while the vehicle is listened to: both are waiting. The localizer comes before,
-    alone: its compilers hold the interpreter, and the link's round trip would be theirs. say: takes
-    what is being done now.
+    vehicle, feed: false leaves out flight controller or camera. Feed and vehicle are checked in
+    parallel, after the localizer, whose compilation would delay the link. say: receives each step
+    as text.
     """
     say("reading the map")
     cache, findings = _check_map(config)

@@ -100,7 +100,7 @@ class _FixRate:
 
 
 class WithheldMotion:
-    """Motion of the vehicle from fix to fix while its position is withheld."""
+    """Motion of the vehicle between two fixes while its position is withheld."""
 
     def __init__(self) -> None:
         self._before: VisionFix | None = None

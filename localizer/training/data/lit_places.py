@@ -22,7 +22,7 @@ from localizer.training.data.shards import PhotoSource
 
 @dataclass(frozen=True)
 class PlaceVisits:
-    """A place as it was surveyed, and on the days of several flights."""
+    """A place as surveyed, and on several flight days."""
 
     survey: LitScene
     days: tuple[tuple[LitScene, FlightDay, bool], ...]
@@ -45,6 +45,6 @@ def make_place(
 
 
 def be_nice() -> None:
-    """How a process that makes places begins: it yields to the training, and uses one core."""
+    """Initialise a worker process: low priority, one core."""
     os.nice(5)
     cv2.setNumThreads(1)

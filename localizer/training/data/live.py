@@ -40,9 +40,8 @@ _SPARE = 1.25  # candidates for each sample: some see too little in common
 
 @dataclass(frozen=True)
 class LivePlan:
-    """Which places a step draws from: `active` of them, of which the oldest is replaced by a new
-    one every `steps_per_place` steps. places: how many there are before they repeat; flight_days:
-    on which each is seen.
+    """Places that a step draws from: `active` of them; every `steps_per_place` steps the oldest is
+    replaced. places: number before they repeat; flight_days: per place.
     """
 
     first_seed: int
@@ -62,7 +61,7 @@ class LivePlan:
 
 
 class LiveStream:
-    """Deals batches like `training.data.batches.ShardStream`, of pairs that it makes itself."""
+    """Makes batches like `training.data.batches.ShardStream`, from pairs rendered on demand."""
 
     def __init__(
         self,
