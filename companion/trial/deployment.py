@@ -16,7 +16,7 @@ from companion.trial.result import Trial
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, euler_from_matrix, matrix_from_euler, so3_exp
 
-_SEAL = "# Unchanged since then, as long as this is the SHA-256 of the lines below: "
+_SEAL = "# `companion try` replaces this file only if this is the SHA-256 of the rest: "
 _SOURCE, _CONNECTION = "udp://0.0.0.0:5600", "serial:/dev/ttyTHS1:921600"
 
 

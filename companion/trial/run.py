@@ -34,7 +34,7 @@ Stage = Callable[[str], AbstractContextManager[Count]]
 # it bends the focal length of a near-nadir flight by 1 %. Pixels finer than the map's imagery err
 # more again: over a satellite mosaic the gimbal's bias is 1.5 degrees off then.
 _MEASURED_WIDTH = 640
-_MOST_PLACED = 40  # frames that are searched about their position: each takes about ten seconds
+_MOST_PLACED = 24  # frames that are searched about their position: each takes 10 to 20 s
 _AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
 
 
@@ -90,7 +90,7 @@ def run_trial(
 
 
 def sampled(flight: RecordedFlight, known: FlightPriors) -> tuple[RecordedFlight, FlightPriors]:
-    """Of frames that a search has to place at most forty, spread over the flight; a note says so.
+    """Of frames that a search has to place at most 24, spread over the flight; a note says so.
     All frames of which registration can start are kept.
     """
     slow = [k for k, p in enumerate(known.priors) if p.pose is not None and not p.is_complete]

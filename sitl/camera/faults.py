@@ -29,7 +29,7 @@ class PictureFault:
     seconds: float = 0.0
 
 
-class FaultyLens:
+class VideoFaultInjector:
     """Applies the current video fault, if any, to each frame."""
 
     def __init__(self, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""glTF, GLB and OBJ meshes with a georeference: cut into tiles, coarser levels made for them."""
+"""Imports georeferenced glTF, GLB and OBJ meshes: cuts tiles and makes coarser levels."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file and where it stands; one `Model`."""
+    """A georeferenced mesh file; implements `Model`."""
 
     path: Path
     up_axis: UpAxis
@@ -86,9 +86,7 @@ def _has_area(mesh: SourceMesh) -> bool:
 
 
 def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
-    """The materials of an OBJ's libraries by name, and what of its picture is not there, as
-    sentences.
-    """
+    """The materials of an OBJ's libraries by name, and its missing textures as sentences."""
     libraries = [p for p in files_beside(path) if p.suffix.lower() == ".mtl" and p.is_file()]
     found = [m for library in libraries for m in read_mtl(library, path.parent)]
     doubts = [f"its texture {name!r} is not there" for m in found for name in m.missing]

@@ -150,9 +150,9 @@ def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(small_assets,
     names = [int(frame.name[:2]) for frame in kept.frames]
     assert [k for k in names if not k % 2] == list(range(0, 90, 2))  # their heading is known
     odd = [k for k in names if k % 2]
-    assert (len(odd), odd[0], odd[-1]) == (40, 1, 89)
+    assert (len(odd), odd[0], odd[-1]) == (24, 1, 89)
     assert len(priors.priors) == len(names)
-    assert sum("40 of them" in note for note in priors.notes) == 1
+    assert sum("24 of them" in note for note in priors.notes) == 1
     assert sampled(kept, priors)[0] is kept
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sitl.camera.faults import FaultyLens, PictureFault
+from sitl.camera.faults import PictureFault, VideoFaultInjector
 
 
 def picture(seed: int) -> np.ndarray:
@@ -13,7 +13,7 @@ def picture(seed: int) -> np.ndarray:
 
 
 def test_a_frozen_picture_stays_the_last_good_one_until_it_ends() -> None:
-    lens = FaultyLens(0)
+    lens = VideoFaultInjector(0)
     first = lens.picture(picture(1))
     lens.set(PictureFault("frozen"))
     assert np.array_equal(lens.picture(picture(2)), first)
@@ -24,7 +24,7 @@ def test_a_frozen_picture_stays_the_last_good_one_until_it_ends() -> None:
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("covered", 0, 30), ("blinded", 190, 220)])
 def test_a_covered_or_blinded_camera_shows_nothing(kind: str, low: int, high: int) -> None:
-    lens = FaultyLens(0)
+    lens = VideoFaultInjector(0)
     lens.set(PictureFault(kind))  # type: ignore[arg-type]
     shown = lens.picture(picture(1))
     assert low <= shown.mean() <= high
@@ -32,7 +32,7 @@ def test_a_covered_or_blinded_camera_shows_nothing(kind: str, low: int, high: in
 
 
 def test_late_pictures_are_stamped_as_they_are_sent() -> None:
-    lens = FaultyLens(1)
+    lens = VideoFaultInjector(1)
     assert lens.delay_ns == 0
     lens.set(PictureFault("late", 0.3))
     assert (lens.delay_ns, lens.stamp(1_000_000_000)) == (300_000_000, 1_300_000_000)
@@ -41,7 +41,7 @@ def test_late_pictures_are_stamped_as_they_are_sent() -> None:
 
 
 def test_late_stamps_move_the_time_alone() -> None:
-    lens = FaultyLens(0)
+    lens = VideoFaultInjector(0)
     lens.set(PictureFault("stamped_late", 0.3))
     assert lens.stamp(1_000_000_000) == 1_300_000_000
     assert np.array_equal(lens.picture(picture(1)), picture(1))
