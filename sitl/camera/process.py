@@ -327,7 +327,7 @@ class _Studio:
                 time_ns + self._lens.delay_ns,
                 time_ns,
                 self._lens.stamp(stamp_ns),
-                self._lens.picture(self._zoom.picture(exposure.image, time_ns)),
+                self._lens.picture(self._zoom.picture(exposure.image, time_ns), time_ns),
             )
         )
         if self._detector is not None:

@@ -83,6 +83,15 @@ def test_who_is_back_too_late_or_never_is_missed(injects_s: float, ok: bool) -> 
     assert not judge(record(flight([0.5] * 4)), expect)[-1].ok
 
 
+@pytest.mark.parametrize(("degraded_s", "ok"), [(9.0, True), (4.0, False)])
+def test_the_warning_must_come_before_what_it_warns_of(degraded_s: float, ok: bool) -> None:
+    dim, lost = alert(AlertId.LOW_CONTRAST, gray=1.8), alert(AlertId.LOST, seconds=1.0)
+    texts = (LoopText(degraded_s, 191, 3, text(lost)), LoopText(5.0, 191, 4, text(dim)))
+    expect = Expectation(warns_first=AlertId.LOW_CONTRAST)
+    assert judge(LoopRecord(flight([0.5] * 4), texts, (0.2,)), expect)[-1].ok is ok
+    assert not judge(record(flight([0.5] * 4)), expect)[-1].ok
+
+
 def replace_says(expect: Expectation) -> Expectation:
     return expect.model_copy(update={"reports": (AlertId.BORESIGHT,)})
 
