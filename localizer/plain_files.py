@@ -49,8 +49,8 @@ def as_text(data: bytes) -> str:
         raise
 
 
-def legible(data: bytes) -> str:
-    """As `as_text`; in another encoding, non-ASCII characters are replaced."""
+def decode_lenient(data: bytes) -> str:
+    """Decode text as `as_text`; in another encoding, non-ASCII characters are replaced."""
     try:
         return as_text(data)
     except UnicodeDecodeError:

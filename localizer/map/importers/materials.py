@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.map.importers.gltf_data import vector
 from localizer.map.importers.referenced_files import file_of
-from localizer.plain_files import legible
+from localizer.plain_files import decode_lenient
 from localizer.types import Float32
 
 _BLACK = 1 / 255  # linear light; a base so dark shows nothing of its own
@@ -163,7 +163,7 @@ def read_mtl(library: Path, obj_folder: Path) -> list[MtlMaterial]:
     """
     made: list[MtlMaterial] = []
     rank = 0
-    for line in legible(library.read_bytes()).splitlines():
+    for line in decode_lenient(library.read_bytes()).splitlines():
         key, rest = ([*line.split(maxsplit=1), "", ""])[:2]
         key, rest = key.lower(), rest.strip()
         if key == "newmtl":

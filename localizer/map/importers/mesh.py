@@ -25,7 +25,7 @@ from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_pl
 from localizer.map.importers.textures import palette_mesh, require_readable
 from localizer.map.importers.tiles3d import inside, read_file
 from localizer.map.source import SourceMesh
-from localizer.plain_files import legible
+from localizer.plain_files import decode_lenient
 
 _LINE_BYTES = 1 << 16  # of an OBJ
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t]")
@@ -95,7 +95,7 @@ def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         if not libraries and _MENTIONS_LIBRARY.search(text):
             doubts.append("its material library is not there: it has no picture")
-        used = {legible(match[1]).strip() for match in _USE.finditer(text)}
+        used = {decode_lenient(match[1]).strip() for match in _USE.finditer(text)}
         unknown = sorted(used - {m.name for m in found} - {""})
         if unknown:
             doubts.append(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from localizer.plain_files import legible
+from localizer.plain_files import decode_lenient
 
 _LONGEST_JSON = 1 << 30
 _LONGEST_PACKED = 64 << 20  # of a compressed header
@@ -86,11 +86,11 @@ def _of_obj(path: Path) -> Iterator[Path]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         libraries = [match[1] for match in _LIBRARY.finditer(text)]
     for names in libraries:
-        line = legible(names)
+        line = decode_lenient(names)
         for library in {*_named(path.parent, line), *_each(path.parent, line)}:
             yield library
             if library.is_file():
-                for match in _PICTURE.finditer(legible(library.read_bytes())):
+                for match in _PICTURE.finditer(decode_lenient(library.read_bytes())):
                     yield from _named(path.parent, match[1])
 
 

@@ -95,7 +95,7 @@ class ImportRules:
 
 
 def limit_names() -> tuple[str, ...]:
-    """Names of the limits."""
+    """Names of the limits that an import option may raise."""
     return tuple(f.name for f in fields(ImportRules) if "counts" in f.metadata)
 
 
