@@ -111,8 +111,10 @@ class FeedConfig(StrictModel):
     settings: SourceSettings = SourceSettings()
 
     def is_calibrated(self, today: date) -> bool:
-        """Whether what the localizer knows of the camera is a calibration's result, not long ago:
-        focus, temperature and a knock change a camera. A clock that is not set says no.
+        """Whether the camera model is from a recent calibration: focus, temperature and shocks
+        change a camera.
+
+        False if the computer's clock is not set.
         """
         if self.calibrated is None:
             return False
@@ -184,7 +186,7 @@ class TargetConfig(StrictModel):
     timeout_s: float = Field(300.0, exclude=True)
 
     def over(self, kind: MapKind) -> TargetConfig:
-        """The same over a map of a kind: a target may stand on a roof that the map lacks."""
+        """The settings over a map of this kind, which may lack roofs that targets stand on."""
         sigma_m = max(self.map_sigma_m, kind.unknown_height_sigma_m)
         return self.model_copy(update={"map_sigma_m": sigma_m})
 

@@ -103,7 +103,8 @@ def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
 def camera_rotation(gimbal: GimbalAttitude) -> Array:
     """Rotation (3, 3) world_from_camera by the gimbal's report.
 
-    The map origin's axes stand for the vehicle's: 0.1° at 10 km, far below the gimbal's own error.
+    The axes at the map's origin are used instead of the vehicle's: 0.1° at 10 km, far below the
+    gimbal's error.
     """
     world_from_camera: Array = (
         NED_FROM_ENU.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
@@ -200,4 +201,5 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
         None if seen is None else seen.height_m,
         float(np.sqrt(estimate.covariance[0, 0] + estimate.covariance[1, 1])),
         float(np.sqrt(estimate.covariance[2, 2])),
+        (camera.horizontal_fov_deg, camera.vertical_fov_deg),
     )

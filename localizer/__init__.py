@@ -1,8 +1,8 @@
 """The PiLoT algorithm as a library: no MAVLink, no video transport, no application.
 
-A camera's pose from its image and a geo-referenced 3D map: `open_localizer` opens a map that
-`build_cache` made, `Localizer.set_prior` tells about where the camera is, `Localizer.track`
-localizes one frame after the other. examples/ shows it at work; api.md holds every name.
+It estimates a camera's pose from its image and a geo-referenced 3D map: `open_localizer` opens a
+map that `build_cache` made, `Localizer.set_prior` sets an approximate pose, `Localizer.track`
+localizes one frame after the other. examples/ has programs; api.md lists every name.
 """
 
 import os

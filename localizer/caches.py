@@ -1,4 +1,4 @@
-"""Where things are kept that are made once and may be deleted at any time."""
+"""Folders of cached files that may be deleted at any time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def cache_folder(kind: str) -> Path:
-    """The folder of one kind of thing: below `PILOT_CACHE`, else below the user's cache folder."""
+    """Cache folder of one kind, below `PILOT_CACHE` or else the user's cache folder."""
     base = os.environ.get("PILOT_CACHE")
     if base:
         return Path(base) / kind

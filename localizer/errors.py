@@ -68,4 +68,4 @@ class DeviceArrayError(LocalizerError):
 
 
 class OdometryError(LocalizerError):
-    """Odometry that has nothing to carry on from."""
+    """Odometry was called without a start pose."""

@@ -1,4 +1,4 @@
-"""Image files, read and written through Python: OpenCV ends the process at a path not in UTF-8."""
+"""Reads and writes image files through Python, because OpenCV crashes for a path not in UTF-8."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Files that users, records and maps name, read without waiting for ever and within bounds; a
-user's text whatever editor saved it; the files that a user means by a folder.
+"""Reads files without blocking and with size limits, in any usual text encoding, and lists a
+folder's visible files.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ MOST_BYTES = 1 << 28  # of text and pictures; what is longer is another file, gi
 
 
 def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
-    """A plain file's content. most: bytes; None: whatever there is.
+    """Content of a plain file. most: size limit in bytes; None: no limit.
 
     OSError for a pipe, whose reader waits for who writes into it, for a device, which may have no
     end, and for more than `most` bytes.
@@ -32,13 +32,13 @@ def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
 
 
 def plain_text(path: Path, most: int | None = MOST_BYTES) -> str:
-    """A plain file's text, lines as they end there; see `plain_bytes` and `as_text`."""
+    """Text of a plain file; see `plain_bytes` and `as_text`."""
     return as_text(plain_bytes(path, most))
 
 
 def as_text(data: bytes) -> str:
-    """UTF-8, or UTF-16 as its byte order mark says, which is left out: editors of Windows write
-    one. UnicodeDecodeError for another encoding.
+    """Decode UTF-8, or UTF-16 with a byte order mark, which is removed. UnicodeDecodeError for
+    another encoding.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
@@ -49,8 +49,8 @@ def as_text(data: bytes) -> str:
         raise
 
 
-def legible(data: bytes) -> str:
-    """As `as_text`; in another encoding, what is not ASCII is replaced."""
+def decode_lenient(data: bytes) -> str:
+    """Decode text as `as_text`; in another encoding, non-ASCII characters are replaced."""
     try:
         return as_text(data)
     except UnicodeDecodeError:
@@ -58,12 +58,10 @@ def legible(data: bytes) -> str:
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:
-    """Those that a user means, by name: a Mac that copies to a stick puts a ``._NAME`` beside each
-    NAME (AppleDouble), and a ``.NAME`` is hidden.
-    """
+    """Sorted paths without hidden files and macOS's ``._NAME`` files (AppleDouble)."""
     return sorted(p for p in paths if not p.name.startswith("."))
 
 
 def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """The files of a folder that end so (lower case, with the dot) and are not hidden, by name."""
+    """A folder's visible files with these suffixes (lower case, with the dot), sorted by name."""
     return visible(p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file())

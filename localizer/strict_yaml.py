@@ -1,5 +1,5 @@
-"""YAML for settings: plain types, no repeated key, no merge key, no `yes` for a number, and no
-number that YAML 1.1 reads differently, such as 8:20 for 500.
+"""Reads YAML settings strictly: plain types, no repeated or merge keys, no `yes` for a number, and
+no sexagesimal or octal numbers of YAML 1.1 (8:20 is 500).
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def _plain(node: yaml.ScalarNode, number: float) -> float:
 
 
 def load_yaml(text: str) -> Any:
-    """The document in `text`; yaml.YAMLError, with line and column, also for a repeated key, a
-    merge key and a number to base 60 or 8.
+    """Parse a YAML document. yaml.YAMLError, with line and column, also for a repeated key, a merge
+    key and a number to base 60 or 8.
 
     As with `yaml.safe_load`, ValueError for an impossible date, RecursionError for endless nesting.
     """
@@ -80,8 +80,8 @@ def load_yaml(text: str) -> Any:
 def misread_booleans(
     given: Any, taken: Any, where: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], bool]]:
-    """(where, value) of the booleans in the data `given` that its model `taken` took for numbers:
-    pydantic makes YAML's yes, on and true the number 1.
+    """Yield (key path, value) of booleans in `given` that the model `taken` converted to numbers,
+    as pydantic does with yes, on and true.
     """
     if isinstance(given, bool):
         if isinstance(taken, int | float) and not isinstance(taken, bool):

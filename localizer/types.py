@@ -1,8 +1,8 @@
-"""The small frozen messages that travel between threads and packages.
+"""The frozen dataclasses passed between threads and packages.
 
-World means the map's ENU frame (`geometry.geo.LocalFrame` about the map's origin), float64
-metres. Camera means OpenCV axes (x right, y down, z forward). Times are CLOCK_MONOTONIC
-nanoseconds of the exposure's middle.
+World is the map's ENU frame (`geometry.geo.LocalFrame` about the map's origin), float64 metres.
+Camera axes are OpenCV's (x right, y down, z forward). Times are CLOCK_MONOTONIC nanoseconds of the
+exposure's middle.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a `MapRenderer` returns. rgb: (H, W, 3) uint8. depth: (H, W) float32, z in metres along
-    the optical axis at pixel centres, 0 where no surface was hit.
+    """A rendered view. rgb: (H, W, 3) uint8. depth: (H, W) float32, z in metres along the optical
+    axis at pixel centres, 0 without a surface.
     """
 
     rgb: Image
@@ -149,7 +149,7 @@ class TrackingState(Enum):
 
 @dataclass(frozen=True)
 class FocalFit:
-    """The focal length that fits a picture best, as a multiple of its camera's, and its sigma."""
+    """The best-fitting focal length, as a multiple of the camera's, and its sigma."""
 
     factor: float
     sigma: float
@@ -193,8 +193,8 @@ def _up() -> Array:
 @dataclass(frozen=True)
 class TargetSurface:
     """A surface that a target's pixel may show. probability: 0 to 1; position: (3,) world metres;
-    covariance: (3, 3) m², world axes, if it is this one; normal: (3,) unit, world axes;
-    roughness_m: how far the surface strays from its tangent plane.
+    covariance: (3, 3) m², world axes, given this surface; normal: (3,) unit, world axes;
+    roughness_m: deviation from its tangent plane.
     """
 
     probability: float
@@ -206,7 +206,7 @@ class TargetSurface:
 
 @dataclass(frozen=True)
 class TargetSighting:
-    """A pixel with the surfaces (at least one) that it may show; time_ns is the exposure's."""
+    """An observed pixel with the surfaces (at least one) that it may show; time_ns: exposure."""
 
     target_id: str
     surfaces: tuple[TargetSurface, ...]
@@ -215,7 +215,7 @@ class TargetSighting:
 
 
 class Visibility(Enum):
-    """How a target's place is known in a frame."""
+    """How a target's position is known in a frame."""
 
     SEEN = "seen"
     """Its pixel was measured in this frame."""
@@ -229,9 +229,9 @@ class Visibility(Enum):
 
 @dataclass(frozen=True)
 class TargetFix:
-    """A target's place on Earth. position_world: (3,) metres; covariance: (3, 3) m², world axes,
-    the mean square about the position, other surfaces included. elsewhere: the probability, 0 to 1,
-    that the target is on another surface than the reported one.
+    """A target's position. position_world: (3,) metres; covariance: (3, 3) m², world axes, mean
+    square about the position including other surfaces. elsewhere: probability, 0 to 1, that the
+    target is on another surface than the reported one.
 
     pixel: its place in the frame; None beside the picture. velocity: (3,) m/s, world axes, with its
     covariance (3, 3); None of what stands still or was seen once. extent: its width and height in

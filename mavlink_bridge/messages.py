@@ -242,8 +242,12 @@ class CameraView:
     """1 sigma of the camera's position, horizontal (over both directions)."""
     v_accuracy_m: float | None = None
     """1 sigma of its height."""
+    fov_deg: tuple[float, float] | None = None
+    """Horizontal and vertical field of view at this zoom; None: the configured one."""
 
     def __post_init__(self) -> None:
+        if not all(0.0 < angle < 180.0 for angle in self.fov_deg or ()):
+            raise FixError(f"camera view: no field of view: {self.fov_deg}")
         _check_position("camera view", self.latitude_deg, self.longitude_deg, self.height_m)
         image = (self.image_latitude_deg, self.image_longitude_deg, self.image_height_m)
         _check_position("camera view's picture", *(value or 0.0 for value in image))

@@ -46,7 +46,7 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
 
 
 def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Rz(yaw) Ry(pitch) Rx(roll): body to NED."""
+    """Quaternion of Rz(yaw) Ry(pitch) Rx(roll), radians: body to NED."""
     cr, sr = math.cos(roll / 2.0), math.sin(roll / 2.0)
     cp, sp = math.cos(pitch / 2.0), math.sin(pitch / 2.0)
     cy, sy = math.cos(yaw / 2.0), math.sin(yaw / 2.0)

@@ -19,12 +19,12 @@ from rich.markup import escape
 from companion.errors import CompanionError, ReportError
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
-from companion.terminal.steps import shown_steps
+from companion.terminal.steps import show_steps
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
-from sitl.demo.flight import DemoRecord, Onlookers, fly
+from sitl.demo.flight import DemoRecord, FlightObservers, fly
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import LogProgress, shown_progress
 from sitl.demo.report import make_report, print_report
@@ -129,7 +129,7 @@ def demo(
     _clear(out)
     port = free_console_port()
     with shown_progress(console) as progress:
-        onlookers = Onlookers(
+        onlookers = FlightObservers(
             progress, partial(_tell_endpoint, console), port, partial(_tell_page, console)
         )
         program = shlex.split(companion) if companion else THIS_PROGRAM
@@ -163,7 +163,7 @@ def sequence(
     console = Console()
     assets = _world_of(script, seed, worlds, ideal, console)
     check_inside(script, assets.world.size_m)
-    with shown_steps(console) as say:
+    with show_steps(console) as say:
         say("rendering the path; a minute or more")
         count = record_scenario(assets, script, seed, out)
     console.print(f"[green]{out}[/]: {count} frames; its map is {assets.map_cache}")

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.calibration.desk.film import EstimateWithTruth
 from benchmarks.calibration.draws import Draw, Sortie, drawn, fly, true_camera, true_mount
 from companion.calibrate import unknowns as u
-from companion.calibrate.flight import Calibrated, calibrate
+from companion.calibrate.flight import CalibrationResult, calibrate
 from companion.calibrate.proposal import blind_spots, changed, changes
 from companion.config import CompanionConfig, load_config
 from companion.offline.record import load_record
@@ -56,7 +56,7 @@ def solve_draw(
     return row
 
 
-def _found_numbers(found: Calibrated) -> dict[str, Any]:
+def _found_numbers(found: CalibrationResult) -> dict[str, Any]:
     return {
         "names": [n.name for n in u.UNKNOWNS],
         "found": found.shared.tolist(), "sigma": found.sigmas.tolist(),
@@ -78,7 +78,7 @@ def true_numbers(draw: Draw, seed: int, sortie: Sortie) -> Array:
     return truth
 
 
-def _noise(found: Calibrated) -> dict[str, Any]:
+def _noise(found: CalibrationResult) -> dict[str, Any]:
     s = found.solution
     return {
         "attitude_deg": np.degrees(s.attitude.sigma).tolist(),

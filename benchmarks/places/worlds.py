@@ -14,7 +14,7 @@ from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.synth.config import Character, WorldConfig
 from localizer.synth.visits.changes import Changes
-from localizer.synth.visits.visit import Visit, draw_look, surveyed_and_lived
+from localizer.synth.visits.visit import Visit, draw_look, survey_and_flight_visits
 from localizer.synth.world import WorldInfo, build_visits
 
 WORLD_M = 400.0
@@ -60,7 +60,7 @@ class PlaceFolder:
 def visits(place: GeneratedPlace) -> dict[str, Visit]:
     """The survey and both later visits, drawn from the place's seed."""
     config = place.config
-    survey, live = surveyed_and_lived(config)
+    survey, live = survey_and_flight_visits(config)
     rng = config.rng(63)
     look = replace(draw_look(rng), changed_buildings=0.0)
     changes = replace(_YEARS, seed=int(rng.integers(1 << 30)))

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from benchmarks.common.arguments import Parser, whole
@@ -28,11 +27,10 @@ with needs_torch():
 from companion.integrity_monitor.config import VideoCheckConfig
 from companion.integrity_monitor.video import detail, thumbnail
 from localizer.types import Image
+from sitl.camera.faults import darkened
 
 _LIGHTS = tuple((1.0 / n, gain) for gain in (1.0, 16.0)
                 for n in (64, 256, 512, 1024, 2048, 4096, 8192, 16384))  # fmt: skip
-_WHITE, _READ, _NATIVE_PX = 6000.0, 2.5, 1280
-_GAMMA, _QUALITY = 2.2, 70
 _ATTITUDE_DEG, _WIDTH = 1.0, 320
 _EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, np.inf)
 
@@ -52,20 +50,6 @@ class DarkenedView(RealView):
             return rgb
         rng = np.random.default_rng((self.seed, int(1.0 / self.light), int(self.most_gain)))
         return darkened(rgb, self.light, self.most_gain, rng)
-
-
-def darkened(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
-    """An image (H, W, 3) with so much of its light; smaller ones count as binned."""
-    binned = (_NATIVE_PX / rgb.shape[1]) ** 2
-    white, read = _WHITE * binned, _READ * np.sqrt(binned)
-    electrons = (rgb.astype(np.float32) / 255.0) ** _GAMMA * (white * light)
-    noise = rng.standard_normal(electrons.shape, dtype=np.float32)
-    electrons += noise * np.sqrt(electrons + read**2)
-    shown = np.clip(electrons * min(1.0 / light, most_gain) / white, 0.0, 1.0) ** (1.0 / _GAMMA)
-    dark = (shown * 255.0 + 0.5).astype(np.uint8)
-    _, data = cv2.imencode(".jpg", dark[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
-    return np.ascontiguousarray(decoded[..., ::-1])
 
 
 def rows(name: str, views: list[RealView]) -> Iterator[tuple[float, bool]]:

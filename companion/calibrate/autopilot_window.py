@@ -35,11 +35,11 @@ class AutopilotRecord(Protocol):
 
 @dataclass(frozen=True)
 class AutopilotWindow:
-    """Data around one timestamp, at T times `OFFSETS_S` from it; NaN where unknown.
+    """Autopilot data around one timestamp, at T times `OFFSETS_S` from it; NaN if unknown.
 
     camera: (T, 3, 3) world from the camera's housing (gimbal axes, x along the boresight), without
-    the deployment's mounting correction; body: (T, 3, 3) world from body; place: (T, 3) metres in
-    the map's ENU, of the EKF.
+    the deployment's mounting correction; body: (T, 3, 3) world from body; place: (T, 3) position by
+    the EKF, map ENU, m.
     """
 
     camera: Array

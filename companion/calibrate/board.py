@@ -54,7 +54,7 @@ def board_picture(dots: int = _DOTS_PER_SQUARE) -> Image:
 def write_sheet(path: Path, paper: Paper) -> BoardPage:
     """Write the board as PDF or PNG, by the file's suffix; `ReportError` for others.
 
-    Printed at 100 %, a square has the side that the sheet says: a ruler tells.
+    Printed at 100 %, the squares have the size stated on the sheet.
     """
     sheet = BoardPage.of(paper)
     endings = {".pdf": _pdf, ".png": _png}

@@ -40,7 +40,7 @@ _OURS = ("inject", "rc")
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CalibrationResult:
     """Result of a calibration flight. solution: see `solve`; before, after: mean distance of the
     image patches from their map positions, px of the stream, poses free; frames, parts: numbers
     used. gnss_bias_m: constant error of the receiver, already in `covariance`. notes: sentences for
@@ -86,12 +86,12 @@ def calibrate(
     record: FlightRecord,
     frames: int = 200,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> Calibrated:
-    """Estimate the values of the record's deployment from its images over its map.
+) -> CalibrationResult:
+    """Estimate calibration values from a record's images over its map, starting from its
+    deployment.
 
-    frames: at most so many pictures are read, spread over the flight. progress: told how many are
-    read, and of how many (each twice). `RecordError` where the
-    record does not suffice, with what it lacks.
+    frames: largest number of images, spread over the flight. progress: called with the numbers read
+    and total (twice the frames). `RecordError` says what the record lacks.
     """
     config = record.config
     stack = MapStack(config.map, config.localizer)
@@ -134,7 +134,7 @@ def calibrate(
     covariance = solution.covariance.copy()
     covariance[u.SHIFT, u.SHIFT] += np.eye(3) * bias_m**2
     covariance[u.LATE, u.LATE] += _CLOCKS_S**2
-    return Calibrated(
+    return CalibrationResult(
         camera, mount, arm_m, solution, covariance, before_px, solution.pixel_sigma, len(sighted),
         len(evidence.owner), bias_m, _notes(evidence, config),
     )  # fmt: skip
@@ -220,11 +220,11 @@ def _unzoomed(camera: FeedConfig, autopilot: RecordedAutopilot, time_ns: int) ->
 
 
 def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
-    """Error of a flight's mean position because of the receiver, m, 1 sigma.
+    """Error of a flight's mean position caused by the GNSS receiver, m, 1 sigma.
 
-    accuracies_m: what the receiver said of itself at each picture whose place counts; None where it
-    did not say. Errors that last all flight do not average out: the sigma of their mean is the mean
-    of their sigmas.
+    accuracies_m: accuracy that the receiver stated for each image used, None if it stated none.
+    Errors that last all flight do not average out: the sigma of their mean is the mean of their
+    sigmas.
     """
     window = [max(_GNSS_BIAS_M, a) for a in accuracies_m if a is not None]
     return float(np.mean(window)) if window else _GNSS_BIAS_M

@@ -46,7 +46,7 @@ class Parts:
 class PictureReader:
     """Renders the map at an image's pose and measures where the image shows the map's points.
 
-    camera: as it is believed to be; wrong by per cents it still finds every point.
+    camera: the assumed model, which may be wrong by some per cent.
     """
 
     def __init__(

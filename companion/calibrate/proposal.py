@@ -13,7 +13,7 @@ import yaml
 
 from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import changed_camera
-from companion.calibrate.flight import Calibrated
+from companion.calibrate.flight import CalibrationResult
 from companion.calibrate.lens import LensEstimate
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
@@ -38,7 +38,7 @@ class SettingChange:
     after: Any
 
 
-def changes(config: CompanionConfig, found: Calibrated) -> tuple[SettingChange, ...]:
+def changes(config: CompanionConfig, found: CalibrationResult) -> tuple[SettingChange, ...]:
     """All settings that the flight's estimate replaces. They were estimated together and must be
     replaced together.
     """
@@ -72,7 +72,7 @@ def changes(config: CompanionConfig, found: Calibrated) -> tuple[SettingChange, 
     return tuple(c for c in made if c.before != c.after)
 
 
-def _mounting(config: CompanionConfig, found: Calibrated) -> list[SettingChange]:
+def _mounting(config: CompanionConfig, found: CalibrationResult) -> list[SettingChange]:
     mount = found.mount @ so3_exp(found.shared[u.MOUNT])
     angles = np.degrees(euler_from_matrix(mount))
     c = config.bridge.camera
@@ -83,7 +83,7 @@ def _mounting(config: CompanionConfig, found: Calibrated) -> list[SettingChange]
     ]
 
 
-def _sigmas(config: CompanionConfig, found: Calibrated) -> list[SettingChange]:
+def _sigmas(config: CompanionConfig, found: CalibrationResult) -> list[SettingChange]:
     """The new sigmas of the camera model."""
     sigma = found.sigmas
     told = config.localizer.calibration
@@ -193,7 +193,7 @@ def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -
     return kept
 
 
-def blind_spots(found: Calibrated) -> tuple[str, ...]:
+def blind_spots(found: CalibrationResult) -> tuple[str, ...]:
     """Combinations of values that this flight cannot separate, in words: weak eigenvectors of its
     information.
     """

@@ -35,9 +35,9 @@ class GaussMarkovProcess:
     memory_s: Array
 
     def whitened(self, values: Array, times_s: Array, white: float) -> Array:
-        """(K, 3, n) values less what is left of the ones before them, in sigmas: (3 K, n).
+        """Residuals (K, 3, n) without the part predicted from earlier ones, in sigmas: (3 K, n).
 
-        white: of what has no memory.
+        white: sigma of uncorrelated noise.
         """
         gaps = np.diff(times_s)[:, None]
         kept = np.concatenate([np.zeros((1, 3)), np.exp(-gaps / self.memory_s)])

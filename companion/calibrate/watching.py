@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.calibrate.views import BoardView, BoardViews
-from companion.setup.asking import first_picture
+from companion.setup.asking import read_stream_size
 from companion.sources import SourceSettings, open_source
 from localizer.geometry.camera import Camera
 from localizer.pictures import write_rgb
@@ -18,7 +18,7 @@ _QUIET_PICTURES = 30  # of the same word, after which it is said again
 
 
 @dataclass(frozen=True)
-class Filmed:
+class BoardViewing:
     """Result of the collection. missing: views that are still missing."""
 
     views: tuple[BoardView, ...]
@@ -27,13 +27,13 @@ class Filmed:
     height: int
 
 
-def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> Filmed:
-    """Watch for at most this time, to the end of a file or folder, or until all views are there.
+def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> BoardViewing:
+    """Collect views of the board until all are there, the source ends, or `seconds` have passed.
 
-    told: views, the newest picture's fate and what is missing, whenever that changes. keep: folder
-    for the pictures that were taken. seconds: that time.
+    told: called with the views, the result of the newest image and the missing views, after each
+    change. keep: folder for the images used.
     """
-    size = first_picture(source)
+    size = read_stream_size(source)
     views = BoardViews(size.width, size.height)
     # Any model of the pictures' size: it is what is being looked for.
     camera = Camera.from_fov(size.width, size.height, 65.0)
@@ -58,4 +58,4 @@ def watch_board(source: str, seconds: float, told: Told, keep: Path | None = Non
     finally:
         timer.cancel()
         feed.close()
-    return Filmed(tuple(views.views), tuple(views.missing()), size.width, size.height)
+    return BoardViewing(tuple(views.views), tuple(views.missing()), size.width, size.height)

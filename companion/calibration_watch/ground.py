@@ -34,7 +34,7 @@ class GroundView:
     def height_m(self, state: VehicleState, now_ns: int) -> float | None:
         """Height above the ground, the largest of the known ones; None if none is known.
 
-        now_ns: of what it is asked for; ground that was seen long before says nothing of it.
+        now_ns: time of the query; observations from long before it are not used.
         """
         relative_m, newest = state.altitude_relative_m, self._newest
         known = [] if relative_m is None or relative_m < _BELOW_M else [max(relative_m, 0.0)]

@@ -29,11 +29,11 @@ class CalibrationObservation:
 
 @dataclass(frozen=True)
 class AutopilotObservation:
-    """The autopilot's data at the time of a frame; None where unknown.
+    """The autopilot's data at the time of a frame; None if unknown.
 
     ned_from_camera: (3, 3) by gimbal and attitude; turn: its rotation vector (3,) over a second,
-    NED, rad. north_east_m: of the EKF on GNSS, from the sighting's place. gnss_height_m,
-    pressure_height_m: only their changes count.
+    NED, rad. north_east_m: the EKF's position on GNSS, relative to the observation. gnss_height_m,
+    pressure_height_m: used for changes only.
     """
 
     ned_from_camera: Array | None

@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
-from companion.terminal.steps import shown_work
+from companion.terminal.steps import show_work
 from companion.writing import refuse_input, writing
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
@@ -88,7 +88,7 @@ def convert_command(
         above = Heights(heights.value, separation or 0.0)
     notes: list[str] = []
     place = MapReference(frame, above, notes.append)
-    with shown_work(Console(stderr=True), f"converting {source}"):
+    with show_work(Console(stderr=True), f"converting {source}"):
         poses = _dated(READERS[of.value](source, place), times, needed=to is OutputFormat.TUM)
         with writing(out):
             WRITERS[to.value](out, poses, place)

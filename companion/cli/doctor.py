@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.config import load_config
-from companion.terminal.steps import shown_steps, shown_work
+from companion.terminal.steps import show_steps, show_work
 from companion.versions import made_by, processor
 from companion.writing import refuse_input, result_file, writing
 from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
@@ -52,7 +52,7 @@ def doctor_command(
         refuse_input(page.with_suffix(".txt"), "--page", config, plan)
     vehicle, feed = vehicle and not beside_flight, not beside_flight
     console = Console()
-    with shown_steps(Console(stderr=True)) as say:
+    with show_steps(Console(stderr=True)) as say:
         say(f"examining {config}")  # the imports take seconds, too
         from companion.preflight.doctor import examine_deployment
         from mavlink_bridge.preflight.doctor import repair
@@ -64,10 +64,10 @@ def doctor_command(
     if fix and diagnosis.fixable:
         names = ", ".join(f"{f.name} = {f.fix:.7g}" for f in diagnosis.fixable if f.fix is not None)
         if yes or typer.confirm(f"Write {names}?"):
-            with shown_work(Console(stderr=True), "writing parameters"):
+            with show_work(Console(stderr=True), "writing parameters"):
                 reboot = repair(settings.bridge, diagnosis.fixable)
             console.print("written" + ("; reboot the flight controller" if reboot else ""))
-            with shown_steps(Console(stderr=True)) as say:
+            with show_steps(Console(stderr=True)) as say:
                 diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
             print_diagnosis(console, diagnosis, left_out)
     if page is not None:

@@ -22,7 +22,7 @@ from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import sequence_of
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
-from companion.terminal.steps import COMPILES, shown_count, tally
+from companion.terminal.steps import COMPILES, show_count, tally
 from companion.trajectory import stamped, write_trajectory
 from companion.versions import made_by
 from companion.writing import made_folder, writing
@@ -113,7 +113,7 @@ def evaluate_command(
             width=width, model=model, seed=seed, renderer=renderer, device=device, feature_threads=2
         )
     )
-    counting = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
+    counting = show_count(Console(stderr=True), "localizing", begins=COMPILES)
     with ExitStack() as progress:
         show = progress.enter_context(counting)
         stack = MapStack(map_cache, config)

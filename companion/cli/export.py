@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from companion.errors import ConfigError
-from companion.terminal.steps import shown_count, shown_steps, tally
+from companion.terminal.steps import show_count, show_steps, tally
 
 
 def export_command(
@@ -29,7 +29,7 @@ def export_command(
     if not mcap:
         raise ConfigError("say which format: --mcap, the only one so far; the .tlog needs none")
     console = Console()
-    with shown_steps(Console(stderr=True)) as say:
+    with show_steps(Console(stderr=True)) as say:
         say(f"reading {record}")
         from companion.export.mcap_export import export_mcap
 
@@ -62,7 +62,7 @@ def klv_command(
     from companion.reporting.klv_recording import describe_recording
 
     path = out or video.with_suffix(".klv.ts")
-    with shown_count(Console(stderr=True), "describing") as show:
+    with show_count(Console(stderr=True), "describing") as show:
         written = describe_recording(
             video, record, path, map_cache=map_cache, begin_s=begin, mission=mission,
             progress=tally(show),

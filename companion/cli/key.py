@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from companion.errors import ConfigError
-from companion.terminal.steps import shown_work
+from companion.terminal.steps import show_work
 from mavlink_bridge.errors import EndpointError
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint
@@ -38,7 +38,7 @@ def key_command(
         from mavlink_bridge.preflight.signing_setup import install_key
 
         console.print("the key goes over this connection in clear: use a cable", soft_wrap=True)
-        with shown_work(Console(stderr=True), f"waiting for the flight controller at {install}"):
+        with show_work(Console(stderr=True), f"waiting for the flight controller at {install}"):
             installed = install_key(install, file)
         if installed:
             console.print("installed: the autopilot's heartbeat is signed with it")

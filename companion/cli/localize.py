@@ -22,7 +22,7 @@ from companion.offline.localize import (
     sensors_of,
 )
 from companion.sources.folder_source import list_images
-from companion.terminal.steps import COMPILES, shown_count, tally
+from companion.terminal.steps import COMPILES, show_count, tally
 from companion.trajectory import TRAJECTORY_NAMES, stamped, write_trajectory
 from companion.writing import made_folder, refuse_input, writing
 from localizer.config import LocalizerConfig
@@ -119,7 +119,7 @@ def localize_command(
     known: Mapping[str, Pose] = {row.name: world_from_camera(row, cache.frame) for row in rows}
     dated = zip(paths, times, strict=True)
     sensors = sensors_of({t: known[path.name] for path, t in dated if path.name in known})
-    count = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
+    count = show_count(Console(stderr=True), "localizing", begins=COMPILES)
     with open_localizer(map_cache, intrinsics, config, sensors) as localizer, count as show:
         frame = localizer.frame
         more = tally(show, len(paths))

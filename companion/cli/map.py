@@ -17,7 +17,7 @@ from rich.table import Table
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
 from companion.errors import ConfigError
-from companion.terminal.steps import READING, shown_count, shown_work
+from companion.terminal.steps import READING, show_count, show_work
 from companion.writing import refuse_input, result_file, writing
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def build(
     try:
         with (
             _with_ground(source, flat_ground, out, rules) as sources,
-            shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar,
+            show_count(Console(stderr=True), "importing tiles", begins=READING) as bar,
         ):
             manifest = build_cache(
                 sources,
@@ -283,7 +283,7 @@ def verify(cache: CachePath) -> None:
     from localizer.map.inspection.inspect import verify as check
 
     opened = TileCache.open(cache)
-    with shown_work(Console(stderr=True), f"hashing {opened.manifest.tiles} tiles, seeking holes"):
+    with show_work(Console(stderr=True), f"hashing {opened.manifest.tiles} tiles, seeking holes"):
         result = check(opened)
     console = Console()
     _print_warnings(opened.manifest.warnings)
@@ -329,7 +329,7 @@ def render(
 
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
-    with shown_work(Console(stderr=True), "rendering; the first time compiles the renderer"):
+    with show_work(Console(stderr=True), "rendering; the first time compiles the renderer"):
         view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
     with writing(out, "--out"):
         inspect.write_picture(out, view.rgb)
@@ -352,7 +352,7 @@ def export(
     from localizer.map.inspection.inspect import export_glb
 
     opened = TileCache.open(cache)
-    with writing(out, "--out"), shown_work(Console(stderr=True), "joining the tiles"):
+    with writing(out, "--out"), show_work(Console(stderr=True), "joining the tiles"):
         triangles = export_glb(opened, out, level)
     Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
 
@@ -363,7 +363,7 @@ def _make_overview(cache: Path) -> None:
     from localizer.map.cache.cache import TileCache
     from localizer.relocalization.relocalizer import open_relocalizer
 
-    with shown_count(Console(stderr=True), "overview", begins="the map from above") as show:
+    with show_count(Console(stderr=True), "overview", begins="the map from above") as show:
         opened = open_relocalizer(
             TileCache.open(cache),
             LocalizerConfig(),

@@ -15,7 +15,7 @@ from companion.cli.console import require_extra, serve
 from companion.errors import ConfigError, RecordError
 from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, validated
-from companion.terminal.steps import COMPILES, shown_count, shown_steps, tally
+from companion.terminal.steps import COMPILES, show_count, show_steps, tally
 from localizer.geometry.pose import Array
 
 
@@ -42,7 +42,7 @@ def replay_command(
     from localizer.map.cache.cache import TileCache
 
     loaded = load_record(record, tlog=tlog, map_cache=map_cache)
-    with shown_count(Console(stderr=True), "localizing", begins=COMPILES) as show:
+    with show_count(Console(stderr=True), "localizing", begins=COMPILES) as show:
         summary = summarize(replay(loaded, tally(show, len(loaded.estimates))))
     table = Table(title=str(record))
     for column in ("", "median", "p95", "max"):
@@ -86,7 +86,7 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
     except SettingsError as error:
         raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
     with (
-        shown_steps(Console(stderr=True)) as say,
+        show_steps(Console(stderr=True)) as say,
         map_pictures(map_path, flown=tables.flown) as pictures,
     ):
         say(f"reading {record} and its map")

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from companion.errors import ReportError
 from companion.terminal.links import file_link
-from companion.terminal.steps import shown_steps
+from companion.terminal.steps import show_steps
 
 
 def report_command(
@@ -29,7 +29,7 @@ def report_command(
         raise ReportError(f"{out}: give a name that ends in .html")
     if out is not None and out.is_file() and not overwrite:
         raise ReportError(f"{out}: is there already; --overwrite replaces it")
-    with shown_steps(Console(stderr=True)) as say:
+    with show_steps(Console(stderr=True)) as say:
         say(f"reading {folder}")
         from companion.reporting.report import NAME, write_page
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from companion.console.source import Newest
 from companion.live.protocol import LinkError, Message, MessageDecoder, encode
-from companion.live.shared import Arrivals
+from companion.live.shared import SharedMemoryReader
 
 _log = logging.getLogger(__name__)
 _AGAIN_S = 1.0
@@ -75,7 +75,7 @@ class FlightSource:
     async def _serve(self) -> None:
         """One connection, until it ends."""
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        arrivals = Arrivals(connection)
+        arrivals = SharedMemoryReader(connection)
         try:
             connection.setblocking(False)
             await asyncio.get_running_loop().sock_connect(connection, str(self._path))
@@ -87,7 +87,7 @@ class FlightSource:
             self._connection = None
             arrivals.close()
 
-    async def _read(self, connection: socket.socket, arrivals: Arrivals) -> None:
+    async def _read(self, connection: socket.socket, arrivals: SharedMemoryReader) -> None:
         """What came until now is taken whole; of it the newest is shown."""
         loop, decoder = asyncio.get_running_loop(), MessageDecoder()
         readable = asyncio.Event()
@@ -108,7 +108,7 @@ class FlightSource:
         finally:
             loop.remove_reader(connection)
 
-    def _take(self, message: Message, arrivals: Arrivals) -> None:
+    def _take(self, message: Message, arrivals: SharedMemoryReader) -> None:
         head = message.head
         if head.get("kind") == "answer":
             self._answer(head)

@@ -137,10 +137,10 @@ def edges(picture: OverlayFrame) -> np.ndarray:
 
 
 def map_at_pose(picture: OverlayFrame) -> np.ndarray | None:
-    """The map rendered as the camera saw it, with distortion, at half size.
+    """The map rendered as the camera saw it, with distortion, at half size; None without a pose.
 
-    For each pixel the ray is followed to the depth that the reference has where it passes; the
-    reference was rendered at the predicted pose, so two steps are enough.
+    The reference was rendered at the predicted pose; each pixel is moved to the estimated pose by
+    its depth, in two iterations.
     """
     view, pose = picture.view, picture.pose
     if view is None or pose is None:

@@ -29,7 +29,7 @@ _FIX_3D = 3
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """Result of an export. rows: rows, images and MAVLink messages read; messages: written, of all
     topics; notes: missing parts of the record.
     """
@@ -62,7 +62,7 @@ def export_mcap(
     out: Path | None = None,
     tlog: Path | None = None,
     progress: Callable[[int], None] = lambda _: None,
-) -> Exported:
+) -> ExportResult:
     """Write the record's rows, pictures and MAVLink in the order of their times.
 
     out: ``record.mcap`` in the record if None; tlog: instead of the record's own; progress: takes
@@ -102,7 +102,7 @@ def export_mcap(
     finally:
         partial.unlink(missing_ok=True)
     progress(count)
-    return Exported(path, file.messages, count, tuple(notes))
+    return ExportResult(path, file.messages, count, tuple(notes))
 
 
 def _sources(

@@ -74,10 +74,11 @@ class Companion:
         self._parts.forget()
 
     def run(self) -> None:
-        """Fly until stopped. Raises the error that ended the video, after the shutdown.
+        """Fly until stopped.
 
-        Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
-        behind would keep the process from ending.
+        Raises the error that ended the video, after the shutdown. If the start fails, all
+        components that were started are stopped, because a remaining thread would keep the process
+        alive.
         """
         sys.setswitchinterval(_SWITCH_S)
         self._parts.channels.events.subscribe(_log_event)
@@ -129,9 +130,10 @@ class Companion:
         return feed
 
     def stop(self) -> bool:
-        """End `run` soon, in order. Returns False during the start, which continues.
+        """End `run` soon, with a clean shutdown.
 
-        For a signal handler: it takes no lock, since what it interrupts may hold that one.
+        Returns False during the start, which continues. For a signal handler: it takes no lock,
+        because the interrupted code may hold it.
         """
         self._is_stopping = True
         return self._is_up

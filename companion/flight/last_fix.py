@@ -122,11 +122,10 @@ def _is_place(fix: LastFix) -> bool:
 
 
 class FixMemory:
-    """Writes the newest confirmed position in flight, and holds that of the process before.
+    """Writes the newest confirmed position in flight, and reads that of the previous process.
 
-    trusted: whether nobody withholds fixes now; state: what the vehicle says about itself.
-    Thread-safe: estimates come on the localization thread, which only leaves them here; the file is
-    written on a thread of its own.
+    trusted: whether no check holds the output now; state: the vehicle's telemetry. Thread-safe; the
+    file is written by its own thread.
     """
 
     def __init__(

@@ -141,9 +141,9 @@ def _is_beside_receiver(state: VehicleState) -> bool:
 class AutopilotPose:
     """The camera's pose from the autopilot's position, attitude and gimbal angles.
 
-    on_gnss: whether GNSS, if healthy, makes the autopilot's position, None where nobody knows: then
-    it does where the receiver says the same place. One that was led by our own fixes is none to
-    begin from, whatever a receiver says beside it that is not followed.
+    on_gnss: whether the EKF uses GNSS, None if unknown; then it counts as using GNSS if the
+    receiver reports the same position. A position that results from our own fixes is not used as a
+    start.
     """
 
     def __init__(
@@ -159,10 +159,10 @@ class AutopilotPose:
         self.belief = PositionBelief(config)
 
     def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
-        """Note one of our fixes. Never blocks.
+        """Note one of our fixes.
 
-        reaches_ekf: whether positions go to it. One in shadow, or withheld, holds no EKF in place:
-        taken for one that does, it would let the search look too near where a drifted EKF is.
+        Never blocks. reaches_ekf: whether positions are sent to the EKF. A fix in shadow mode or on
+        hold does not correct the EKF, which may drift; the search region must allow for that.
         """
         if estimate.accepted and reaches_ekf:
             self.belief.note_fix(estimate.exposure_time_ns)
@@ -240,8 +240,8 @@ class AutopilotPose:
     def displacement(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
         """Displacement (3,) in the map's axes between two times by the EKF, and its sigma (m).
 
-        Inertial as long as none of our fixes goes to the EKF: while a place is on trial. The map
-        origin's axes stand for the vehicle's, 0.1° at 10 km.
+        It is inertial while no fix of ours is sent, as during a tentative track. The axes at the
+        map's origin are used instead of the vehicle's: 0.1° at 10 km.
         """
         state = self._autopilot.state()
         if state.ekf_flags & _CONST_POSITION or not state.ekf_flags & _HORIZONTAL:

@@ -67,7 +67,7 @@ def fresh_folder(folder: Path) -> Path:
 def remove_empty(folder: Path) -> None:
     """Remove the record of a failed start, whose files hold at most column names.
 
-    The start may have ended between any two of its steps, so none of this need exist.
+    Any of the files may be missing.
     """
     tables = [folder / name for name in ("estimates.csv", "targets.csv", "events.csv")]
     snapshots = folder / "snapshots"

@@ -61,8 +61,8 @@ class HeadingHistory:
     def apart(self, turn: HeadingChange) -> float:
         """Rotation of a fix from the median of the history, rad; 0 with too few headings.
 
-        The gyros' heading suffers where ATTITUDE was lost in a turn, and the autopilot's own may
-        step: only what both contradict is a turn.
+        The gyros' heading has errors after lost ATTITUDE messages, and the autopilot's may step; a
+        rotation counts only if both show it.
         """
         newest = self._newest()
         if len(newest) < _LEAST:

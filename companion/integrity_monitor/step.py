@@ -28,10 +28,10 @@ _SPEED_MPS = 1.0  # what leads from one to the next may be off by
 
 @dataclass(frozen=True)
 class PositionStep:
-    """Offset of a position from its prediction. offset_m, velocity: (north, east), m, m/s.
+    """Offset of a position from its prediction.
 
-    sigma_m: of the position. allowed_m: what the offset may be; growth_m: of that, what the time
-    between the two adds; after_s: that time.
+    offset_m, velocity: (north, east), m, m/s; sigma_m: of the position; allowed_m: largest
+    explained offset; growth_m: part of it caused by the elapsed time after_s.
     """
 
     time_ns: int

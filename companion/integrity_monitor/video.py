@@ -198,10 +198,11 @@ _X, _Y = (_U - (WIDTH - 1) / 2) / WIDTH, (_V - (HEIGHT - 1) / 2) / WIDTH  # shar
 
 
 def picture_motion(a: Thumbnail, b: Thumbnail) -> ImageShift:
-    """Least-squares motion from a to b (48, 64): what shift, rotation and scale do at the edge.
+    """Least-squares motion from a to b (48, 64): displacement at the image's edge by shift,
+    rotation and scale.
 
-    Linear in the difference, so it is right for motions of a pixel of the thumbnail or less; what
-    moved farther comes out as more than nothing, which is all that is asked.
+    It is linear, so it is exact for motions up to a pixel of the thumbnail; larger motions give a
+    value that is wrong but not zero, which is sufficient.
     """
     mean = 0.5 * (a + b)
     gv, gu = np.gradient(mean)

@@ -42,9 +42,9 @@ class _RelayItem:
 
 
 class KlvRelay:
-    """A `PacketTap` that writes to `config.output` on a thread of its own.
+    """A `PacketTap` that writes to `config.output` on its own thread.
 
-    attitude: the aircraft's, NED from body (3, 3), at a time; None where it is not known.
+    attitude: the aircraft's, NED from body (3, 3), at a time; None if unknown.
     utc_minus_monotonic_ns: of this computer. Failures are counted and reported once.
     """
 

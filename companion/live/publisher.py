@@ -21,7 +21,7 @@ from companion.live.orders import OrderError, Orders
 from companion.live.pace import RateLimiter
 from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, encode
 from companion.live.shared import SharedMemory
-from companion.live.shown import Shot, Shown
+from companion.live.shown import ConsoleFrame, Shown
 
 _log = logging.getLogger(__name__)
 _MOST_CONSOLES = 3
@@ -68,10 +68,10 @@ class _Console:
 
 
 class Publisher:
-    """Serves the console's process at `path`.
+    """Serves the console's process at the socket `path`.
 
-    shown: makes the messages; orders: carries out what the console asks. Nothing here is called by
-    the flight but `start`, `stop` and `wake`, which only sets a flag.
+    shown: makes the messages; orders: executes the console's orders. The flight calls only `start`,
+    `stop` and `wake`, which sets a flag.
     """
 
     def __init__(self, path: Path, shown: Shown, orders: Orders, frames_hz: float) -> None:
@@ -220,7 +220,7 @@ class Publisher:
         if console.is_idle:
             self._next_answer(console)
 
-    def _show(self, console: _Console, shot: Shot) -> None:
+    def _show(self, console: _Console, shot: ConsoleFrame) -> None:
         try:
             if console.memory is None:
                 console.memory = SharedMemory()

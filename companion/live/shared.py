@@ -51,7 +51,7 @@ class SharedMemory:
         os.close(self._file)
 
 
-class Arrivals:
+class SharedMemoryReader:
     """The console's side: receives socket data and the file descriptor."""
 
     def __init__(self, connection: socket.socket) -> None:

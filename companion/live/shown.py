@@ -49,7 +49,7 @@ class Instruments:
 
 
 @dataclass(frozen=True)
-class Shot:
+class ConsoleFrame:
     """A frame for the console. parts: image (h, w, 3) uint8 and, with a map view, its rgb (h, w, 3)
     uint8 and depth (h, w) float32.
     """
@@ -154,7 +154,7 @@ class Shown:
         plain: dict[str, Any] = _plain(document)
         return plain, count
 
-    def take_frame(self) -> Shot | None:
+    def take_frame(self) -> ConsoleFrame | None:
         """The newest frame with its pose and map view; None if there is no new one."""
         with self._lock:
             paired, self._paired = self._paired, None
@@ -186,7 +186,7 @@ class Shown:
                     "camera": view.camera.to_dict(), "pose": _pose(view.world_from_camera)
                 }  # fmt: skip
                 parts += [view.rgb, view.depth]
-        return Shot(_plain(head), tuple(parts))
+        return ConsoleFrame(_plain(head), tuple(parts))
 
     def _is_unlocalized(self) -> bool:
         newest = self._estimate

@@ -54,10 +54,10 @@ _PLACE, _POINT = ("latitude_deg", "longitude_deg", "height_m"), ("east_m", "nort
 
 @dataclass(frozen=True)
 class RecordTables:
-    """A record's contents. health: last health.json, {} without one; notes: missing parts.
+    """A record's contents.
 
-    Of the settings only what a report needs is read, so that a record of an older or newer version,
-    with keys that this one does not know, can still be shown.
+    health: last health.json, {} without one; notes: missing parts. Only settings that a report
+    needs are read, so that records of other versions can be shown.
     """
 
     folder: Path
@@ -219,10 +219,10 @@ def load_record(
     tlog: Path | None = None,
     map_cache: Path | None = None,
 ) -> FlightRecord:
-    """Load a record to localize it again. `RecordError` says what is missing.
+    """Load a record to localize it again; `RecordError` says what is missing.
 
-    kept_share: of the localized frames that must have their picture; tlog, map_cache: instead of
-    the record's own.
+    kept_share: share of the localized frames that must have their image; tlog, map_cache: instead
+    of the record's own.
     """
     tables = read_record(folder)
     if not tables.manifest:

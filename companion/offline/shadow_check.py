@@ -55,7 +55,7 @@ _SEARCH_EVERY_NS = 5_000_000_000
 
 
 @dataclass(frozen=True)
-class ToldLine:
+class ReportedText:
     """A text that the operator would have received. at_s: since the first image, negative before
     it; alert: its identifier.
     """
@@ -85,7 +85,7 @@ class ShadowCheck:
     first_go_s: float | None
     score: ShadowScore
     held_s: dict[str, float]
-    lines: tuple[ToldLine, ...]
+    lines: tuple[ReportedText, ...]
     notes: tuple[str, ...]
 
     @property
@@ -224,7 +224,7 @@ class _Counts:
     first_go_s: float | None = None
     problem: str = ""
     held: Counter[str] = field(default_factory=Counter)
-    lines: list[ToldLine] = field(default_factory=list)
+    lines: list[ReportedText] = field(default_factory=list)
 
 
 class _Player:
@@ -337,7 +337,7 @@ class _Player:
         return fix
 
     def _told(self, of: Alert) -> None:
-        line = ToldLine(self._since_s(), severity(of), text(of), of.id.value)
+        line = ReportedText(self._since_s(), severity(of), text(of), of.id.value)
         self._counts.lines.append(line)
 
     def _since_s(self) -> float:

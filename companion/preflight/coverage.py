@@ -94,7 +94,7 @@ def check_origin(origin: OriginConfig, cache: TileCache) -> DoctorFinding:
     return DoctorFinding("bridge.origin", found, needed, why, good, True)
 
 
-def check_stand(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
+def check_vehicle_position(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
     """Findings if the vehicle's GNSS position is off the map, which is then the wrong map; empty if
     it is on the map or unknown.
     """

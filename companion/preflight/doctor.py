@@ -10,10 +10,10 @@ from pathlib import Path
 
 from companion.config import CompanionConfig
 from companion.errors import CompanionError, DetectorError
-from companion.preflight.coverage import check_mission, check_origin, check_stand
+from companion.preflight.coverage import check_mission, check_origin, check_vehicle_position
 from companion.preflight.heights import check_heights
 from companion.preflight.map_pin import require_pinned
-from companion.preflight.meanings import check_meanings, check_ports
+from companion.preflight.meanings import check_plausibility, check_ports
 from companion.preflight.places import check_places
 from companion.redaction import redacted
 from companion.sources import StreamState, open_source
@@ -42,11 +42,11 @@ def examine_deployment(
     feed: bool = True,
     say: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Run all checks. vehicle, feed: false leaves out flight controller or camera.
+    """Run all checks.
 
-    The feed is read while the vehicle is listened to: both are waiting. The localizer comes before,
-    alone: its compilers hold the interpreter, and the link's round trip would be theirs. say: takes
-    what is being done now.
+    vehicle, feed: false leaves out flight controller or camera. Feed and vehicle are checked in
+    parallel, after the localizer, whose compilation would delay the link. say: receives each step
+    as text.
     """
     say("reading the map")
     cache, findings = _check_map(config)
@@ -58,7 +58,7 @@ def examine_deployment(
         camera = aside.submit(_check_camera, config) if feed else None
         diagnosis = examine(config.bridge, say) if vehicle else None
         findings += [*([] if camera is None else [camera.result()]), _check_power()]
-    findings += [*check_places(config), *check_meanings(config)]
+    findings += [*check_places(config), *check_plausibility(config)]
     findings += check_ports(config) if feed else []  # beside a flight they are its own
     findings += _check_detector(config)
     if cache is not None and config.bridge.origin is not None:
@@ -67,7 +67,7 @@ def examine_deployment(
         found = diagnosis.findings
         findings += found
         if cache is not None and diagnosis.state is not None:
-            findings += check_stand(cache, diagnosis.state)
+            findings += check_vehicle_position(cache, diagnosis.state)
             findings += check_heights(cache, diagnosis.state)
         if cache is not None and found[0].ok:
             say("reading the mission")

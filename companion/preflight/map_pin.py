@@ -13,9 +13,8 @@ from localizer.plain_files import plain_bytes
 def map_hash(cache: Path) -> str:
     """SHA-256 of the map's manifest, in hexadecimal.
 
-    The manifest holds the index's hash and the index the tiles', so that it stands for all. The
-    manifest itself (origin, datum, geoid separation) is guarded by nothing else. `ConfigError` if
-    it cannot be read.
+    The manifest contains the index's hash, and the index those of the tiles, so it identifies the
+    whole map. `ConfigError` if it cannot be read.
     """
     path = cache / MANIFEST_NAME
     try:

@@ -15,7 +15,7 @@ _STEEP_ENOUGH_DEG = 10.0  # below the horizon, to see ground near by
 _SHORTEST_MS = 1.0  # less is no camera's, no link's and nobody's
 
 
-def check_meanings(config: CompanionConfig) -> list[DoctorFinding]:
+def check_plausibility(config: CompanionConfig) -> list[DoctorFinding]:
     """Advice about unusual settings."""
     return [*_arm(config), *_mount(config), *_lens(config), *_milliseconds(config)]
 

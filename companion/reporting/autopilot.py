@@ -25,10 +25,10 @@ class TimedTrack:
     points: np.ndarray
 
     def distance_to(self, estimates: Columns) -> np.ndarray:
-        """Horizontal distance (E,) of each accepted estimate, interpolated; NaN where none is near.
+        """Horizontal distance (E,) from each accepted estimate to the track, interpolated; NaN
+        without a near sample.
 
-        Between the camera and the vehicle: the lever arm is in it, and the message's own delay
-        times the speed.
+        It includes the lever arm, and the message's delay times the speed.
         """
         times = np.asarray(estimates["exposure_time_ns"])
         begin = int(self.time_ns[0])

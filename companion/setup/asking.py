@@ -24,7 +24,7 @@ class Seen:
     height: int
 
 
-def first_picture(source: str) -> Seen:
+def read_stream_size(source: str) -> Seen:
     """Read the frame size of a stream; `StreamError` if no frame arrives in time."""
     if "://" not in source and Path(source).is_dir():  # pictures are taken at their own size there
         height, width = read_image(list_images(Path(source))[0], _ANY_GREY).shape[:2]

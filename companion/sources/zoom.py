@@ -104,8 +104,8 @@ class ZoomedFrames:
     """Sets the camera model of every frame by its zoom, on the feed's thread; `factor` may be
     called from any.
 
-    level_at: the reported level at a time, None where it is not known. report: takes an alert for
-    the operator when the trouble begins and every ten seconds of it.
+    level_at: the reported zoom level at a time, None if unknown. report: receives an alert when a
+    problem begins, and every ten seconds while it lasts.
     """
 
     def __init__(

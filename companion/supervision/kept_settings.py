@@ -12,7 +12,7 @@ from companion.errors import ConfigError
 
 
 def keep(config: CompanionConfig) -> int:
-    """File descriptor of the deployment in memory, for child processes."""
+    """Keep the deployment in memory; returns a file descriptor that child processes inherit."""
     with open(os.memfd_create("deployment"), "wb") as file:
         # Escaped: a folder's name may be no UTF-8.
         file.write(json.dumps(config.model_dump(mode="json")).encode())

@@ -20,9 +20,9 @@ _PERIOD_S = 0.25
 class Pulse:
     """Writes ``NAME MILLISECONDS`` lines: the component whose last cycle is oldest, and its age.
 
-    beats: the CLOCK_MONOTONIC times of the parts' last turns, ns; none is older than the start: the
-    parts are made long before on a slow computer, and each begins with a wait. descriptor: of a
-    pipe's end, which is closed at the end. A supervisor that does not read is not waited for.
+    beats: times of the components' last cycles, CLOCK_MONOTONIC ns; ages count from the start at
+    the earliest. descriptor: of a pipe, closed at the end. A supervisor that does not read is not
+    waited for.
     """
 
     def __init__(self, beats: Callable[[], Mapping[str, int]], descriptor: int) -> None:

@@ -105,9 +105,9 @@ class Manager(Protocol):
 class Supervisor:
     """Starts, watches and restarts flight processes; `run` until the flight is over.
 
-    spawn: makes a process, flying at once or as a standby. tell: an alert to the
-    operator; mark: what the ``health.json`` of the process (id) is to say. manager: told on the
-    way. clock: monotonic seconds; pause: sleeps so many.
+    spawn: starts a process, flying (False) or as a standby (True). tell: sends an alert to the
+    operator; mark: writes a text to the ``health.json`` of a process id. manager: the service
+    manager. clock: monotonic seconds; pause: sleeps.
     """
 
     def __init__(

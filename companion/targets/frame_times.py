@@ -21,8 +21,8 @@ _SAME_S = 0.001  # presentation times that differ by less are of one picture
 class FrameTimes:
     """Gives each detection its frame's exposure time, at once or when the frame arrives.
 
-    A `PacketTap` that looks at presentation times alone. on_detection: takes what is timed; must
-    not block. unmatched counts what named a frame that never came. Safe to use from any thread.
+    A `PacketTap` that uses presentation times only. on_detection: receives detections with a time;
+    must not block. unmatched: number of detections whose frame never arrived. Thread-safe.
     """
 
     def __init__(self, on_detection: Callable[[Detection], None]) -> None:

@@ -42,11 +42,10 @@ class PoseHistory:
             return self._estimates[-1] if self._estimates else None
 
     def at(self, time_ns: int) -> PoseEstimate | None:
-        """The estimate at a time, interpolated between two neighbours if there is none.
+        """The estimate at a time, interpolated between two neighbours if there is none; it then has
+        the worse covariance and state of both, increased by the possible change of motion.
 
-        Between two, the worse covariance and state of both are told, and by how much the motion
-        may have changed between them. None outside of what is kept, and in a gap of more than a
-        second.
+        None outside the history, and in gaps above a second.
         """
         with self._lock:
             kept = list(self._estimates)

@@ -16,8 +16,8 @@ _MOST = 256  # names; many times as many as are followed at a time
 class TargetNumbers:
     """Gives each target's name a number: the click's own, or the next one for detections.
 
-    No number is two targets' of now, and none is given again before a million others. A name that
-    256 others came after is forgotten, since a detector makes new ones as long as it flies.
+    Numbers are unique, and are not reused before a million others. The 256 newest names are
+    remembered.
     """
 
     def __init__(self) -> None:

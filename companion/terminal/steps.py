@@ -18,7 +18,7 @@ READING = "reads the source"
 
 
 @contextmanager
-def shown_steps(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[Say]:
+def show_steps(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[Say]:
     """Context manager: a callback that shows the present step. In a log each step is a line with
     the seconds since the start.
     """
@@ -33,7 +33,7 @@ def shown_steps(console: Console, clock: Callable[[], float] = time.monotonic) -
 
 
 @contextmanager
-def shown_count(
+def show_count(
     console: Console, what: str, every_s: float = 5.0, begins: str = "begun"
 ) -> Iterator[Callable[..., None]]:
     """Context manager: a callback (done, total) for counted work: a bar, or a line every few
@@ -57,7 +57,7 @@ def shown_count(
 
 
 @contextmanager
-def shown_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[None]:
+def show_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[None]:
     """Context manager for work that cannot be counted: a spinner, or in a log a line after two
     seconds and then every ten.
     """

@@ -124,7 +124,7 @@ def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> 
     """Indices of frames whose ground point on the optical axis is consistent with most others:
     recorded position plus one map offset and one tilt error.
 
-    The point on the optical axis is used because position and tilt err together, and it does not.
+    This point is used because correlated errors of position and tilt cancel there.
     """
     which = [k for k, one in enumerate(localized) if one.pose is not None]
     placed = [k for k in which if priors[k].pose is not None and priors[k].height_known]

@@ -1,1 +1,1 @@
-"""Recorded sequences and the paper's measures."""
+"""Recorded sequences and the paper's error measures."""

@@ -1,7 +1,7 @@
-"""Roll, pitch and height as an autopilot would report them: drawn about the truth, seeded.
+"""Simulates an autopilot's roll, pitch and height: true values plus seeded random errors.
 
-A recorded sequence with true poses seldom has the autopilot's reports. To see what they add, they
-are drawn with a stated sigma.
+Recorded sequences with true poses seldom contain the autopilot's data. Simulated ones show how much
+such data improve the result.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from localizer.types import PosePrior
 
 @dataclass(frozen=True)
 class DrawnSensors:
-    """tilt_sigma_deg: of roll and pitch, per axis; height_sigma_m: of the height; None: not
-    reported. by_frame: every frame has errors of its own, as photos have; else they are constant,
-    as a gimbal's and a barometer's are over a flight.
+    """Errors of the simulated sensors. tilt_sigma_deg: of roll and pitch, per axis; height_sigma_m:
+    of the height; None: not measured. by_frame: independent errors for each frame, as for photos;
+    otherwise constant, as a gimbal's and barometer's in a flight.
     """
 
     tilt_sigma_deg: float | None = None
@@ -32,7 +32,7 @@ class DrawnSensors:
     seed: int = 0
 
     def rotation(self, truth: Pose, index: int) -> Array | None:
-        """(3, 3) world_from_camera as reported at a frame; the heading is the true one."""
+        """Simulated attitude (3, 3) world_from_camera of a frame; the heading is the true one."""
         if self.tilt_sigma_deg is None:
             return None
         tilt = self._rng(index).normal(0.0, np.radians(self.tilt_sigma_deg), 2)
@@ -40,14 +40,14 @@ class DrawnSensors:
         return rotation
 
     def height_m(self, truth: Pose, index: int) -> float | None:
-        """World z as reported at a frame."""
+        """Simulated height (world z, m) of a frame."""
         if self.height_sigma_m is None:
             return None
         error = self._rng(index).normal(0.0, 1.0, 3)[2]
         return float(truth.translation[2] + self.height_sigma_m * error)
 
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
-        """The settings with these sigmas."""
+        """The localizer's settings with these sigmas."""
         tilt = self.tilt_sigma_deg
         attitude = None if tilt is None else AttitudePrior.known_to(tilt)
         return config.model_copy(
@@ -69,7 +69,7 @@ class DrawnSensors:
         return AuxiliarySensors(rotation_at=rotation_at, height_at=height_at)
 
     def in_prior(self, prior: PosePrior, truth: Pose, index: int) -> PosePrior:
-        """A prior with roll, pitch and height as reported; its place and heading stay."""
+        """The prior with simulated roll, pitch and height; position and heading are unchanged."""
         pose, covariance = prior.world_from_camera, prior.covariance.copy()
         rotation, height_m = self.rotation(truth, index), self.height_m(truth, index)
         if rotation is not None and self.tilt_sigma_deg is not None:

@@ -1,4 +1,4 @@
-"""The paper's measures of localization (Sec. 4.2, Table 2): pure functions over error arrays."""
+"""The paper's error measures of localization (Sec. 4.2, Table 2) over error arrays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class LocalizationMetrics:
     max_rotation_deg: float | None = None
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """JSON-ready; a median over no frame is null."""
+        """JSON data; a median without frames is null."""
         return asdict(self)
 
 

@@ -1,4 +1,4 @@
-"""Beginning a sequence, and coming back from LOST, without a usable prior: by relocalization."""
+"""Starts a sequence, and recovers from LOST, by relocalization instead of a prior."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class KnownOfPlace:
 
 @dataclass(frozen=True)
 class PlaceFinder:
-    """Asks a relocalizer for the prior of a frame."""
+    """Searches the prior of a frame by a relocalizer."""
 
     relocalizer: Relocalizer
     known: KnownOfPlace

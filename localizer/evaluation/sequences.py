@@ -1,4 +1,4 @@
-"""Localizing recorded sequences: the paper's protocol (Sec. 4.1) from a perturbed prior."""
+"""Localizes recorded sequences by the paper's protocol (Sec. 4.1) from a perturbed prior."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class EvaluatedFrame:
-    """One frame's outcome. Errors are None where integrity accepted no estimate.
+    """Result of one frame. Errors are None if no estimate was accepted.
 
     estimate: None for an image that cannot be used (`problem` says why), or where no place is known
     (`searching`).
@@ -85,7 +85,7 @@ class EvaluatedFrame:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Error of a prior: up to so many metres and degrees, seeded. reported: adds the other sensors'
+    """Random error of a prior, up to so many metres and degrees. reported: adds simulated sensor
     data of a frame (`DrawnSensors.in_prior`).
     """
 
@@ -95,7 +95,7 @@ class Perturbation:
     reported: Callable[[PosePrior, Pose, int], PosePrior] = lambda prior, _truth, _index: prior
 
     def prior(self, truth: Pose, index: int, time_ns: int) -> PosePrior:
-        """The truth moved along and turned about random axes by uniform amounts."""
+        """The true pose, displaced and rotated about random axes by uniform amounts."""
         rng = np.random.default_rng((self.seed, index))
         offset = _random_vector(rng, self.translation_m)
         turn = _random_vector(rng, np.radians(self.rotation_deg))
@@ -122,14 +122,13 @@ def evaluate(
     progress: Callable[[int], None] = lambda _: None,
     find: FindPlace | None = None,
 ) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
-    """Localize every frame and measure it.
+    """Localize every frame of a sequence and compute errors and metrics.
 
-    mode ``first``: only the first frame's prior is known, as in the paper. ``each``: every frame
-    starts from its own perturbed truth. passes: how often a frame that starts from a perturbed
-    prior is rendered and registered, each time from the last result. A frame that is predicted
-    outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
-    `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
-    whenever it is lost or led nowhere, instead of the perturbed truth.
+    mode ``first``: only the first frame has a prior, as in the paper; ``each``: every frame starts
+    from its own perturbed true pose. passes: number of renderings and registrations of a frame that
+    starts from a perturbed prior, each from the last result. find: gives a prior at the start and
+    when the camera is lost, instead of the perturbed true pose. A frame outside the map or with an
+    unusable image counts as not localized; `OutsideMapError` or `SequenceError` if all frames are.
     """
 
     def begin(frame: Frame, index: int) -> bool:
@@ -213,8 +212,8 @@ def error_arrays(frames: list[EvaluatedFrame]) -> tuple[Array, Array]:
 
 
 def worst_first(frames: list[EvaluatedFrame]) -> list[int]:
-    """Indices of the localized frames from the largest position error down, then of the rejected
-    ones from the lowest quality up. Images that could not be used are not among them.
+    """Indices of localized frames by decreasing position error, then of rejected frames by
+    increasing quality. Unusable images are left out.
     """
 
     def place(index: int) -> tuple[bool, float]:
@@ -227,7 +226,7 @@ def worst_first(frames: list[EvaluatedFrame]) -> list[int]:
 
 
 def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[str, str]]:
-    """One dictionary per frame for a CSV file; a cell whose value is not known is ""."""
+    """Yield one dictionary per frame for a CSV file; unknown values are ""."""
     for f in frames:
         row = dict.fromkeys(CSV_COLUMNS, "") | {"name": f.name, "problem": f.problem}
         if f.estimate is not None:

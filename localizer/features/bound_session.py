@@ -1,4 +1,4 @@
-"""Runs a network with its outputs left in device memory (onnxruntime's I/O binding)."""
+"""Runs a network and keeps its outputs in device memory (onnxruntime's I/O binding)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from localizer.device_array import DeviceArray
 
 
 class BoundSession:
-    """A session whose outputs are allocated once per image size and written in place.
+    """A session whose outputs are allocated once per image size and reused.
 
-    device: onnxruntime's name of the memory, "cuda" or, in tests, "cpu". What `run` returns is
+    device: onnxruntime's name of the memory, "cuda" or, in tests, "cpu". The result of `run` is
     valid until the next call.
     """
 

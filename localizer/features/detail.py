@@ -1,8 +1,8 @@
-"""The detail level: what takes the registered pose from half a network cell to a tenth of a pixel.
+"""The finest feature level, which improves the registered pose from half a network cell to 0.1
+pixel.
 
-A network's finest level has a stride of 2 or more and features that are smooth over some pixels.
-Once the pose is known to a pixel, the image itself says more: brightness and its two derivatives
-at full resolution, each divided by the local contrast so that light, exposure and haze cancel.
+A network's levels have a stride of 2 or more. This one is the image at full resolution: brightness
+and its two derivatives, divided by the local contrast to remove light, exposure and haze.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Feature extractors: the shipped network in onnxruntime or OpenVINO, or the labelled fallback.
+"""Feature extractors: a network in onnxruntime or OpenVINO, or gradient features as a fallback.
 
 A model is two files: ``NAME.onnx`` and ``NAME.json``. The graph takes ``image`` (1, H, W, 3) uint8
-RGB with H and W divisible by the description's `multiple`, and gives for each level, coarse to
-fine, ``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w)
-float32 in (0, 1). The JSON file names the levels and carries the SHA-256 of the graph.
+RGB with H and W divisible by the description's `multiple`. For each level, coarse to fine, it gives
+``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w) float32
+in (0, 1). The JSON file names the levels and has the SHA-256 of the graph.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MOST_BYTES = 1 << 30
 
 
 class FeatureExtractor(Protocol):
-    """Turns an image into the feature pyramid of the paper's Sec. 3.3.1."""
+    """Computes the feature pyramid of an image (paper, Sec. 3.3.1)."""
 
     @property
     def name(self) -> str:
@@ -111,7 +111,7 @@ def read_model_info(model: Path) -> ModelInfo:
 
 
 class OnnxExtractor:
-    """A network in onnxruntime, on the best execution provider that starts.
+    """A network in onnxruntime, on the best execution provider that works.
 
     size: width and height of the images to come, for which it is warmed up. half: TensorRT may
     compute in float16. only: TensorRT, CUDA or CPU, instead of the best.
@@ -240,10 +240,10 @@ def load_extractor(
     size: tuple[int, int] | None = None,
     half: bool = False,
 ) -> FeatureExtractor:
-    """The extractor for `model`; None takes the shipped weights. Options: see `OnnxExtractor`.
+    """The extractor for `model`; None: the shipped weights.
 
-    Without shipped weights it is the gradient fallback, which says so in its name and in a warning.
-    A model that was asked for by path and is missing or corrupt raises `ModelError`.
+    Options: see `OnnxExtractor`. Without shipped weights the gradient extractor is used, with a
+    warning. `ModelError` if a given model is missing or corrupt.
     """
     if model is None:
         if not SHIPPED_MODEL.exists():

@@ -1,4 +1,4 @@
-"""Hand-made features: soft orientation histograms of the gradient, for when there is no network."""
+"""Gradient features (soft orientation histograms) for use without a network."""
 
 from __future__ import annotations
 

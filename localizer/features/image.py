@@ -1,4 +1,4 @@
-"""The check every extractor makes of its input."""
+"""Checks an extractor's input."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Intel's OpenVINO in onnxruntime's place, where the processor multiplies bfloat16 in hardware.
+"""Runs a network in Intel's OpenVINO, on processors with bfloat16 matrix units (AMX).
 
-With AMX the shipped network takes half of onnxruntime's time in float32. Without it OpenVINO is no
-faster, so it is not used. bfloat16 changes the shipped features by 1 % of their length. On the real
-and the generated sets no accuracy changed by more than its interval (docs/results/speed.md).
+There it halves the time of onnxruntime's float32. Without AMX it is no faster and not used.
+bfloat16 changes the features by 1 % of their length; accuracy did not change measurably on real or
+generated sets (docs/results/speed.md).
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""What runs a model: the first of TensorRT, CUDA, OpenVINO and CPU that does. All but OpenVINO are
-onnxruntime's execution providers.
+"""Selects what runs a model: the first of TensorRT, CUDA, OpenVINO and CPU that works.
+
+All but OpenVINO are onnxruntime's execution providers.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ class Session(Protocol):
         """All outputs, each with its name."""
 
     def get_providers(self) -> list[str]:
-        """Full names of what computes, the first choice first."""
+        """Full names of the execution providers, by priority."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What a session is to run: images of width x height pixels with sides divisible by `multiple`,
-    in float16 where TensorRT computes; sha256: of the model.
+    """The session's input: image size with sides divisible by `multiple`; half: float16 in
+    TensorRT; sha256: of the model.
     """
 
     width: int
@@ -63,8 +64,8 @@ def start_session(
     check: Callable[[Session], None],
     only: str | None = None,
 ) -> Session:
-    """A session on the best installed provider that starts and passes `check`, which runs the model
-    once: engines are built and algorithms chosen there, not at the first frame.
+    """Start a session on the best installed provider that works. check: runs the model once, so
+    that engines are built and algorithms chosen before the first frame.
 
     only: short name of the provider to use instead of the best. Each provider that does not run the
     model is one warning; TensorRT is tried again without what it kept, which may be damaged. Raises
@@ -99,7 +100,7 @@ def start_session(
 
 
 def available_providers() -> list[str]:
-    """Full names of what is installed and worth to be tried on this computer."""
+    """Full names of the usable execution providers on this computer."""
     return [*ort.get_available_providers(), *([_OPENVINO] if is_worthwhile() else [])]
 
 
@@ -130,7 +131,7 @@ def _line(error: Exception) -> str:
 
 
 def provider_of(session: Session) -> str:
-    """Short name of the provider that serves: TensorRT, CUDA, OpenVINO or CPU."""
+    """Short name of a session's provider: TensorRT, CUDA, OpenVINO or CPU."""
     name = str(session.get_providers()[0])
     return SHORT_NAMES.get(name, name.removesuffix("ExecutionProvider"))
 

@@ -1,1 +1,1 @@
-"""Forecast of the registration at a position, from the map."""
+"""Forecasts the registration at a pose, from the map alone."""

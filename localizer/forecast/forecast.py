@@ -1,4 +1,4 @@
-"""Forecast at one pose: frames of another day are drawn and registered as in flight."""
+"""Forecast at one pose: simulated frames of another day are registered as in flight."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from localizer.config import LocalizerConfig
 from localizer.features.extractor import FeatureExtractor
 from localizer.forecast.risk import RIGHT_M, WORST_M, Figures, expected_sigma_m, failure_risk
 from localizer.forecast.rivals import AmbiguousPosition, most_similar_rival
-from localizer.forecast.visit import another_visit
+from localizer.forecast.visit import simulate_visit
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.integrity.acceptance import is_acceptable
@@ -68,7 +68,7 @@ class Forecaster:
         self._config, self._draws = config, draws
 
     def at(self, pose: Pose, conditions: tuple[str, ...], seed: int) -> tuple[ViewForecast, ...]:
-        """One forecast per condition (`FORECAST_CONDITIONS`); the same seed gives the same."""
+        """One forecast per condition (`FORECAST_CONDITIONS`); deterministic for a seed."""
         rng = np.random.default_rng((71, seed))
         prior = prior_of(pose, rng)
         view = self._renderer.render(pose, self._camera, wait=True)
@@ -95,7 +95,7 @@ class Forecaster:
     ) -> ViewForecast:
         found, rival = [], AmbiguousPosition(0.0, 0.0)
         for draw in range(self._draws):
-            query = self._extractor.extract(another_visit(view, condition, rng))
+            query = self._extractor.extract(simulate_visit(view, condition, rng))
             found.append(self._optimizer.register(query, self._camera, anchors, prior, seed=draw))
             if draw == 0 and found[0].status is RegistrationStatus.OK:
                 origin = local_origin(anchors, view.world_from_camera)
@@ -133,20 +133,20 @@ class Forecaster:
         )
 
     def is_accepted(self, found: Registration, prior: PosePrior) -> bool:
-        """Whether a registration is accepted, as in flight."""
+        """Whether a registration would be accepted in flight."""
         gate = mahalanobis_squared(prior, found.world_from_camera, found.covariance)
         return is_acceptable(self._config.integrity, found, gate)
 
 
 def prior_of(truth: Pose, rng: np.random.Generator) -> PosePrior:
-    """A prior that errs as its `PRIOR_SIGMAS` say."""
+    """A random prior about the true pose with `PRIOR_SIGMAS`."""
     drawn = rng.normal(0.0, PRIOR_SIGMAS)
     begun = Pose(so3_exp(drawn[3:]) @ truth.rotation, truth.translation + drawn[:3])
     return PosePrior(begun, np.diag(PRIOR_SIGMAS**2), 0)
 
 
 def position_sigma_m(found: Registration) -> float:
-    """One axis, root mean square of the three; `WORST_M` at most, and where nothing was found."""
+    """RMS position sigma of one axis, m, at most `WORST_M`; `WORST_M` without a result."""
     if found.status is not RegistrationStatus.OK:
         return WORST_M
     return min(float(np.sqrt(np.trace(found.covariance[:3, :3]) / 3)), WORST_M)

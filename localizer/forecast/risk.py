@@ -1,7 +1,7 @@
-"""Convert simulated registrations to a forecast of a flight, by a model fitted on generated worlds.
+"""Converts simulated registrations to a forecast for real flights, by a fitted model.
 
-`SIGMA` and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its worlds for
-tuning: 276 legs over seven, and 60 legs over three of them. Its held-out worlds had no part in it.
+`SIGMA` and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its tuning worlds:
+276 legs over seven, and 60 legs over three of them. Its held-out worlds were not used.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ WEIGHTS = (1.431, 0.578, -0.631, 0.0, -2.07, 0.284, 0.211)
 
 @dataclass(frozen=True)
 class Figures:
-    """Of some draws at one view. sigma_m: median position sigma (one axis, rms), not yet scaled;
-    agreement, quality: means; map_share: of the picture; failed: share of the draws that were
-    refused or more than `RIGHT_M` off; error_m: their mean error, at most `WORST_M`.
+    """Statistics of simulated registrations at one view. sigma_m: median position sigma (one axis,
+    rms), not yet scaled; agreement, quality: means; map_share: of the image; failed: share rejected
+    or with an error above `RIGHT_M`; error_m: mean error, at most `WORST_M`.
     """
 
     sigma_m: float
@@ -41,7 +41,7 @@ class Figures:
 
 
 def predictors(figures: Figures) -> Array:
-    """(6,) what the logistic model weighs."""
+    """Inputs (6,) of the logistic model."""
     f = figures
     sigma, error = (np.log(np.clip(x, 0.01, WORST_M)) for x in (f.sigma_m, f.error_m))
     return np.array([sigma, f.agreement, f.quality, f.map_share, f.failed, error])
@@ -56,6 +56,6 @@ def expected_sigma_m(figures: Figures, constants: tuple[float, float] = SIGMA) -
 
 
 def failure_risk(figures: Figures, weights: Sequence[float] = WEIGHTS) -> float:
-    """Probability, 0 to 1, that a picture taken there is refused or more than `RIGHT_M` off."""
+    """Probability, 0 to 1, that a frame taken there is rejected or has an error above `RIGHT_M`."""
     constant, *slopes = weights
     return float(1.0 / (1.0 + np.exp(-(constant + np.dot(slopes, predictors(figures))))))

@@ -1,4 +1,4 @@
-"""Similarity of other positions: the best match at displaced poses."""
+"""Finds other positions at which the map looks similar."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class AmbiguousPosition:
 def most_similar_rival(
     optimizer: JNGO, levels: tuple[LevelProblem, ...], origin: Array, truth: Pose, width_m: float
 ) -> AmbiguousPosition:
-    """The position that looks most like the true one: poses on rings about it are refined, and the
-    best optimum that is apart from the true pose is taken.
+    """The other position that matches the view best: poses on rings about the true one are refined,
+    and the best optimum away from it is taken.
 
     levels: of the query, coarse to fine, the network's; origin: (3,) of their local frame;
     width_m: of the ground in view.

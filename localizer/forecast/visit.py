@@ -1,9 +1,8 @@
-"""Simulates a camera's view of a mapped place on another day: a rendered view, changed.
+"""Simulates a camera's view of the map on another day, by changing a rendered view.
 
-Geometry stays: light, weather and sensor are `localizer.synth.appearance`'s, the fine texture that
-two visits do not share is `localizer.synth.visits.texture`'s, as in training and in generated
-worlds. Shadows of another sun, and a map's own errors, are not drawn: `localizer.forecast.risk` is
-fitted on flights over worlds that have both.
+Geometry stays. Light, weather and sensor are `localizer.synth.appearance`'s, changes of the fine
+texture `localizer.synth.visits.texture`'s. Moved shadows and map errors are not simulated;
+`localizer.forecast.risk` is fitted on worlds that have both.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ _DRY = np.array([1.12, 1.0, 0.8], np.float32)  # grass and leaves out of season,
 _LEAST_CELL_M = 0.02
 
 
-def another_visit(view: RenderedView, condition: str, rng: np.random.Generator) -> Image:
-    """One draw (H, W, 3) of what the camera of `view` sees under one of `FORECAST_CONDITIONS`.
-    ValueError for another condition.
+def simulate_visit(view: RenderedView, condition: str, rng: np.random.Generator) -> Image:
+    """A simulated image (H, W, 3) of `view` under one of `FORECAST_CONDITIONS`; ValueError for
+    another condition.
     """
     if condition not in FORECAST_CONDITIONS:
         raise ValueError(f"condition {condition!r} is not one of {', '.join(FORECAST_CONDITIONS)}")

@@ -1,1 +1,1 @@
-"""Poses, cameras, the geodesy of a map's frame, and PiLoT's pose lines."""
+"""Poses, cameras, geodesy of the map's frame, and PiLoT's pose files."""

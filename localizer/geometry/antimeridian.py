@@ -1,7 +1,6 @@
 """Outlines across the 180th meridian, where longitude jumps from 180 to -180 degrees.
 
-The smallest and largest of such longitudes are the rest of the Earth, and a polygon of them runs
-around it.
+The minimum and maximum of such longitudes would span the rest of the Earth.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ class GeoBox:
     east: float
 
     def line(self) -> str:
-        """Where it is, in words."""
+        """The box as text."""
         return (
             f"latitude {self.south:.5f} to {self.north:.5f}, longitude {self.west:.5f} to "
             f"{self.east:.5f}"
@@ -30,25 +29,25 @@ class GeoBox:
 
 
 def wrapped(longitude_deg: float) -> float:
-    """The same longitude from -180 up to 180; 180 itself stays."""
+    """The longitude in [-180, 180); 180 itself stays."""
     return longitude_deg if abs(longitude_deg) <= 180.0 else beside(longitude_deg, 0.0)
 
 
 def beside(longitude_deg: float, reference_deg: float) -> float:
-    """The same longitude less than half the Earth from another; it may be beyond 180."""
+    """The longitude plus a multiple of 360 that is nearest to a reference; it may be beyond 180."""
     return longitude_deg + 360.0 * round((reference_deg - longitude_deg) / 360.0)
 
 
 def geo_box(places: Iterable[tuple[float, float]]) -> GeoBox:
-    """About places (latitude, longitude) less than half the Earth apart."""
+    """The box of positions (latitude, longitude) less than half the Earth apart."""
     latitudes, longitudes = zip(*places, strict=True)
     near = [beside(longitude, longitudes[0]) for longitude in longitudes]
     return GeoBox(min(latitudes), wrapped(min(near)), max(latitudes), wrapped(max(near)))
 
 
 def cut(ring: Sequence[Corner]) -> list[list[Corner]]:
-    """A convex outline (longitude, latitude; not closed) as one, or across the 180th meridian as
-    two that end there (RFC 7946, 3.1.9). What does not cross it comes back as it was.
+    """Cut a convex outline (longitude, latitude; not closed) at the 180th meridian: one or two
+    outlines (RFC 7946, 3.1.9).
     """
     near = [(beside(lon, ring[0][0]), lat) for lon, lat in ring]
     parts = []

@@ -1,7 +1,7 @@
-"""A camera: pinhole and lens (`localizer.geometry.lens`).
+"""Camera model: pinhole and lens distortion (`localizer.geometry.lens`).
 
-Pixel convention: the centre of the first pixel is (0.5, 0.5), the image spans [0, width] x
-[0, height]. OpenCV puts that centre at (0, 0); conversions to it happen here and nowhere else.
+Pixel convention: the centre of the first pixel is (0.5, 0.5), the image spans [0, width] x [0,
+height]. OpenCV puts that centre at (0, 0); only this module converts.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether a straight line may look bent."""
+        """Whether the lens has distortion."""
         return self.distortion_model != "opencv" or any(k != 0.0 for k in self.distortion)
 
     def is_like(self, other: Camera) -> bool:
@@ -205,8 +205,8 @@ class Camera:
         return places, maps[1].astype(np.uint16)
 
     def distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """The picture's tangents, by focal length and principal point its pixels, of rays' x / z
-        and y / z, any shape.
+        """Distorted image coordinates (pixels after focal length and principal point) of rays' x /
+        z and y / z, any shape.
         """
         if not self.is_distorted:
             return x, y
@@ -225,14 +225,14 @@ class Camera:
 
 
 def lens_fault(camera: Camera) -> str:
-    """Why the lens is impossible, "" if it is possible (`lens.fault`)."""
+    """Why the lens model is impossible, "" if it is possible (`lens.fault`)."""
     size = camera.width, camera.height
     return lens.fault(size, camera.rays, camera.project) if camera.is_distorted else ""
 
 
 def followed(pinhole: Camera, camera: Camera) -> Camera:
-    """The pinhole, at its own size, with the view of a (distorted) camera; `pinhole` itself while
-    the camera is the one that it was made for, at any size.
+    """The pinhole with the field of view of a (distorted, possibly zoomed) camera, at the pinhole's
+    size; unchanged if the camera is the one it was made for.
     """
     own = camera.without_distortion().resized(pinhole.width, pinhole.height)
     return pinhole if own.is_like(pinhole) else own

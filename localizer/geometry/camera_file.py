@@ -1,9 +1,8 @@
-"""A camera's numbers as files give them: this project's ``camera.json``, and the same of ROS,
-Kalibr, OpenCV and COLMAP.
+"""Reads camera parameters from files: this project's ``camera.json``, ROS, Kalibr, OpenCV and
+COLMAP.
 
-The lens model is what its name or its coefficients' names say. A model that is not known, a
-coefficient of no known model and a number of coefficients that the model does not have are refused:
-a lens that is cut to its known part gives positions that are metres off and look good.
+The lens model follows from its name or its coefficients' names. Unknown models and coefficients are
+rejected: a truncated model would give positions with errors of metres.
 """
 
 from __future__ import annotations
@@ -63,9 +62,9 @@ _READ = (
 
 
 def read_numbers(path: Path) -> dict[str, Any]:
-    """Numbers of one camera in a file, for `camera_numbers`: JSON, YAML (ROS ``camera_info``,
+    """Parameters of one camera in a file, for `camera_numbers`: JSON, YAML (ROS ``camera_info``,
     Kalibr's camchain, OpenCV's FileStorage) or COLMAP's ``cameras.txt``. `CameraError` if the file
-    is missing, cannot be read, or holds no such object.
+    is missing or has none.
     """
     try:
         text = plain_text(path)

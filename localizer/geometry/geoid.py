@@ -1,8 +1,8 @@
-"""How high the geoid is above the WGS84 ellipsoid: EGM96, which GNSS receivers count heights from.
+"""Height of the EGM96 geoid above the WGS84 ellipsoid; GNSS receivers use it for AMSL heights.
 
-`grids/egm96-15.npz` is every third value of the 5' grid that GeographicLib redistributes
-(egm96-5; EGM96 is a work of NIMA, NASA and Ohio State University, in the public domain): second
-differences of centimetres, (721, 1440) int16, from 90° south northwards, from 180° west eastwards.
+`grids/egm96-15.npz` is every third value of the 5' grid that GeographicLib redistributes (egm96-5;
+EGM96 is a work of NIMA, NASA and Ohio State University, in the public domain): second differences
+of centimetres, (721, 1440) int16, from 90° south northwards, from 180° west eastwards.
 """
 
 from __future__ import annotations

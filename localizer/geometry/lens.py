@@ -1,9 +1,9 @@
-"""Lens models: from a ray's tangents (x / z, y / z) to the picture's, and back.
+"""Lens models: undistorted coordinates (x / z, y / z) to distorted ones, and back.
 
 ``opencv``: Brown's k1 k2 p1 p2 k3; with k4 k5 k6 the rational model; with s1 s2 s3 s4 the thin
 prism; with tau_x tau_y the tilted sensor (OpenCV, calib3d). ``fisheye``: k1 k2 k3 k4 of Kannala and
-Brandt 2006 as ``cv2.fisheye`` has them: radius = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a the
-angle from the optical axis.
+Brandt 2006 as in ``cv2.fisheye``: radius = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a the angle
+from the optical axis.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _STEPS = 20
 
 
 def whole_coefficients(model: LensModel, given: tuple[float, ...]) -> tuple[float, ...]:
-    """The coefficients with zeros up to the model's next count, without zeros that only lengthen
-    it; ValueError for a number of them that the model does not have.
+    """The coefficients padded with zeros to the model's next count, without superfluous zeros;
+    ValueError for a number that the model does not have.
     """
     least, most = COUNTS[model][0], COUNTS[model][-1]
     used = max((i + 1 for i, k in enumerate(given) if k != 0.0), default=0)
@@ -56,7 +56,7 @@ def whole_coefficients(model: LensModel, given: tuple[float, ...]) -> tuple[floa
 
 
 def distorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tuple[Array, Array]:
-    """The picture's tangents of rays' tangents, any shape."""
+    """Distorted image coordinates of undistorted ones (x / z, y / z), any shape."""
     if model == "fisheye":
         r = np.hypot(x, y)
         angle = np.arctan(r)
@@ -76,7 +76,7 @@ def distorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tup
 
 
 def undistorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tuple[Array, Array]:
-    """Inverse of `distorted`; NaN where a fisheye's ray has no tangent."""
+    """Inverse of `distorted`; NaN for a fisheye ray at 90 degrees or more."""
     if model == "fisheye":
         r = np.hypot(x, y)
         angle = _fisheye_angle(k, r)
@@ -107,8 +107,8 @@ def _fisheye_angle(k: tuple[float, ...], radius: Array) -> Array:
 
 
 def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Project) -> str:
-    """Why such a lens is impossible; "" if it is possible. size: of the image, px; rays, project:
-    the camera's.
+    """Why a lens model is impossible; "" if it is possible. size: of the image, px; rays, project:
+    the camera's functions.
 
     Every pixel of a grid up to the picture's edges must have a ray that projects back onto it, and
     a straight line between two corners must not bow by more than a lens makes it.

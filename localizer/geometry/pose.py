@@ -1,7 +1,7 @@
-"""Rigid transforms: SO(3), SE(3), and the small `Pose` type that carries the geometry.
+"""Rigid transforms: SO(3), SE(3), and the type `Pose`.
 
-Conventions: a `Pose` named ``a_from_b`` maps points of frame b to frame a. Tangent vectors are
-``xi = (rho, phi)``: translation first (metres), rotation second (radians). Everything is float64.
+Conventions: a `Pose` named ``a_from_b`` maps points of frame b to frame a. Tangent vectors are ``xi
+= (rho, phi)``: translation first (metres), rotation second (radians). Everything is float64.
 """
 
 from __future__ import annotations

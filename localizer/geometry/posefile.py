@@ -97,7 +97,7 @@ def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:
 
 
 def pose_row(name: str, pose: Pose, frame: LocalFrame) -> PoseRow:
-    """Inverse of `pose_of_row`."""
+    """The pose file row of a pose world_from_camera; inverse of `world_from_camera`."""
     position = frame.position(pose.translation)
     R = _map_from_local(position, frame).T @ pose.rotation @ _OPENCV_FROM_OPENGL
     # R = Rz(yaw) Ry(roll) Rx(pitch): the middle angle is roll, from R[2, 0] = -sin(roll).

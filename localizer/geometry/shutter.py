@@ -1,7 +1,7 @@
-"""A rolling shutter: rows that are read out one after the other, by a camera that moves meanwhile.
+"""Rolling shutter: image rows are exposed one after the other while the camera moves.
 
-At 60 degrees a second a readout of 20 ms turns the camera by 1.2 degrees: the picture is stretched
-by 2 to 3 per cent, which a registration takes for three metres and one and a half degrees.
+At 60 degrees a second, a readout of 20 ms stretches the image by 2 to 3 per cent. Without
+correction the error is three metres and one and a half degrees.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Sweep:
 
     @classmethod
     def of(cls, rate: Array, velocity: Array, readout_ms: float) -> Sweep:
-        """Of an angular rate (3,), rad/s, and a velocity (3,), m/s, in world axes."""
+        """From angular rate (3,), rad/s, and velocity (3,), m/s, in world axes."""
         readout_s = 1e-3 * readout_ms
         return cls(np.asarray(rate) * readout_s, np.asarray(velocity) * readout_s)
 
     def matters(self, camera: Camera, depth_m: float) -> bool:
-        """Whether it moves anything in the picture of what is so far away."""
+        """Whether the motion displaces points at depth_m in the image."""
         angle = float(np.linalg.norm(self.turn) + np.linalg.norm(self.way) / max(depth_m, 1.0))
         return 0.5 * angle * max(camera.fx, camera.fy) > _LEAST_PX
 

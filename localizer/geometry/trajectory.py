@@ -1,7 +1,7 @@
-"""Trajectories: camera poses with names, times and covariances, and the files that hold them.
+"""Trajectories: camera poses with names, times and covariances, and their files.
 
-TUM's format (``time x y z qx qy qz qw``, seconds and metres) is what evo and most tools read. Poses
-in it are `world_from_camera` in the map's ENU frame, camera axes OpenCV.
+TUM's format (``time x y z qx qy qz qw``, seconds and metres) is read by evo and most tools. Its
+poses here are `world_from_camera` in the map's ENU frame, OpenCV camera axes.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Which estimates may be used, and how bad they may be: acceptance and confirmation."""
+"""Acceptance and confirmation of estimates, and their error bounds."""

@@ -1,10 +1,10 @@
-"""Which estimates may be used.
+"""Decides which estimates are accepted.
 
-An estimate is acceptable if the registration succeeded, enough anchors were seen, all evidence
+An estimate is accepted if the registration succeeded, enough anchors were seen, all evidence
 together shows the right position (`localizer.integrity.probability`), and it agrees with the
-prediction (Mahalanobis distance). A wide prior contains more positions that look similar, so it
-needs more evidence. A tentative track is refused if another focal length fits better.
-`localizer.tracking.states` derives the tracker's state from runs of acceptances and rejections.
+prediction (Mahalanobis distance). A wider prior contains more similar positions, so it needs more
+evidence. A tentative track is rejected if another focal length fits better.
+`localizer.tracking.states` derives the tracker's state from accepted and rejected estimates.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def is_acceptable(
     distance_squared: float,
     prior_sigma_m: float = 0.0,
 ) -> bool:
-    """Whether one registration may be used. distance_squared: Mahalanobis, from the prediction;
-    prior_sigma_m: of the prediction's horizontal place, the larger axis.
+    """Whether a registration is accepted. distance_squared: Mahalanobis, from the prediction;
+    prior_sigma_m: largest horizontal sigma of the prediction.
     """
     # What is not a number fails a comparison, so each must hold.
     if result.status is not RegistrationStatus.OK or not result.overlap >= config.min_overlap:
@@ -91,5 +91,5 @@ def is_acceptable(
 
 
 def ambiguity(config: IntegrityConfig, prior_sigma_m: float) -> float:
-    """Natural logarithm of how many places a prior of such a horizontal sigma holds."""
+    """Natural logarithm of the number of distinct positions within a prior's horizontal sigma."""
     return 2.0 * float(np.log(max(prior_sigma_m / config.ambiguity_sigma_m, 1.0)))

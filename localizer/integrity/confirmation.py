@@ -1,9 +1,8 @@
-"""Tests a found position with evidence that does not come from the search.
+"""Tests a position found by search with independent evidence.
 
-A wrong place that looks right looks right again in the next frame of the same view: three
-acceptances in a row are one piece of evidence. Independent of the search are the way that the
-vehicle flies on while the map still matches, the attitude that the autopilot knows by gravity and
-compass, and the displacement that it measures inertially.
+A wrong position that looks right looks right again in the next frames of the same view, so repeated
+acceptance proves little. Independent evidence is: continued matching while the vehicle moves on,
+the autopilot's attitude by gravity and compass, and its inertial displacement.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Consistency(Enum):
 
 @dataclass(frozen=True)
 class TentativeTrack:
-    """The first acceptance at a position that was found. covariance: (6, 6); time_ns: its exposure.
+    """The first accepted pose after a search. covariance: (6, 6); time_ns: its exposure.
 
     independent_prior: the proposal does not derive from our own fixes, such as an autopilot with
     healthy GNSS; agreement with it is evidence enough.
@@ -50,8 +49,8 @@ class TentativeTrack:
 
 @dataclass(frozen=True)
 class IndependentEvidence:
-    """What other sensors say. rotation: (3, 3) world_from_camera at the newest acceptance, or None;
-    displacement: (3,) metres since the probation began with its sigma (m), or None.
+    """Evidence of other sensors. rotation: (3, 3) world_from_camera at the newest acceptance, or
+    None; displacement: (3,) metres since the track became tentative, with its sigma (m), or None.
     """
 
     rotation: Array | None = None
@@ -66,7 +65,7 @@ def consistency_test(
     evidence: IndependentEvidence,
     config: IntegrityConfig,
 ) -> Consistency:
-    """The evidence after another acceptance at `pose`, covariance (6, 6)."""
+    """Test a tentative track by another accepted pose, covariance (6, 6), and evidence."""
     if evidence.rotation is not None and not _attitude_agrees(pose, evidence.rotation, config):
         return Consistency.CONTRADICTED
     moved = pose.translation - tentative_track.world_from_camera.translation

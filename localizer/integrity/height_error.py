@@ -1,10 +1,10 @@
-"""How wrong the map's heights are, learned from the images that register to it.
+"""Estimates the error of the map's heights from the registered images.
 
-A terrain or flat map lacks buildings and trees. Their parallax pulls a registered pose: the
-optimizer explains it by a tilt, a shift and a lower camera. How large these heights are shows in
-the same images: in the pattern in which the patches are displaced, and in how far the registered
-tilt and height are from what gravity and the barometer say. Each registration over new ground gives
-the likelihood of a few candidate values; their product over a flight is the posterior.
+A terrain or flat map lacks buildings and trees. Their parallax biases a registered pose by a tilt,
+a shift and a lower camera. The size of the missing heights shows in the displacements of the image
+patches, and in the difference of registered tilt and height from gravity and barometer. Each
+registration over new ground gives the likelihood of a few candidate values; their product over a
+flight is the posterior.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SURE_M = 0.065  # of a surface model: its prior falls by e at each
 def height_likelihood(
     patches: PatchDisplacements, pose: Pose, constraint: PoseConstraint | None
 ) -> Array | None:
-    """Log likelihood (K,) of each of `CANDIDATES_M`, up to a constant.
+    """Log likelihood (K,) of each of `CANDIDATES_M` for one registered image, up to a constant.
 
     The pose is marginalised (restricted maximum likelihood), the patches' noise is profiled. pose:
     at which the patches were measured; constraint: what other sensors know of it. None where the
@@ -85,8 +85,8 @@ def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array)
 
 @dataclass(frozen=True)
 class MapHeightError:
-    """Posterior of the spread of the heights that a map does not have. log_prior: (K,) by the map's
-    kind; evidence: (K,) log likelihood of the images so far, older ground counting less.
+    """Posterior of the RMS height that the map lacks. log_prior: (K,) by the map's kind; evidence:
+    (K,) log likelihood of the images so far, with less weight for older ground.
     """
 
     log_prior: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
@@ -94,7 +94,7 @@ class MapHeightError:
 
     @classmethod
     def prior(cls, expected_m: float | None) -> MapHeightError:
-        """Before the first image. expected_m: by the map's kind; None: nothing is known."""
+        """Before the first image. expected_m: by the map's kind; None if unknown."""
         if expected_m is None:
             return cls()
         if expected_m <= _SURE_M:
@@ -104,7 +104,7 @@ class MapHeightError:
 
     @classmethod
     def of_kind(cls, kind: MapKind | None) -> MapHeightError:
-        """Before the first image over a map of a kind, None where that is not known."""
+        """Before the first image over a map of a kind, None if unknown."""
         if kind is None:
             return cls()
         if kind.has_buildings:
@@ -113,7 +113,7 @@ class MapHeightError:
 
     @property
     def sigma_m(self) -> float:
-        """The spread to reckon with: root mean square over the posterior."""
+        """RMS missing height over the posterior, m."""
         total = self.log_prior + self.evidence
         weight = np.exp(total - total.max())
         return float(np.sqrt((weight * CANDIDATES_M**2).sum() / weight.sum()))

@@ -1,15 +1,12 @@
-"""Covariance of a registered pose from the displacements of its image's patches (registration.md,
-8a).
+"""Covariance of a registered pose from the displacements of image patches (registration.md, 8a).
 
-At the registered pose each patch of the image has a shift under which it matches the map best. If
-the map were right everywhere, these shifts would be noise of a fraction of a pixel. Where it is of
-another date or sensor they scatter more, and where the map lacks buildings and trees every roof is
-displaced by its parallax. Neighbouring patches on one roof err together, so counting anchors as
-independent makes a pose look ten times better known than it is.
-
-The pose follows the displacements by least squares, ``xi = (X'X)^-1 X'd``. So its covariance is
-``(X'X)^-1 X' W X (X'X)^-1``, where W has two parts: noise that is independent from patch to patch,
-measured from the displacements themselves, and heights that the map does not have.
+At the registered pose each patch has a shift at which it matches the map best. With a perfect map
+these shifts would be noise of a fraction of a pixel. If the map is of another date or sensor they
+scatter more, and if it lacks buildings and trees, parallax displaces every roof. Patches on one
+roof have the same error, so treating anchors as independent would make the sigma ten times too
+small. The pose follows the displacements by least squares, ``xi = (X'X)^-1 X'd``, with covariance
+``(X'X)^-1 X' W X (X'X)^-1``. W is the sum of independent noise per patch, measured from the
+displacements, and of the missing heights.
 """
 
 from __future__ import annotations
@@ -53,8 +50,8 @@ def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Arra
 
 
 def height_correlation(ground: Array) -> Array:
-    """(P, P) covariance of unknown heights at places (P, 2), m, whose spread is one: a part of each
-    block's own and a mean that all have.
+    """(P, P) covariance of unknown heights at positions (P, 2), m, with unit variance: one part per
+    block and one common part.
     """
     apart = ground[:, None] - ground[None]
     squared = np.einsum("ijk,ijk->ij", apart, apart)

@@ -1,10 +1,10 @@
-"""How probable it is that a registration shows the right position.
+"""Probability that a registration shows the right position.
 
 A wrong position can look right in one respect: low residuals over uniform land, or a few patches
-that agree on equal roofs. It seldom does in all respects. So one logistic regression over all the
-evidence gives the probability. It is fitted on labelled registrations of several maps, each with
-the same weight. `probability.json` holds its numbers, their data and how each set fared in a fit
-without it. ``python -m benchmarks.integrity FOLDER --fit`` makes it.
+that match similar roofs. It seldom does in all. So a logistic regression over all evidence gives
+the probability. It is fitted on labelled registrations of several maps with equal weights.
+`probability.json` has its weights, data, and cross-validation results. ``python -m
+benchmarks.integrity FOLDER --fit`` makes it.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class PlaceModel:
     bias: float
 
     def log_odds(self, features: Array) -> float:
-        """Natural log odds of being right, where right and wrong places are equally frequent."""
+        """Natural log odds of the right position, for equal prior probabilities."""
         return float(self.bias + self.weights @ ((features - self.mean) / self.spread))
 
 
 @cache
 def place_model(path: Path = MODEL) -> PlaceModel:
-    """The fitted model of a file."""
+    """Read the fitted model from a file."""
     data = json.loads(path.read_text(encoding="utf-8"))
     columns = [data["features"][name] for name in FEATURES]
     mean, spread, weights = (
@@ -52,7 +52,7 @@ def place_model(path: Path = MODEL) -> PlaceModel:
 
 
 def place_features(result: Registration) -> Array | None:
-    """(4,) evidence of a registration, in the order of `FEATURES`; None where it has no patches.
+    """Evidence (4,) of a registration, in the order of `FEATURES`; None without patches.
 
     Quality of the fit; how many patches match where they lie, beyond chance, in their sigmas; the
     whole image's match there over its matches beside, likewise; lead over the best other mode of
@@ -65,9 +65,9 @@ def place_features(result: Registration) -> Array | None:
 
 
 def evidence(quality: float, patches: int, share: float, peak: float, lead: float) -> Array:
-    """(4,) the features of these numbers of a `Registration` and its `PatchAgreement`. quality: 0
-    to 1; patches: their number; share: of those that agree, 0 to 1; peak: in standard deviations;
-    lead: share of the winner's cost.
+    """Evidence (4,) from the values of a `Registration` and its `PatchAgreement`. quality: 0 to 1;
+    patches: their number; share: of agreeing ones, 0 to 1; peak: in standard deviations; lead:
+    relative cost margin over the second-best mode.
     """
     return np.array(
         [
@@ -80,6 +80,6 @@ def evidence(quality: float, patches: int, share: float, peak: float, lead: floa
 
 
 def log_odds(result: Registration) -> float:
-    """Natural log odds that a registration shows the right place; -inf without evidence."""
+    """Natural log odds that a registration shows the right position; -inf without evidence."""
     features = place_features(result)
     return -np.inf if features is None else place_model().log_odds(features)

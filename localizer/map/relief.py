@@ -1,7 +1,7 @@
-"""How steeply a map's ground rises and falls: what lies beyond its edge will do so, too.
+"""Slope statistics of a map's ground, used to extrapolate beyond its edge.
 
-The odometry measures metres by its height above the ground. Where the map ends, that ground goes on
-at an unknown height, which is the less certain the farther off it is (odometry.md).
+Odometry scales with the height above the ground. Beyond the map the ground height is unknown, and
+the more uncertain the farther away (odometry.md).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MEAN_SHARE = 0.5  # mean over root mean square of heights that cover a quarter 
 
 
 def ground_uncertainty(index: TileIndex, kind: MapKind) -> GroundUncertainty:
-    """Of the ground in a map, and beyond its edge.
+    """Uncertainty of the ground height in a map and beyond its edge.
 
     The grade is the root mean square of rise over distance between the lowest points of tiles. A
     flat map and one of few tiles say nothing of it.

@@ -35,11 +35,11 @@ class SourceMesh:
 
 
 class TileSource(Protocol):
-    """One tile that can be imported by itself, in any process (so it pickles)."""
+    """One tile that can be imported in any process (it can be pickled)."""
 
     @property
     def name(self) -> str:
-        """How errors name it."""
+        """Name for errors."""
         ...
 
     def load(self) -> Sequence[SourceMesh]:
@@ -108,14 +108,14 @@ class FlatTree:
 
     @classmethod
     def of(cls, source: SourceTree) -> FlatTree:
-        """Of a tree."""
+        """Flatten a tree."""
         nodes = list(source.root.walk())
         bare = tuple(replace(node, children=[]) for node in nodes)
         counts = tuple(len(node.children) for node in nodes)
         return cls(replace(source, root=bare[0]), bare, counts)
 
     def tree(self) -> SourceTree:
-        """The tree again."""
+        """Rebuild the tree."""
         done: list[SourceNode] = []  # children before their parents, the first on top
         for node, count in zip(reversed(self.nodes), reversed(self.counts), strict=True):
             children = [done.pop() for _ in range(count)]

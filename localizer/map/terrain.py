@@ -1,8 +1,7 @@
 """Terrain model: ground heights where the map has no surface.
 
-Any GeoTIFF of heights will do (Copernicus' 30 m, a surveyed one; `companion map fetch` brings
-some). Its datum plays no part: the odometry takes it for the shape of the ground and not for its
-height (docs/explanation/odometry.md).
+It may be any GeoTIFF of heights (Copernicus' 30 m, a survey; `companion map fetch` downloads some).
+Its datum is irrelevant: odometry uses the shape of the ground only (docs/explanation/odometry.md).
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ class TerrainGrid:
 
 
 def open_terrain(path: Path, frame: LocalFrame) -> TerrainGrid:
-    """The part of a GeoTIFF of heights that lies within 20 km of a map's origin.
+    """Read the part of a height GeoTIFF within 20 km of a map's origin.
 
     MapSourceError: no such raster, no coordinate system, nothing known there, or no heights.
     """

@@ -29,7 +29,7 @@ class GrowthModel:
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """When a keyframe is left, which registrations count, and how errors grow."""
+    """Limits for keyframes and registrations, and error growth."""
 
     anchors: int = 3000  # anchors per keyframe
     min_overlap: float = 0.35  # share of a keyframe's anchors in view of a usable frame

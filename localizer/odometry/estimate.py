@@ -14,7 +14,7 @@ from localizer.types import FeaturePyramid
 
 
 class OdometryStatus(Enum):
-    """Whether a frame carried the pose on, and why not."""
+    """Whether the pose was propagated to a frame, and why not."""
 
     OK = "carried on"
     UNUSABLE_IMAGE = "the picture shows nothing that could be registered"
@@ -41,7 +41,7 @@ class OdometryFrame:
 
 @dataclass(frozen=True)
 class OdometryEstimate:
-    """The odometry's answer for one frame.
+    """The odometry's result for one frame.
 
     world_from_camera: the camera's pose; what is predicted, if the status is not OK. covariance:
     (6, 6) as `PosePrior`'s, the beginning's included. quality: 0 to 1, of the registration against

@@ -22,7 +22,7 @@ _LEAST_ABOVE_M = 1.0
 
 @dataclass(frozen=True)
 class GroundUncertainty:
-    """By how much the ground may lie higher or lower than the odometry takes it to, 1 sigma.
+    """Uncertainty of the ground height that odometry assumes, 1 sigma.
 
     grade: m for each metre from where the ground was last known (`localizer.map.relief`); of hills,
     where nothing is known. missing_m: mean height of what the map lacks. model_m: a terrain model's
@@ -68,7 +68,7 @@ class RaisedGround:
 
     @classmethod
     def onto(cls, ground: TerrainModel, points_world: Array) -> RaisedGround:
-        """So that it lies under surface points (N, 3) as ground does, e.g. the map's last ones."""
+        """Raise `ground` so that it fits surface points (N, 3), e.g. the map's last ones."""
         above = points_world[:, 2] - ground.height(points_world[:, 0], points_world[:, 1])
         return cls(ground, float(np.quantile(above, _LOW_SHARE)))
 
@@ -78,7 +78,7 @@ class RaisedGround:
 
 
 class RangefinderGround:
-    """Ground by a rangefinder: a plane at the height of the lowest recent surface.
+    """Ground height by a rangefinder: a plane at the height of the lowest recent surface.
 
     One beam meets roofs and crowns, too, and a picture's depth from a roof would be short by it; so
     of the last readings those count that are as low as what counts as ground elsewhere.
@@ -104,7 +104,7 @@ class RangefinderGround:
 def height_above_ground(
     points_world: Array, covariance: Array, place: Array
 ) -> tuple[float, float]:
-    """Of a camera at a place (3,) above points (N, 3) on the ground: mean and sigma, m.
+    """Mean and sigma (m) of a camera's height at `place` (3,) above ground points (N, 3).
 
     covariance: (3, 3) of the place. Beside its mean place the ground is taken to go on
     with the slope that it has in view.
@@ -119,7 +119,7 @@ def height_above_ground(
 def ground_points(
     ground: TerrainModel, world_from_camera: Pose, camera: Camera, pixels: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Where the rays of pixels (N, 2) meet the ground: points (N, 3), and which do at all (N,)."""
+    """Intersections of pixels' rays (N, 2) with the ground: points (N, 3), and a mask (N,)."""
     rays = camera.rays(pixels) @ world_from_camera.rotation.T
     steep = -rays[:, 2] > _LEAST_DOWN * np.linalg.norm(rays, axis=1)
     down = np.where(steep, rays[:, 2], -1.0)

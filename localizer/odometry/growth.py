@@ -15,7 +15,7 @@ from localizer.types import PosePrior
 
 
 def carried(covariance: Array, lever: Array) -> Array:
-    """Covariance (6, 6) of a pose that is known exactly relative to another one of `covariance`.
+    """Covariance (6, 6) of a pose that is known exactly relative to another with `covariance`.
 
     lever: (3,) position relative to the other's, world axes. A small turn of the other one moves
     this one by ``turn x lever``.
@@ -27,17 +27,18 @@ def carried(covariance: Array, lever: Array) -> Array:
 
 
 def walked(model: GrowthModel, way_m: float) -> Array:
-    """Covariance (6, 6) that `way_m` metres add, beside the registrations' own."""
+    """Covariance (6, 6) that `way_m` metres of flight add beyond the registrations'."""
     rates = np.array([model.horizontal, model.horizontal, model.vertical,
                       model.tilt, model.tilt, model.heading])  # fmt: skip
     return np.diag(rates**2 * max(way_m, 0.0))
 
 
 def stretched(known: Array, scale: float, displacement: Array) -> Array:
-    """Covariance (3, 3) of what errors of scale add, after one more displacement (3,).
+    """Covariance (3, 3) of position from scale errors, after another displacement (3,).
 
-    scale: its sigma, a share. How alike two stretches of ground err is not known: the bound holds
-    for any correlation (covariance intersection), and is exact for one scale along a straight line.
+    scale: relative sigma. The correlation between two stretches of ground is unknown, so the sum is
+    bounded for any correlation (covariance intersection); it is exact for one scale along a
+    straight line.
     """
     added = scale * displacement
     before, size = float(np.sqrt(np.trace(known))), float(np.linalg.norm(added))
@@ -49,11 +50,11 @@ def stretched(known: Array, scale: float, displacement: Array) -> Array:
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
-    """The pose after another sensor's word on it (height, roll and pitch, heading), axis by axis.
+    """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis.
 
-    Such a sensor's error stays from frame to frame and does not average out. So it is heard only
-    where less is known than it knows, and then no better is known than it knows: with the noise
-    ``R P / (P - R)`` instead of its own R, a variance P becomes R, however often it is asked.
+    The sensor's error is constant over frames and does not average out. So a variance P larger than
+    the sensor's R becomes R, however often it is measured, by an update with the noise ``R P / (P -
+    R)``; a smaller one is unchanged.
     """
     if constraint is None:
         return pose, covariance
@@ -75,10 +76,10 @@ def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> t
 
 
 def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
-    """The pose after an independent measurement of single axes: Kalman's update.
+    """The pose after an independent measurement of single axes: a Kalman update.
 
-    What hangs on those axes moves with them: a turn that is known better mends the position that
-    the registration took it for. covariance: (6, 6) of the pose before.
+    Correlated axes are corrected, too: a better rotation also corrects the position. covariance:
+    (6, 6) of the pose before.
     """
     information = np.diag(constraint.information)
     known = np.flatnonzero(information > 0)
@@ -97,7 +98,7 @@ def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[
 def since(
     then: PoseConstraint, now: PoseConstraint, pose: Pose, turn_sigma: Array, rise_sigma: float
 ) -> PoseConstraint | None:
-    """What two sensors' words say of the way between them, as a constraint on the later pose.
+    """Constraint on a later pose from the change between two sensor constraints.
 
     pose: the earlier one, taken as exact. turn_sigma: (3,) rad, rise_sigma: m. None where they
     have nothing in common.
@@ -123,7 +124,8 @@ def _knows_rotation(constraint: PoseConstraint) -> bool:
 def without_constant_error(
     constraint: PoseConstraint, then: PoseConstraint, pose: Pose
 ) -> PoseConstraint:
-    """A constraint less the error that its like had `then`, at the true `pose`.
+    """A constraint corrected by the error that the same sensor had at constraint `then`, where the
+    true pose was `pose`.
 
     Of the height; of the heading, about the vertical (compass); and of the rest of the rotation, in
     the camera's axes (mounting of autopilot and gimbal).
@@ -142,13 +144,13 @@ def without_constant_error(
 
 
 def knows_height(constraint: PoseConstraint) -> bool:
-    """Whether it knows the height, and not the place besides."""
+    """Whether it constrains the height and not the horizontal position."""
     information = np.diag(constraint.information)
     return bool(information[2] > 0 and not information[:2].any())
 
 
 def distance_squared(prior: PosePrior, pose: Pose, covariance: Array) -> float:
-    """Squared Mahalanobis distance of a pose of `covariance` (6, 6) from a prior, 6 dof."""
+    """Squared Mahalanobis distance (6 dof) of a pose with `covariance` (6, 6) from a prior."""
     known = prior.world_from_camera
     difference = np.concatenate(
         [pose.translation - known.translation, so3_log(pose.rotation @ known.rotation.T)]
@@ -157,7 +159,7 @@ def distance_squared(prior: PosePrior, pose: Pose, covariance: Array) -> float:
 
 
 def tilt_and_heading(turn: Array) -> Array:
-    """A turn (3, 3) as a small rotation vector (x, y) followed by one about the vertical (z).
+    """Split a rotation (3, 3) into a small rotation vector (x, y) and one about the vertical (z).
 
     A compass may be far off: the difference in tilt must not be told in its axes.
     """

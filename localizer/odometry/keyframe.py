@@ -1,4 +1,4 @@
-"""Keyframes: features of an earlier frame on surfaces of known shape."""
+"""Keyframes: an earlier frame's features with known 3-D positions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LEAST_MAP_SHARE = 0.5  # of the anchors, for errors to grow as with the map's g
 
 
 class DepthSource(Enum):
-    """Where a keyframe's depth comes from, for the most part."""
+    """Main source of a keyframe's depth."""
 
     MAP = "the map's geometry"
     GROUND = "the ground's height"
@@ -109,7 +109,7 @@ def _require_host(features: FeaturePyramid) -> None:
 def in_view(
     points: Array, pose: Pose, camera: Camera, sweep: Sweep | None = None
 ) -> tuple[Array, Array]:
-    """Those of the points (N, 3) that the camera sees off its border, with their pixels.
+    """The points (N, 3) that the camera sees inside its border, with their pixels.
 
     sweep: the camera's motion while its rows are read out.
     """

@@ -1,4 +1,4 @@
-"""Visual odometry: carries the pose on where the map does not match (odometry.md)."""
+"""Visual odometry: propagates the pose where the map does not match (odometry.md)."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class VisualOdometry:
 
     @property
     def ready(self) -> bool:
-        """Whether there is a beginning to step from."""
+        """Whether there is a start pose for `step`."""
         return self._beginning is not None
 
     def begin(
@@ -95,7 +95,7 @@ class VisualOdometry:
         surface: Array | None = None,
         constraint: PoseConstraint | None = None,
     ) -> None:
-        """A frame whose pose is known by other means: the map, or the last fix before the loss.
+        """Set a frame with a known pose, from the map or from the last fix before the loss.
 
         pose: world_from_camera, with its covariance (6, 6) as `PosePrior`'s. velocity: (3,) m/s,
         world axes. surface: (N, 3) world points of the map's surfaces there, the anchors of the
@@ -117,7 +117,7 @@ class VisualOdometry:
                 self._ground = RaisedGround.onto(self._terrain, surface)
 
     def forget(self) -> None:
-        """Nothing is known any more: `step` needs a new beginning."""
+        """Reset; `step` needs a new `begin`."""
         self._beginning = self._keyframe = self._track = None
 
     def step(
@@ -129,7 +129,7 @@ class VisualOdometry:
         constraint: PoseConstraint | None = None,
         clearance_m: float | None = None,
     ) -> OdometryEstimate:
-        """The pose of the next frame.
+        """Estimate the pose of the next frame.
 
         prediction: of the motion model, at the frame's time, that was fed with the last estimates
         of this odometry; None: constant velocity, turned by the constraint's turn. surface: (N, 3)

@@ -43,7 +43,7 @@ _RADIAN_M = 100.0  # weighs turns against shifts where the axes of a covariance 
 
 @dataclass(frozen=True)
 class ParallaxView:
-    """A picture's features, its pose, world_from_camera, and its pinhole."""
+    """An image's features, its pose world_from_camera, and its pinhole."""
 
     features: FeaturePyramid
     pose: Pose

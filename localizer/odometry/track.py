@@ -65,7 +65,7 @@ class OdometryTrack:
     def ahead(
         self, config: OdometryConfig, time_ns: int, constraint: PoseConstraint | None
     ) -> PosePrior:
-        """Constant velocity, turned by what the sensors say."""
+        """Predict: constant velocity, with the rotation that the sensors measure."""
         dt = seconds(self.time_ns, time_ns)
         rotation, aided = self.pose.rotation, aided_rotation(constraint)
         if aided is not None and self.aided_rotation is not None:
@@ -77,7 +77,7 @@ class OdometryTrack:
 
 
 def growth_of(config: OdometryConfig, source: DepthSource) -> GrowthModel:
-    """The model of growth for a source of depth."""
+    """The error growth model for a depth source."""
     return {
         DepthSource.MAP: config.with_map,
         DepthSource.GROUND: config.with_ground,
@@ -87,7 +87,7 @@ def growth_of(config: OdometryConfig, source: DepthSource) -> GrowthModel:
 
 
 def fault(config: OdometryConfig, result: Registration, prior: PosePrior) -> str:
-    """Why a registration is not used; "" if it is."""
+    """Why a registration is rejected; "" if it is used."""
     if result.status is not RegistrationStatus.OK:
         return str(result.status.value)
     if result.quality < config.min_quality:
@@ -137,11 +137,11 @@ def followed(
 
 
 def aided_rotation(constraint: PoseConstraint | None) -> Array | None:
-    """The rotation that a constraint knows."""
+    """Rotation (3, 3) of a constraint; None if it has none."""
     known = constraint is not None and bool(np.diag(constraint.information)[3:].all())
     return constraint.world_from_camera.rotation if known and constraint is not None else None
 
 
 def seconds(begin_ns: int, end_ns: int) -> float:
-    """From nanoseconds."""
+    """Seconds between two times in nanoseconds."""
     return (end_ns - begin_ns) * 1e-9

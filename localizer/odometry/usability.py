@@ -1,7 +1,7 @@
-"""Whether an image can be registered at all, decided before any feature is computed.
+"""Checks whether an image can be registered at all, before features are computed.
 
-The image alone decides, without a map: a covered lens, cloud, night without gain, a lens against
-the sun, motion blur of a fast turn, or a stream that repeats one frame.
+It uses the image alone: covered lens, cloud, night without gain, sun in the lens, motion blur, or a
+repeated frame.
 """
 
 from __future__ import annotations
@@ -65,14 +65,14 @@ class Usability:
 
     @property
     def usable(self) -> bool:
-        """Whether there is something to register."""
+        """Whether it can be registered."""
         return self.fault is None
 
 
 def examine(
     image: Image, previous: Image | None = None, config: UsabilityConfig | None = None
 ) -> Usability:
-    """The verdict on a picture (H, W, 3) uint8 RGB; previous: the stream's picture before it.
+    """Check an image (H, W, 3) uint8 RGB; previous: the stream's image before it.
 
     Takes a fraction of a millisecond at the working size.
     """

@@ -1,8 +1,8 @@
-"""Whether the parts of an image agree on a pose (registration.md, section 8a).
+"""Checks whether the patches of an image agree on a pose (registration.md, section 8a).
 
-At the right pose nearly every part of the image matches best without a shift. A wrong pose is a
-compromise between parts that would each match better elsewhere: its cost may be low over uniform
-land, but few parts agree with it.
+At the right pose nearly every patch matches best without a shift. A wrong pose is a compromise
+between patches that would match better elsewhere: its cost may be low over uniform land, but few
+patches agree.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class PatchAgreement:
 
 
 def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> PatchAgreement:
-    """How the patches of the image agree on a pose camera_from_local; problem: a level and some of
-    its anchors.
+    """Test how many patches of the image agree on a pose camera_from_local. problem: a level and
+    some of its anchors.
     """
     grid = _patch_grid(problem, rotation, translation)
     able = grid.anchors >= _LEAST_ANCHORS

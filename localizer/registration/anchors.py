@@ -122,7 +122,7 @@ def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
 
 
 def swept(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> Anchors:
-    """The anchors, moved to where a picture whose rows were read out one after the other has them.
+    """The anchors, displaced as a rolling shutter shows them.
 
     pose: where the camera is thought to be (in the middle of the readout); some degrees beside it
     change the rows, and so the places, by centimetres. None: all rows at once, nothing moves.

@@ -1,7 +1,7 @@
-"""The uncertainty of a pose that camera model and survey cause.
+"""Pose uncertainty from errors of camera model and map survey.
 
-No image shows it: if the principal point is a pixel off, the residuals are as small, and the
-position is a quarter of a metre off at 120 m, in every frame.
+The residuals do not show them: a principal point error of a pixel leaves them unchanged and moves
+the position by a quarter of a metre at 120 m, in every frame.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ _LEAST_EIGENVALUE = 1e-9  # of the scaled normal equations, below which no pose 
 
 
 class CalibrationSigmas(BaseModel):
-    """One sigma of each number of the camera's model, as its calibration leaves them, and of the
-    map's surface, as its survey does.
-    """
+    """One sigma of each camera parameter after calibration, and of the map's surface."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -49,7 +47,7 @@ def calibration_covariance(
     sigmas: CalibrationSigmas, points_world: Array, pose: Pose, camera: Camera,
     sweep: Sweep | None, moving: tuple[Array, Array],
 ) -> Array:  # fmt: skip
-    """Covariance (6, 6), as `PosePrior`'s, of a registered pose by the model's errors.
+    """Covariance (6, 6), as `PosePrior`'s, of a registered pose from camera and map errors.
 
     Each number that is off by a sigma moves every point's pixel; the pose gives way by least
     squares over the points in view, ``(sum J'J)^-1 sum J'c``, and the numbers fail independently.

@@ -52,12 +52,12 @@ class JNGOConfig:
 
     @property
     def settings(self) -> LMSettings:
-        """What the backends need of it."""
+        """Settings for the backends."""
         return LMSettings(self.huber, damping=self.damping, min_overlap=self.min_overlap)
 
     @property
     def noise(self) -> NoiseModel:
-        """What the covariance needs of it."""
+        """Noise model for the covariance."""
         return NoiseModel(
             self.correlation,
             self.covariance_floor,

@@ -140,7 +140,7 @@ def mean_motion(projection: Array) -> Array:
 
 
 def curvature_steps(motion: Array, distance_px: float) -> Array:
-    """(13, 6) values of xi: none, then each axis to and fro by what moves the image so far."""
+    """(13, 6) values of xi: zero, and each axis to and fro by distance_px in the image."""
     reach = np.diag(distance_px / np.sqrt(np.maximum(np.diag(motion), 1e-12)))
     return np.concatenate([np.zeros((1, 6)), reach, -reach])
 

@@ -21,7 +21,7 @@ _TRIAL_CHANNELS = 32  # the networks'
 
 
 def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
-    """The backend for a choice of device; it always gives one.
+    """Open the backend for a choice of device; falls back to the CPU.
 
     A GPU is tried: driver, run-time compiler, and a small problem. Where anything of that fails the
     CPU takes over, and one log line says why: a warning if the GPU was asked for or is there but
@@ -46,7 +46,7 @@ def _on_the_cpu(error: BackendError, level: int, threads: int) -> Backend:
 
 
 def trial(backend: Backend, channels: int) -> None:
-    """One step on a small random problem: compiles or loads what `channels` needs."""
+    """Run one step on a small random problem, to compile or load the kernels."""
     rng = np.random.default_rng(0)
     problem = LevelProblem(
         rng.standard_normal((8, 8, channels)).astype(np.float32),

@@ -1,9 +1,8 @@
-"""Knowledge about the camera pose from other sensors, as residuals of the registration.
+"""Other sensors' knowledge of the camera pose, as constraints of the registration.
 
-Each function gives a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
-(docs/explanation/registration.md, section 9). All are optional and none is used unless it is given.
-`fused` takes one into a registered pose afterwards: there each has its honest weight, because the
-pose's covariance says what the image cannot tell.
+Each function makes a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
+(docs/explanation/registration.md, section 9). `fused` applies one to a registered pose afterwards,
+weighted by the pose's covariance.
 """
 
 from __future__ import annotations
@@ -109,12 +108,12 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
-    """The pose after another sensor's knowledge of it. covariance: (6, 6).
+    """The pose after a constraint of another sensor was applied.
 
-    Such a sensor's error (mounting, gimbal, air pressure) stays from frame to frame and does not
-    average out. So it is used only where less is known than it knows, and then no better is known
-    than it knows: along each principal direction a variance P > R becomes R, with the noise
-    ``R P / (P - R)``. The odometry follows the same rule, axis by axis (`odometry.growth.fused`).
+    covariance: (6, 6). The sensor's error (mounting, gimbal, air pressure) is constant over frames
+    and does not average out. So along each principal direction a variance P larger than the
+    sensor's R becomes R, by an update with the noise ``R P / (P - R)``; a smaller one is unchanged.
+    `odometry.growth.fused` follows the same rule.
     """
     rows, values = constraint_rows(constraint, pose)
     known = rows @ covariance @ rows.T

@@ -25,7 +25,7 @@ from localizer.types import PosePrior, RegistrationStatus
 
 @dataclass(frozen=True)
 class Registration:
-    """A registered pose, or the prior's with the reason why not.
+    """A registered pose; after a failure the prior's, with the reason in `status`.
 
     covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
     better, inf on failure.
@@ -113,7 +113,7 @@ def _lead(scores: Array, other: NDArray[np.bool_]) -> float:
 
 
 def failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:
-    """The prior, with the reason why there is nothing better."""
+    """A failed registration: the prior's pose and the reason."""
     return Registration(
         prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, evaluations
     )

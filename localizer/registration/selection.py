@@ -1,6 +1,5 @@
-"""Selection among the hypotheses between the refinements (registration.md, 7).
-
-Which are distinct, how probable, how good against chance, and how large their residuals are.
+"""Selection of hypotheses between refinements (registration.md, 7): distinct modes, their
+probability, quality and residuals.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> A
 
 
 def thinned(problem: LevelProblem, count: int) -> LevelProblem:
-    """The problem with about `count` of its anchors: every k-th of the Morton order, so spread."""
+    """The problem with about `count` of its anchors, evenly spread (every k-th in Morton order)."""
     step = problem.points.shape[1] // max(count, 1)
     if step < 2:
         return problem
@@ -48,7 +47,7 @@ def thinned(problem: LevelProblem, count: int) -> LevelProblem:
 def distinct(
     problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
 ) -> NDArray[np.int64]:
-    """Indices of finite hypotheses, best first, without those that repeat a better one.
+    """Indices of finite hypotheses, best first, without near copies of better ones.
 
     Distance: rms over probe anchors of the distance between projections, in pixels of the level.
     Without this the survivors would be many copies of one mode.
@@ -81,7 +80,7 @@ def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float3
 
 
 def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:
-    """1 - score / score of chance, where chance pairs each anchor with another's query feature."""
+    """1 - score / chance score, where chance pairs each anchor with another one's query feature."""
     query, reference, weights = _sampled(problem, R, t)
     others = np.roll(reference, len(reference) // 2, axis=0)
     actual, _ = robust_loss(np.linalg.norm(query - reference, axis=1), settings)

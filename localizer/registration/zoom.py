@@ -45,7 +45,7 @@ _LEAST_CURVATURE, _SIGMA = 20.0, 0.02
 
 @dataclass(frozen=True)
 class FocalTest:
-    """Refines under other focal lengths, on the registration's own backend."""
+    """Refines a pose under other focal lengths, on the registration's own backend."""
 
     backend: Backend
     config: JNGOConfig
@@ -53,8 +53,8 @@ class FocalTest:
     def gain(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
     ) -> float:
-        """How much lower a registration's cost is, as a share, with a focal length `FOCAL_STEP`
-        longer or shorter, the pose refined for it; the better one of the two.
+        """Relative decrease of a registration's cost with a focal length `FOCAL_STEP` longer or
+        shorter, with the pose refined; the larger of both.
 
         Negative where the camera's own fits best; -inf where that cannot be tested (a registration
         that failed, features on a GPU).
@@ -69,9 +69,9 @@ class FocalTest:
     def fit(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
     ) -> FocalFit | None:
-        """The focal length that fits best, as a multiple of the camera's, the pose refined for each
-        that is tried; 5 ms. None where the picture does not tell it (flat ground seen straight
-        down: a zoom and a height are one), where it is not within `FOCAL_REACH`, and as in `gain`.
+        """The best focal length, as a multiple of the camera's, with the pose refined for each; 5
+        ms. None if the image does not determine it (flat ground seen straight down), if it is
+        beyond `FOCAL_REACH`, and as in `gain`.
         """
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:
@@ -132,7 +132,7 @@ class _Trial:
 
 
 def focal_gain(scores: Mapping[float, float]) -> float:
-    """The gain of the best other focal length, from costs by factor; -inf without an own cost."""
+    """Gain of the best other focal length, from costs by factor; -inf without the camera's own."""
     own = scores[1.0]
     if not np.isfinite(own):
         return -np.inf

@@ -1,1 +1,1 @@
-"""Where am I, without a prior: one frame against the whole map (relocalization.md)."""
+"""Relocalization without a prior: one frame against the whole map (relocalization.md)."""

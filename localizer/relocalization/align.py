@@ -1,8 +1,8 @@
-"""Where a candidate really is: the frame's features over those of the map rendered at it.
+"""Refines a candidate position: correlates the frame's features with those of the map rendered
+there.
 
-A search takes the ground as flat. Roofs that stand high under a low camera lean outwards in its
-frame, so that the best place of the flat ground is metres off: farther than a registration finds
-back. In a rendering they lean likewise, and what is left is a shift of the image.
+The search assumes flat ground. High roofs displace its result by metres at low height, too far for
+a registration. A rendering has the same parallax, so only an image shift remains.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Complex64 = NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class ImageOffset:
-    """u, v: px of the image that the frame lies to the right of and below in the rendering;
-    score: correlation there times the root of the share that both see, 0 to 1.
+    """u, v: shift of the frame to the right of and below the rendering, px; score: correlation
+    there times the root of the common share, 0 to 1.
     """
 
     u: float
@@ -36,7 +36,7 @@ class ImageOffset:
 
 
 class FrameShift:
-    """Finds the shift of one frame's features over renderings' features of the same size."""
+    """Estimates the shift between a frame's features and renderings' of the same size."""
 
     def __init__(self, levels: tuple[FeatureLevel, ...]) -> None:
         level = levels[_LEVEL]
@@ -75,8 +75,8 @@ class FrameShift:
 
 
 def moved(pose: Pose, camera: Camera, shift: ImageOffset, ground_m: float) -> Array:
-    """How far (2,) m a camera lies from a rendering's pose whose image its own is shifted over, at
-    one heading and height; ground_m: the height of the ground. Zero where no ground is seen.
+    """Horizontal displacement (2,) m of a camera from a rendering's pose, from their image shift,
+    at equal heading and height. ground_m: ground height. Zero if no ground is seen.
     """
     middle = np.array([camera.cx, camera.cy])
     rays = camera.rays(np.stack([middle, middle + np.array([shift.u, shift.v])])) @ pose.rotation.T

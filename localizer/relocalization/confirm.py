@@ -1,7 +1,7 @@
-"""Which candidates are rendered and registered, cheap tests first.
+"""Selects the candidates to render and register, cheap tests first.
 
-At half the size a candidate costs a tenth of a registration, and the right position nearly always
-has the best score. So all candidates are screened, and only those that can win are registered.
+At half the image size a candidate costs a tenth of a registration, and the right position nearly
+always has the best score. So all candidates are screened, and only the best are registered.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _SAME_START = 1.0  # m and degrees: a registration from so near is the same one
 _HOPELESS = 0.5  # of the best quality
 
 
-class StopAskedError(Exception):
-    """The answer is not wanted any more."""
+class SearchCancelledError(Exception):
+    """The search was cancelled."""
 
 
 def compared(
     candidates: list[PlaceCandidate], judged: list[VerifiedCandidate]
 ) -> list[PlaceCandidate]:
-    """The candidates that an answer is held against: the best of the search, or as many as it took
+    """The candidates that compete with a result: the best of the search, or as many as were needed
     to find it.
     """
     return candidates[: max(_ROUNDS[-1], *(j.rank + 1 for j in judged))]
@@ -59,7 +59,7 @@ class Confirmation:
     finished: set[int] = field(default_factory=set)
 
     def run(self) -> list[VerifiedCandidate]:
-        """Those that were registered, the best of them to the end; best first. None if stopped."""
+        """The registered candidates, best first, the best to the end; None if cancelled."""
         try:
             self._first_pass()
             self._finish()
@@ -69,7 +69,7 @@ class Confirmation:
                 self._screen(min(len(self.candidates), _ROUNDS[-1]))
                 self._settle_alike(order[0])
                 self._finish()
-        except StopAskedError:
+        except SearchCancelledError:
             return []
         return self._order()
 
@@ -210,4 +210,4 @@ class Confirmation:
 
     def _go_on(self) -> None:
         if self.should_stop():
-            raise StopAskedError
+            raise SearchCancelledError

@@ -54,8 +54,8 @@ class _Spectra:
 
 @dataclass(frozen=True)
 class PatchSpectra:
-    """A patch, transformed. features: (K, SIZE, SIZE/2+1); mask: as `_Spectra.energy`; norm: the
-    root of its energy; cells: its side; weight: share of its cells that are seen.
+    """A patch's Fourier transform. features: (K, SIZE, SIZE/2+1); mask: as `_Spectra.energy`; norm:
+    root of its energy; cells: its side; weight: share of cells in view.
     """
 
     features: Complex64
@@ -66,7 +66,7 @@ class PatchSpectra:
 
 
 def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
-    """features: (n, n, K) weighted; mask: (n, n) in [0, 1], where they count."""
+    """Transform a patch. features: (n, n, K) weighted; mask: (n, n) in [0, 1]."""
     n = features.shape[0]
     # Row by row first: most rows are empty and stay so.
     lines = np.zeros((features.shape[2], n, SIZE), np.float32)
@@ -87,11 +87,10 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
 
 
 class LevelCorrelator:
-    """Correlates patches with one level; keeps spectra of `byte_budget`. Safe to share.
+    """Correlates patches with one level; caches spectra up to `byte_budget`.
 
-    A search goes over all its blocks again and again. Where they do not fit, the block unused for
-    longest is the next one wanted: so only what other searches left is given up for a new one, and
-    the share that fits is found each time.
+    Thread-safe. A search visits all blocks repeatedly. If they do not fit, only spectra of earlier
+    searches are replaced, so that part of the blocks is always found in the cache.
     """
 
     def __init__(self, level: OverviewLevel, byte_budget: int) -> None:
@@ -108,7 +107,7 @@ class LevelCorrelator:
         self._usual = float(energy[energy > 0].mean()) if (energy > 0).any() else 1.0
 
     def begin(self) -> None:
-        """A search begins: what earlier ones wanted may be given up."""
+        """A search starts: spectra of earlier ones may be dropped."""
         with self._lock:
             self._search += 1
 
@@ -166,7 +165,7 @@ class LevelCorrelator:
         return scores
 
     def warm_up(self) -> None:
-        """Compile what a search needs."""
+        """Compile the kernels of a search."""
         channels = self.level.features.shape[0]
         patch = transform_patch(np.ones((8, 8, channels), np.float32), np.ones((8, 8), np.float32))
         self.correlate(patch, self.blocks()[0])

@@ -1,4 +1,4 @@
-"""Overviews of models that are no longer used: a map's folder keeps the few newest."""
+"""Keeps only the newest overviews in a map's folder; each model makes its own."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def mark_used(folder: Path) -> None:
 
 
 def drop_old(folder: Path) -> None:
-    """Remove overviews beside this folder, the longest unused first, and what a cut off process
-    left in it. What is no overview, or cannot be removed, stays.
+    """Remove the longest unused overviews beside this folder, and files of an interrupted process.
+    Other files stay.
     """
     try:
         for left in folder.glob("*.new"):

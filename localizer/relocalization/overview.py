@@ -1,9 +1,8 @@
 """The map's features seen from above, computed once and stored beside the tiles.
 
-Squares of the map are drawn from above, the network's features of each are projected onto the
-map's own principal components, weighted by confidence, and stored as bytes. One file per scale in
-the cache's folder, ``overview/KEY/LEVEL.safetensors``; KEY names the map, the model and this
-format, so that another model or a rebuilt map makes a file of its own.
+Squares of the map are rendered from above. The network's features of each are projected onto the
+map's principal components, weighted by confidence, and stored as bytes. One file per scale:
+``overview/KEY/LEVEL.safetensors`` in the cache's folder; KEY depends on map, model and format.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Projection:
-    """From a network's features (..., C) to the stored ones. mean: (C,); basis: (C, K)."""
+    """Linear, from features (..., C) to the stored ones. mean: (C,); basis: (C, K)."""
 
     mean: Float32
     basis: Float32
@@ -96,7 +95,7 @@ class OverviewLevel:
 
 
 def without_local_mean(values: Float32, known: Float32) -> Float32:
-    """Values (h, w) or (h, w, K) less their mean about each cell over what is known (h, w)."""
+    """Values (h, w) or (h, w, K) minus their local mean over the known cells (h, w)."""
     total = cv2.GaussianBlur(values, (0, 0), _LOCAL_CELLS, borderType=cv2.BORDER_CONSTANT)
     share = cv2.GaussianBlur(known, (0, 0), _LOCAL_CELLS, borderType=cv2.BORDER_CONSTANT)
     if values.ndim == 3:
@@ -113,20 +112,20 @@ class MapOverview:
 
     @property
     def area_km2(self) -> float:
-        """Of the ground that is covered."""
+        """Area of the covered ground."""
         level = self.levels[0]
         cell = (level.cell_m * GROUND_CELLS) ** 2
         return float(np.isfinite(level.ground).sum()) * cell / 1e6
 
     @property
     def nbytes(self) -> int:
-        """In memory."""
+        """Bytes in memory."""
         return sum(level.features.nbytes + level.ground.nbytes for level in self.levels)
 
 
 def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
-    """The features of an image that are compared: the level whose stride is `STRIDE`.
-    `MapCacheError` if the network has none.
+    """The features of an image at stride `STRIDE`, used for the comparison. `MapCacheError` if the
+    network has none.
     """
     for level in extractor.extract(rgb).levels:
         if level.stride == STRIDE:
@@ -135,7 +134,7 @@ def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
 
 
 def overview_key(cache: TileCache, model: str) -> str:
-    """Of map, model (`model_key`) and format."""
+    """Key of map, model (`model_key`) and format."""
     settings = (_FORMAT, GSD_M, STRIDE, CHANNELS, GROUND_CELLS, _QUANTUM)
     text = f"{cache.manifest.index_sha256} {model} {settings}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -149,8 +148,8 @@ def open_overview(
     progress: Progress = lambda _done, _total: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> MapOverview | None:
-    """The map's overview from the disk, or computed, stored there and returned; None if
-    `should_stop` returned true before its end.
+    """Read the map's overview from disk, or compute and store it; None if cancelled by
+    `should_stop`.
 
     progress: called with the number of squares that are done and of all. A damaged file is named in
     the log and computed again. If the folder cannot be written, the log says so, and the overview
@@ -226,7 +225,7 @@ def _require_memory(squares: Sequence[_Squares]) -> None:
 
 
 def available_bytes() -> int | None:
-    """Memory that may be had without swapping; None where the system does not say."""
+    """Memory available without swapping; None if unknown."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):

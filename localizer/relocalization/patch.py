@@ -1,4 +1,4 @@
-"""The query as the map shows its ground: a frame rectified onto the horizontal plane below."""
+"""Rectifies a frame onto the horizontal ground plane, to compare it with the map from above."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Patch:
 
 
 def turned(rotation: Array, heading_rad: float) -> Array:
-    """A rotation (3, 3) world_from_camera, turned by a heading counter-clockwise."""
+    """A rotation (3, 3) world_from_camera, rotated by a heading counter-clockwise."""
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     result: Array = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation
     return result
@@ -50,7 +50,7 @@ def turned(rotation: Array, heading_rad: float) -> Array:
 def footprint(
     camera: Camera, rotation: Array, height_m: float, largest_m: float
 ) -> CameraFootprint:
-    """What a camera `height_m` above flat ground sees, as far as it is of use."""
+    """The useful part of the ground seen by a camera `height_m` above flat ground."""
     u = np.linspace(0, camera.width, _EDGE_RAYS)
     v = np.linspace(0, camera.height, _EDGE_RAYS)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -85,7 +85,7 @@ def rectify(
     side_px: int,
     gsd_m: float,
 ) -> Patch:
-    """The square of ground about `centre` (2,) as an image (H, W, 3) of a pinhole shows it.
+    """Rectify a pinhole image (H, W, 3) to the square of ground about `centre` (2,).
 
     rotation: (3, 3) world_from_camera; height_m: above the ground, which is taken as flat. What is
     not seen has the image's mean colour.

@@ -80,7 +80,7 @@ class Relocalizer:
     def find(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> Relocalization | None:
-        """The camera's pose with the evidence for it; None where nothing convinces, or stopped."""
+        """The camera's pose with its evidence; None without a convincing one or if cancelled."""
         began = time.perf_counter()
         candidates = self.search(query, should_stop)
         searched = time.perf_counter() - began
@@ -95,7 +95,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> Relocalization | None:
-        """The candidate that registration confirms, if it does so for one."""
+        """The candidate that registration confirms; None without one."""
         began = time.perf_counter()
         judged = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}
@@ -106,9 +106,7 @@ class Relocalizer:
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> list[PlaceCandidate]:
-        """The places that look most like the frame from above, best first; none if stopped, or
-        where the frame shows nothing.
-        """
+        """The most similar positions, best first; empty if cancelled or without any."""
         camera = working_camera(query.frame.camera, min(_SEARCH_WIDTH, query.frame.camera.width))
         image = cv2.GaussianBlur(self._undistorted(query, camera), (0, 0), _BLUR_PX)
         if (
@@ -135,7 +133,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> list[VerifiedCandidate]:
-        """The places that were registered, the best of them to the end; best first."""
+        """The registered candidates, best first; the best is refined to the end."""
         sight, small = self._sights(query)
         return Confirmation(
             self._verifier, sight, small, query, candidates, self._config, should_stop
@@ -189,8 +187,8 @@ def open_relocalizer(
     progress: Progress = lambda _done, _total: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> OpenRelocalizer | None:
-    """Everything that a search needs, apart from the tracker's own parts, so that neither waits for
-    the other; the map's overview is computed now if it is not there. None if stopped before.
+    """Open a relocalizer with its own renderer and network, so that it and the tracker do not wait
+    for each other. Computes the map's overview if it is missing. None if cancelled.
     """
     c = config.relocalization
     streamer = TileStreamer(cache, byte_budget=c.cache_mib * 2**20)

@@ -49,7 +49,7 @@ _LEAST_HEIGHT_M = 10.0
 
 @dataclass(frozen=True)
 class SearchView:
-    """The frame as the search uses it: image (H, W, 3) of a pinhole camera."""
+    """The frame for the search: image (H, W, 3) of a pinhole camera."""
 
     image: Image
     camera: Camera
@@ -68,8 +68,8 @@ class Rectification:
 
 
 def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
-    """(n,) turns of the query's rotation to try, rad counter-clockwise about up: the whole circle
-    if the heading is not known.
+    """Rotations (n,) of the query to try, rad counter-clockwise about up: the whole circle if the
+    heading is unknown.
     """
     step = math.radians(config.heading_step_deg)
     if query.heading_sigma_rad is None:
@@ -84,7 +84,7 @@ def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
 
 
 def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel:
-    """The finest level of which a patch of `side_m` is not larger than can be compared."""
+    """The finest level at which a patch of `side_m` can be compared."""
     for level in levels:
         if side_m / level.gsd_m <= _MOST_PX:
             return level
@@ -92,8 +92,8 @@ def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel
 
 
 def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
-    """Heights of the ground that a camera in the query's region can see, any shape; the whole map's
-    where there is no region.
+    """Ground heights that a camera in the query's region can see, any shape; the whole map's
+    without a region.
     """
     if query.region is None or not np.isfinite(level.ground).any():
         return level.ground
@@ -112,7 +112,7 @@ def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
 
 
 def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> Array:
-    """Heights above ground (n,) to rectify for, so that each place has one close to its own."""
+    """Heights above ground (n,) to rectify for, so that each position has one near its own."""
     known = ground[np.isfinite(ground)]
     if len(known) == 0:
         return np.empty(0)
@@ -145,7 +145,7 @@ def search(
     pool: ThreadPoolExecutor | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> list[PlaceCandidate] | None:
-    """The places that look most like `view` from above, the most distinct first.
+    """The positions that look most like `view` from above, the most distinct first.
 
     Up to `candidates` + 1; none if the map has no ground heights there; None if stopped.
     correlators: of the levels, finest first. A place's height is the query's.
@@ -179,7 +179,7 @@ def search(
 
 
 def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
-    """Indices of heights in groups whose ends are no farther apart than `ratio`."""
+    """Group height indices by ratio at most `ratio`; each group shares its features."""
     groups: list[list[int]] = []
     for i, height in enumerate(heights):
         if groups and height <= heights[groups[-1][0]] * ratio:

@@ -13,8 +13,8 @@ from localizer.types import Frame
 
 @dataclass(frozen=True)
 class SearchRegion:
-    """An ellipse in which the camera is. centre: (2,) east and north, m; shape: (2, 2) m², positive
-    definite: inside is where ``(x - centre)' shape^-1 (x - centre) <= 1``.
+    """An ellipse that contains the camera. centre: (2,) east and north, m; shape: (2, 2) m²,
+    positive definite; inside is ``(x - centre)' shape^-1 (x - centre) <= 1``.
     """
 
     centre: Array
@@ -22,7 +22,7 @@ class SearchRegion:
 
     @classmethod
     def circle(cls, centre: Array, radius_m: float) -> SearchRegion:
-        """All places up to `radius_m` from `centre` (2,)."""
+        """A circle of `radius_m` about `centre` (2,)."""
         return cls(np.asarray(centre, np.float64)[:2], np.eye(2) * radius_m**2)
 
     @classmethod
@@ -92,5 +92,5 @@ class Relocalization:
 
     @property
     def separation(self) -> float:
-        """Score over the runner-up's: 1 is no separation at all."""
+        """Score divided by the runner-up's; 1 means no separation."""
         return self.score / max(self.runner_up, 1e-6)

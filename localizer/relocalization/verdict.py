@@ -19,9 +19,8 @@ SAME_PLACE_M = 5.0  # answers that are closer are one
 
 @dataclass(frozen=True)
 class VerifiedCandidate:
-    """A candidate after registration. result: with attitude and height; prior: what the next pass
-    begins from; log_odds: of being right, by the image; credible: whether the other sensors agree,
-    too.
+    """A candidate after registration. result: fused with attitude and height; prior: for the next
+    pass; log_odds: of the right position, by the image; credible: the other sensors agree, too.
     """
 
     candidate: PlaceCandidate
@@ -43,7 +42,7 @@ def answer(
     judged: list[VerifiedCandidate],
     stages: dict[str, float],
 ) -> Relocalization | None:
-    """The best of the registered candidates (at least one, best first), unless another has
+    """The best of the registered candidates (at least one, best first); None if another has
     comparable evidence.
     """
     best = judged[0]

@@ -57,7 +57,7 @@ class RenderedReference:
 
     @property
     def ground_m(self) -> float:
-        """World z of what is seen, the median over the image."""
+        """Median world z of the surface in view."""
         v, u = np.nonzero(self.view.depth)
         some = slice(None, None, max(1, len(u) // 500))
         pixels = np.stack([u[some], v[some]], axis=-1) + 0.5
@@ -67,7 +67,7 @@ class RenderedReference:
 
 @dataclass(frozen=True)
 class Aligned:
-    """A candidate's prior after alignment. score: of `Shift`, 0 where there is hardly any map."""
+    """A candidate's prior after alignment. score: of the image shift, 0 with hardly any map."""
 
     prior: PosePrior
     score: float
@@ -101,7 +101,7 @@ class Verifier:
     seed: int
 
     def prior(self, candidate: PlaceCandidate, query: PlaceQuery) -> PosePrior:
-        """The candidate with its covariance."""
+        """The candidate's pose with its covariance."""
         tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
         rise = max(query.height_sigma_m, 1.0)
         sigma = np.array(
@@ -113,14 +113,14 @@ class Verifier:
     def reference(
         self, prior: PosePrior, camera: Camera, extractor: FeatureExtractor | None = None
     ) -> RenderedReference | None:
-        """The map as the prior's pose sees it; None where that is hardly any."""
+        """Render the map at the prior's pose; None if hardly any is in view."""
         view = self.renderer.render(prior.world_from_camera, camera, wait=True)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
             return None
         return RenderedReference(view, (extractor or self.extractor).extract(fill_holes(view)))
 
     def screened(self, small: QueryFeatures, prior: PosePrior) -> Aligned:
-        """The prior moved to where the frame, at a small size, lies over its rendering."""
+        """The prior, moved by the shift between the small frame and its rendering."""
         reference = self.reference(prior, small.camera, self.coarse)
         if reference is None:
             return Aligned(prior, 0.0)
@@ -132,7 +132,7 @@ class Verifier:
     def from_place(
         self, sight: QueryFeatures, place: Aligned, query: PlaceQuery
     ) -> tuple[PosePrior, FusedRegistration]:
-        """A screened place aligned once more, at full size, and registered from there."""
+        """Align a screened candidate again at full size, and register the frame there."""
         prior = place.prior
         reference = self.reference(prior, sight.camera)
         for _ in range(_ALIGNMENTS):
@@ -149,7 +149,7 @@ class Verifier:
     def around(
         self, sight: QueryFeatures, prior: PosePrior, query: PlaceQuery
     ) -> FusedRegistration:
-        """The best of registrations that begin to all sides of an aligned place."""
+        """The best of several registrations that start displaced to all sides."""
         reference = self.reference(prior, sight.camera)
         if reference is None:
             return FusedRegistration(failure(prior, RegistrationStatus.NO_OVERLAP))
@@ -166,9 +166,8 @@ class Verifier:
         query: PlaceQuery,
         reference: RenderedReference | None = None,
     ) -> FusedRegistration:
-        """One pass: the frame registered to the view at the prior's pose, rendered if not given,
-        with what attitude and height know of it; another focal length is tried where the result is
-        good.
+        """One pass: register the frame to the view at the prior's pose (rendered if not given) and
+        fuse attitude and height. Another focal length is tried if the result is good.
         """
         reference = reference or self.reference(prior, sight.camera)
         if reference is None:
@@ -183,14 +182,14 @@ class Verifier:
         return fused_registration(with_map_error(image, self.height_sigma_m), known)
 
     def again(self, prior: PosePrior, result: Registration) -> PosePrior:
-        """The prior of the next pass: the same image is no new evidence, sigma only halves."""
+        """The prior of the next pass; the same image is no new evidence, so sigma halves."""
         return PosePrior(result.world_from_camera, prior.covariance / 4, prior.time_ns)
 
     def is_credible(
         self, found: FusedRegistration, candidate: PlaceCandidate, query: PlaceQuery
     ) -> bool:
-        """Whether a registration shows a place by its image, where the candidate was, and neither
-        attitude nor height nor the heading speaks against it.
+        """Whether the image supports the position, it is near the candidate, and attitude, height
+        and heading agree.
         """
         result = found.registration
         if found.contradicted or result.overlap < self.config.min_overlap:
@@ -219,15 +218,15 @@ def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseCon
 
 
 def shifted(prior: PosePrior, away: Array) -> PosePrior:
-    """A prior so far (2,) m to the east and north."""
+    """A prior displaced by (2,) m to the east and north."""
     pose = prior.world_from_camera
     place = pose.translation + np.array([*away, 0.0])
     return replace(prior, world_from_camera=Pose(pose.rotation, place))
 
 
 def tilt_and_heading(rotation: Array, reference: Array) -> tuple[float, float]:
-    """How far a rotation (3, 3) world_from_camera is tilted (rad, >= 0) against a reference's, and
-    turned about the vertical (rad, counter-clockwise).
+    """Tilt (rad, >= 0) and rotation about the vertical (rad, counter-clockwise) of a rotation (3,
+    3) world_from_camera relative to a reference.
     """
     relative = rotation @ reference.T
     # Twist of the swing-twist decomposition: what of the turn is about the vertical.

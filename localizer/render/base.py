@@ -1,4 +1,4 @@
-"""The renderer protocol and what its backends share."""
+"""The renderer protocol, and the common part of its backends."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SKY = (176, 196, 216)
 
 
 class TileProvider(Protocol):
-    """Where a renderer gets its tiles: a `TileStreamer`, or `StaticTiles`."""
+    """Source of a renderer's tiles: a `TileStreamer`, or `StaticTiles`."""
 
     def select(
         self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
@@ -32,7 +32,7 @@ class TileProvider(Protocol):
         ...
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """Get ready for views (world_from_camera) to come, the next one first."""
+        """Load the tiles of future views (world_from_camera), in order."""
         ...
 
 
@@ -79,11 +79,11 @@ class MapRenderer(Protocol):
         ...
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """Have the tiles of views (world_from_camera) to come loaded; returns at once."""
+        """Load the tiles of future views (world_from_camera); returns at once."""
         ...
 
     def warm_up(self) -> None:
-        """Compile what drawing needs, so that the first view need not wait for it."""
+        """Compile what rendering needs, so that the first view is not delayed."""
         ...
 
     def close(self) -> None:
@@ -92,7 +92,7 @@ class MapRenderer(Protocol):
 
 
 class TileRenderer(ABC):
-    """What the backends share: a view's tiles come from a provider, then they are drawn."""
+    """Common part of the backends: gets a view's tiles from a provider and draws them."""
 
     name: str
 
@@ -136,12 +136,12 @@ class TileRenderer(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Release threads and devices; the streamer is its owner's."""
+        """Release threads and devices, but not the streamer."""
 
 
 def require_pinhole(camera: Camera) -> None:
-    """Renderers draw straight lines straight: distortion is the caller's (`undistortion_maps`).
-    `CameraError` if the camera has distortion.
+    """`CameraError` if the camera has distortion, which renderers do not support (see
+    `undistortion_maps`).
     """
     if camera.is_distorted:
         raise CameraError(
@@ -163,7 +163,7 @@ def bounding_spheres(meshes: Sequence[TileMesh]) -> tuple[Array, Array]:
 def are_visible(
     centres: Array, radii: Array, world_from_camera: Pose, camera: Camera
 ) -> NDArray[np.bool_]:
-    """Which spheres, see `bounding_spheres`, meet the view; (N,)."""
+    """Mask (N,) of the spheres (see `bounding_spheres`) that are in view."""
     x, y, z = world_from_camera.inverse.apply(centres).T
     seen = z >= NEAR_M - radii
     for offset, focal, near_edge, far_edge in (
@@ -177,7 +177,7 @@ def are_visible(
 
 
 def clip_from_camera(camera: Camera) -> Array:
-    """OpenGL clip coordinates (4, 4) of OpenCV camera axes.
+    """Projection (4, 4) from OpenCV camera axes to OpenGL clip coordinates.
 
     Image row 0 becomes the framebuffer's row 0, which is read first: nothing is flipped afterwards.
     """

@@ -10,7 +10,7 @@ from localizer.types import Image, RenderedView
 
 
 def fill_holes(view: RenderedView) -> Image:
-    """The view's picture (H, W, 3) uint8, the map's holes painted over from what surrounds them.
+    """The view's image (H, W, 3) uint8 with the map's holes filled from their surroundings.
 
     No flight sees the edge of a hole, but the features of everything near would. What is above the
     horizon stays: there the sky may be seen. By averages from fine to coarse and back: Gortler et

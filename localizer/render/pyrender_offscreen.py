@@ -1,8 +1,8 @@
-"""Renderer on pyrender (extra `pyrender`), held to the same parity suite as the others.
+"""Renderer on pyrender (extra `pyrender`), tested for equality with the others.
 
-Stock pyrender reads metres back from a multisampled 24-bit depth buffer: 5 to 10 cm off, metres at
-edges. Here it draws without multisampling, with shaders that write eye-space z to a float32
-target, and with node poses relative to the camera, so that float32 never sees world coordinates.
+Stock pyrender reads depth from a multisampled 24-bit buffer: errors of 5 to 10 cm, and metres at
+edges. Here shaders write eye-space z to a float32 target without multisampling, and node poses are
+relative to the camera, so that float32 is precise.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ _LANES = 0x1FFF | 0x1FFF << 21 | 0x1FFF << 42  # 13 of 21 bits each
 
 @njit(cache=True, nogil=True, fastmath=True)
 def clear(rgb, depth, sky, begin, end):  # type: ignore[no-untyped-def]
-    """Sky and no depth in the flat pixels from begin to end."""
+    """Set sky colour and zero depth in the flat pixels from begin to end."""
     red, green, blue = sky[0], sky[1], sky[2]
     for i in range(np.uint64(begin), np.uint64(end)):
         depth[i] = np.float32(0)
@@ -37,7 +37,7 @@ def depth_from_inverse(depth, begin, end):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True)
 def project(positions, T, intrinsics, near, screen):  # type: ignore[no-untyped-def]
-    """Vertices to (x, y, 1/z) in pixels and 1/m; 1/z is -1 for those before the near plane."""
+    """Project vertices to (x, y, 1/z) in pixels and 1/m; 1/z is -1 before the near plane."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]

@@ -48,7 +48,7 @@ def make_renderer(
     threads: int = 2,
     sky: tuple[int, int, int] = SKY,
 ) -> MapRenderer:
-    """A renderer, to be made and used by one thread.
+    """A renderer that one thread makes and uses.
 
     auto: OpenGL where a GPU drives it, else numba (a software OpenGL is slower than numba).
     Raises `RenderError` when the asked backend is not available.

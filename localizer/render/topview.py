@@ -1,4 +1,4 @@
-"""The map drawn from above, square by square."""
+"""Renders the map from above, square by square."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _EYE_M = 20_000.0
 
 @dataclass(frozen=True)
 class TopView:
-    """A square from above, north up. rgb: (n, n, 3) uint8, holes painted over; height: (n, n)
-    float32 world z, NaN where there is no map.
+    """A square from above, north up. rgb: (n, n, 3) uint8, holes filled; height: (n, n) float32
+    world z, NaN without map.
     """
 
     rgb: Image
@@ -33,7 +33,7 @@ class TopView:
 def render_top_view(
     renderer: MapRenderer, centre: Array, side_px: int, gsd_m: float, base_m: float
 ) -> TopView:
-    """The square about `centre` (2,) of `side_px` pixels of `gsd_m`; base_m: the map's least z."""
+    """Render the square about `centre` (2,) of side_px pixels; base_m: lowest z."""
     focal = _EYE_M / gsd_m
     camera = Camera(side_px, side_px, focal, focal, side_px / 2, side_px / 2)
     eye = base_m + _EYE_M

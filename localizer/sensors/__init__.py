@@ -1,1 +1,1 @@
-"""Errors of the sensors other than the camera's image."""
+"""Error models of all sensors other than the camera."""

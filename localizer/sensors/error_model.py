@@ -1,9 +1,8 @@
-"""Errors of every sensor other than the image: one value for each quantity, with its source.
+"""Error models of all sensors other than the camera: one value for each quantity, with its source.
 
-Receiver and gyros are in `mavlink_bridge/vehicle/sensor_errors.py`: the localizer hears neither.
-
-Priors, jump check, reachable region, motion check, search, odometry, integrity monitor, calibration
-watch and targets take their figures from `SENSORS`. All are one standard deviation along an axis.
+Receiver and gyros are in `mavlink_bridge/vehicle/sensor_errors.py`. Priors, jump check, reachable
+region, motion check, search, odometry, integrity monitor, calibration watch and targets use
+`SENSORS`. All values are one standard deviation along an axis.
 """
 
 from __future__ import annotations
@@ -16,15 +15,15 @@ GRAVITY_MPS2 = 9.80665
 
 @dataclass(frozen=True)
 class DeadReckoningError:
-    """How a position without a measurement grows wrong: an unknown velocity at the beginning, and a
-    constant acceleration error.
+    """Error growth of a position without measurements: an initial velocity error, and a constant
+    acceleration error.
     """
 
     speed_mps: float
     acceleration_mps2: float
 
     def sigma_m(self, seconds: float) -> float:
-        """Horizontal sigma (m, per axis) after so many seconds; 0 before the beginning."""
+        """Horizontal sigma (m, per axis) after so many seconds."""
         t = max(seconds, 0.0)
         return math.hypot(self.speed_mps * t, 0.5 * self.acceleration_mps2 * t * t)
 
@@ -81,17 +80,17 @@ class SensorErrorModel:
 
     @property
     def mounted_tilt_deg(self) -> float:
-        """Roll and pitch of gimbal and autopilot with their constant error."""
+        """Sigma of roll and pitch of gimbal and autopilot, constant error included."""
         return math.hypot(self.tilt_deg, self.alignment_deg)
 
     @property
     def ekf_drift(self) -> DeadReckoningError:
-        """An EKF without absolute measurements; gravity leaks through its tilt error."""
+        """Drift of an EKF without absolute measurements, caused by its tilt error."""
         return DeadReckoningError(self.ekf_speed_mps, self._leak_mps2)
 
     @property
     def inertial_drift(self) -> DeadReckoningError:
-        """The free integral of the IMU, likewise."""
+        """Drift of the integrated IMU, caused by its tilt error."""
         return DeadReckoningError(self.integral_speed_mps, self._leak_mps2)
 
     @property

@@ -1,1 +1,1 @@
-"""Generated worlds as 3D Tiles, their appearance, and small moving things."""
+"""Generated worlds as 3D Tiles, their appearance, and moving objects."""

@@ -1,4 +1,4 @@
-"""What a generated world is made from: a seed, a size, and the look of one visit to it."""
+"""Configuration of a generated world: seed, size, and the look of one visit."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class WorldConfig:
 
 @dataclass(frozen=True)
 class VisitLook:
-    """One visit's light, season and movable things.
+    """Light, season and movable objects at one visit.
 
     Sun angles in degrees (azimuth clockwise from north); `sun_rgb` and `sky_rgb` are the irradiance
     of a surface that faces the sun, and of one that sees the whole sky, 1 = albedo as painted.

@@ -1,4 +1,4 @@
-"""Generated worlds: `build_world` writes 3D Tiles 1.1 and what else is known about the place."""
+"""Generates worlds: `build_world` writes 3D Tiles 1.1 and the truth about the place."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _INFO, _HEIGHTS = "world.json", "heights.npy"
 
 @dataclass(frozen=True)
 class WorldInfo:
-    """What is known about a generated world besides its tiles.
+    """Truth about a generated world besides its tiles.
 
     targets: named static points on surfaces, ENU. roads: right-hand lanes of the main roads as
     polylines (N, 3) ENU, longest first. buildings: how many stand there, sheds included.
@@ -116,7 +116,7 @@ class WorldInfo:
 
 
 def world_origin(config: WorldConfig) -> Geodetic:
-    """Where on Earth the world of a seed lies: somewhere on the Swiss plateau."""
+    """Geodetic origin of a seed's world, on the Swiss plateau."""
     rng = config.rng(3)
     latitude = 47.4 + float(rng.uniform(-0.2, 0.2))
     longitude = 8.5 + float(rng.uniform(-0.4, 0.4))
@@ -150,7 +150,7 @@ def build_visits(
     processes: int = 2,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[WorldInfo]:
-    """Several visits to one world: the plan is made once, each visit is painted to its folder.
+    """Generate several visits to one world, each in its folder; the plan is made once.
 
     progress: told the share of all that is done, 0 to 1.
     """

@@ -1,1 +1,1 @@
-"""Coordinates of pixels, and targets over time."""
+"""Locates pixels on the map, and tracks targets."""

@@ -1,7 +1,7 @@
-"""Errors that all targets of a flight share: of the map, the pose, and the boresight.
+"""Errors common to all targets of a flight: of map, pose and boresight.
 
-A state that no sighting measures (Schmidt's consider state): it is carried beside every target and
-never shrinks, so that a hundred fixes of one place do not claim what the map cannot keep.
+They are a consider state (Schmidt): part of every target's covariance that no observation reduces,
+so that many observations do not claim more than the map's accuracy.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from localizer.geometry.pose import Array
 
 @dataclass(frozen=True)
 class SharedBias:
-    """One sigma of the bias: metres along each axis, and radians as seen from the camera."""
+    """Sigmas of the common error: metres along each axis, and radians as seen from the camera."""
 
     sigma_m: float = 0.2
     sigma_rad: float = 0.0005
 
     def covariance(self, offset: Array) -> Array:
-        """(3, 3) m², world axes, for a place at `offset` (3,) from the camera."""
+        """(3, 3) m², world axes, of a target at `offset` (3,) from the camera."""
         distance = float(np.linalg.norm(offset))
         d = offset / max(distance, 1e-6)
         across = np.eye(3) - np.outer(d, d)

@@ -54,7 +54,7 @@ class TargetFilter:
 
     @property
     def velocity(self) -> Array | None:
-        """Velocity (3,) in m/s, world axes; None until a second sighting has measured one."""
+        """Velocity (3,) in m/s, world axes; None before a second observation."""
         if not self._tracks or self._tracks[0].sightings < 2:
             return None
         velocity: Array = self._tracks[0].mean[3:].copy()
@@ -62,25 +62,23 @@ class TargetFilter:
 
     @property
     def velocity_covariance(self) -> Array | None:
-        """Of `velocity`, (3, 3) m²/s²."""
+        """Covariance of `velocity`, (3, 3) m²/s²."""
         if self.velocity is None:
             return None
         covariance: Array = self._tracks[0].covariance[3:, 3:].copy()
         return covariance
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
-        """Where it would be by its motion: position (3,), covariance (3, 3); None before a first
-        sighting."""
+        """Predicted position (3,) and covariance (3, 3); None before an observation."""
         if not self._tracks:
             return None
         track = _predicted(self._tracks[0], time_ns - self._time_ns)
         return track.mean[:3], track.covariance[:3, :3]
 
     def update(self, sighting: TargetSighting) -> TargetFix | None:
-        """Fuse a sighting of at least one surface. Three that fit no track restart the filter.
+        """Fuse an observation of at least one surface; None for one that fits no track.
 
-        None for a sighting that fits none: where the target would be by its motion is no place at
-        which it was seen.
+        Three of those restart the filter.
         """
         tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]
         met = _met(tracks, sighting.surfaces)

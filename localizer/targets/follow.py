@@ -1,9 +1,9 @@
-"""A target followed in the image: its appearance, looked for on ground that the pose holds still.
+"""Tracks a target's appearance in the image, on ground rectified by the pose.
 
-Each frame is resampled to a chart: a square of the horizontal plane through the target, of fixed
-metres per cell. In charts the camera's motion is gone: what stands still stays in its cell, a car
-moves by its own way at its own size, and the chart turns with it through a bend. Normalised
-cross-correlation with two templates (the first one and one of late) finds it there.
+Each frame is resampled to a chart: a square of the horizontal plane through the target, with
+constant metres per cell. Charts remove the camera's motion: static objects stay in their cells, and
+a car keeps its size; the chart turns with its course. Normalised cross-correlation with two
+templates (the first and a recent one) finds the target.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from localizer.targets.foreground import (
     is_distinct,
     is_ground,
 )
-from localizer.targets.standing import StandingLook
+from localizer.targets.standing import StaticAppearance
 from localizer.targets.track import projected
 from localizer.types import PoseEstimate
 
@@ -61,7 +61,7 @@ _FLAT = 4.0  # grey levels: a template of less contrast tells nothing
 
 @dataclass(frozen=True)
 class FollowedPosition:
-    """Where the target is in a frame. position: (3,) world metres on the chart's plane."""
+    """Position (3,) of the target in a frame, world metres on the chart's plane."""
 
     position: Array
     pixel: tuple[float, float]
@@ -69,7 +69,7 @@ class FollowedPosition:
 
 
 class ImageFollower:
-    """Follows one target from a frame in which its place is known. Not thread-safe.
+    """Tracks one target from a frame with a known position. Not thread-safe.
 
     half_m: half the side of what is followed; None around a point. Use `ready` first: plain ground
     has no look that could be followed.
@@ -98,7 +98,7 @@ class ImageFollower:
         self._isolated_look: TargetAppearance | None = None  # as it was on that ground
         self._learns_m = 0.5 * self._half_m  # from where it was clicked, once it is so far away
         self._renewed_ns = estimate.exposure_time_ns
-        self._stands = StandingLook()
+        self._stands = StaticAppearance()
         self.ready = first is not None and float(first.std()) >= _FLAT
 
     def find(
@@ -110,7 +110,7 @@ class ImageFollower:
         *,
         was_hidden: bool = False,
     ) -> FollowedPosition | None:
-        """The target within `reach_m` of where it is expected (3,); None where it is not seen.
+        """Find the target within `reach_m` of the expected position (3,); None if it is not seen.
 
         was_hidden: it comes out of an occlusion, so nearer to there is likelier.
         """
@@ -151,10 +151,10 @@ class ImageFollower:
         *,
         was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:
-        """(whether these pictures can tell, the target): as `find`, of an isolated target, where it
-        covers the ground that `pictures` show without it. Neither road markings nor shadows under
-        it are taken for its look; where it looks as the ground does, or has stood in them all, they
-        cannot tell.
+        """Returns (whether these images can decide, the target). As `find`, for an isolated target,
+        compared with `pictures` of the same ground without it, so that road markings and shadows
+        are not mistaken for it. They cannot decide if it looks like the ground or is in all of
+        them.
         """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)
@@ -213,8 +213,8 @@ class ImageFollower:
             self._learns_m = np.inf if is_off else gone_m + 0.5 * self._half_m
 
     def isolate(self, pictures: Sequence[tuple[PoseEstimate, Gray]]) -> bool:
-        """Tell it from the ground by pictures of where it was first seen, without it; False if it
-        cannot be told: it does not move, or the pictures do not show that.
+        """Separate the target from the ground, by images of its first position without it; False if
+        that is impossible because it does not move or the images do not show it.
 
         In charts the ground stands still, so what differs from their median is what has moved. A
         grey car on a grey road differs in parts: all of them about its middle are taken for it.
@@ -242,7 +242,7 @@ class ImageFollower:
         return True
 
     def watch(self, gray: Gray, estimate: PoseEstimate, position: Array) -> bool:
-        """`is_changed`, with the next frame of what stands at a place (3,)."""
+        """As `is_changed`, after processing the next frame of a static target at (3,)."""
         chart = self._chart(gray, estimate, position, self._half, course=0.0)
         if chart is not None:
             self._stands.see(estimate.exposure_time_ns, chart)
@@ -250,13 +250,11 @@ class ImageFollower:
 
     @property
     def is_changed(self) -> bool:
-        """Whether what stands looks otherwise since a sudden change: it left, or something is
-        before it.
-        """
+        """Whether a static target's image changed suddenly and stayed so: it left or is covered."""
         return self._stands.is_changed
 
     def shows_ground(self, gray: Gray, estimate: PoseEstimate) -> bool:
-        """Whether the ground is seen where an isolated target was first, as it was without it."""
+        """Whether the ground is seen at the first position of an isolated target, as without it."""
         chart = self._chart(gray, estimate, self._origin, self._half, course=0.0)
         if chart is None or self._isolated_look is None or self._ground is None:
             return False
@@ -268,7 +266,7 @@ class ImageFollower:
 
     @property
     def is_isolated(self) -> bool:
-        """Whether it is known which cells are the target's and which the ground's."""
+        """Whether target and ground cells are separated."""
         return self._mask is not None
 
     def _turned(self, chart: Grey | None, angle: float) -> Grey | None:

@@ -1,8 +1,7 @@
-"""Detects an object before known ground by a likelihood test.
+"""Detects an object before known ground by a likelihood ratio test.
 
-A car's outline on a zebra crossing is the crossing's as much as its own, and correlation follows
-the stripes. With the ground known, each place of the look is asked: is the picture there the look,
-or the ground? What both share counts for neither.
+Correlation alone would follow ground texture, such as zebra stripes. With the ground known, each
+cell is tested: does it show the object or the ground? Cells that are alike in both do not count.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ _AHEAD = 3  # an end is a third of the length
 
 @dataclass(frozen=True)
 class TargetAppearance:
-    """A target's own look in a chart. grey, inside, about: (2 half + 1) square; inside is 1 where
-    the grey levels are the target's own, about is 1 close by, where the ground is seen.
+    """A target's appearance in a chart. grey, inside, about: (2 half + 1) square; inside is 1 in
+    the target, about is 1 close by on the ground.
     """
 
     grey: Grey
@@ -60,7 +59,7 @@ class TargetAppearance:
 
 @dataclass(frozen=True)
 class AppearanceCoverage:
-    """Where a look covers the ground. share: of the look that is seen, 1 is all of it; offset: (2,)
+    """Position of the target over the ground. share: visible part, 1 is all of it; offset: (2,)
     cells, x then y; evidence: log-likelihood ratio against the ground, times twice the noise's
     variance.
     """
@@ -71,7 +70,7 @@ class AppearanceCoverage:
 
 
 def is_distinct(ground: Grey, look: TargetAppearance) -> bool:
-    """Whether the look in the middle of the ground (both square) differs enough to be told."""
+    """Whether the target differs enough from the ground (both square) to be detected."""
     side, size = len(look.grey), len(ground)
     k = (size - side) // 2
     off = (ground[k : k + side, k : k + side] - look.grey) ** 2
@@ -79,8 +78,8 @@ def is_distinct(ground: Grey, look: TargetAppearance) -> bool:
 
 
 def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
-    """Whether a chart (all of one size) shows the ground and nothing of the look, though the two
-    differ.
+    """Whether a chart shows the ground and nothing of the target, although the two differ. All are
+    of one size.
     """
     if not is_distinct(ground, look):
         return False
@@ -93,9 +92,9 @@ def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
 def covered(
     chart: Grey, ground: Grey, look: TargetAppearance, aside: float = 0.0
 ) -> AppearanceCoverage | None:
-    """Where the look covers the ground; None where it does not, is half hidden, or a second place
-    rivals. chart, ground: squares of the same size. aside: by how much evidence at the end of the
-    reach counts less.
+    """Position at which the target covers the ground; None without one, if it is half hidden, or if
+    a second position is as likely. chart, ground: squares of the same size. aside: by how much less
+    evidence counts at the end of the search range.
 
     Of Gaussian noise, the log-likelihood ratio of look against ground goes with ``sum (I - G)² -
     (I - L)²``; a picture ``G + a (L - G)`` has ``(2 a - 1)`` of what the whole look would have,

@@ -1,8 +1,7 @@
-"""Limits for reported targets: on the map, at the measured depth, and without jumps.
+"""Plausibility limits for target positions: on the map, at the measured depth, without jumps.
 
-A map with a hole under a car lets the car's rays meet what lies behind, hundreds of metres on. Each
-such place lies under its pixel and has a small covariance of its own; that it is wrong shows in
-where the target was before, and in what the same rays met then.
+Through a hole in the map under a car, its rays hit the ground hundreds of metres behind, with a
+small covariance. The target's previous position and the depth of neighbouring rays show the error.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _ASIDE = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dty
 
 
 class RefusalReason(enum.Enum):
-    """Why a sighting gives no fix."""
+    """Why an observation gives no position."""
 
     NO_MAP = "no map under it"
     TOO_FAR = "{metres:.0f} m away"
@@ -65,7 +64,7 @@ class _Leap:
 
 class LastPlace:
     """Last reported position of a target. Not thread-safe. confirm_ns: time over which its first
-    sightings must agree; a hole in the depth of the first frames is gone by then.
+    observations must agree, so that holes in the first frames' depth do not matter.
     """
 
     def __init__(self, confirm_ns: int = 0) -> None:
@@ -75,7 +74,7 @@ class LastPlace:
         self._begun_ns = 0
 
     def objection(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
-        """Why a place is not believed; None for one that is, which is the last one from then on.
+        """Why a position is rejected; None if it is accepted, which makes it the last position.
 
         A detector may give its name to another object: then the new place is told once it has been
         seen for as long as the old one was, 3 s at the most.
@@ -117,9 +116,9 @@ class LastPlace:
         return None
 
 
-def is_by_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
-    """Whether a ray passes through a hole of the map, or close by one or by the map's end: what it
-    meets is then what lies behind. eye, direction: (3,); distance: metres to what it meets.
+def is_near_map_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
+    """Whether a ray passes through or near a hole of the map or its edge, so that it hits ground
+    behind. eye, direction: (3,); distance: metres to its hit.
 
     A hole shows as nothing at all, or as a place much farther away than all that is about it.
     """
@@ -135,9 +134,7 @@ def is_by_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -
 
 
 def is_on_map(fix: TargetFix, cast: RayCaster) -> bool:
-    """Whether the map has a surface about the height of the place, there or as far beside it as its
-    error reaches.
-    """
+    """Whether the map has a surface at about the position's height, within its error."""
     P = fix.covariance
     aside = max(1.0, 2.0 * float(np.sqrt(P[0, 0] + P[1, 1])))
     reach = _OFF_SURFACE_M + _SIGMAS * float(np.sqrt(P[2, 2]))
@@ -153,8 +150,8 @@ def is_on_map(fix: TargetFix, cast: RayCaster) -> bool:
 def is_at_seen_depth(
     fix: TargetFix, eye: Array, direction: Array, surfaces: tuple[TargetSurface, ...]
 ) -> bool:
-    """Whether a place is as far along the pixel's ray as one of the surfaces that the frame's rays
-    met; eye, direction: (3,) of that ray. Errors of both count.
+    """Whether a position is at the depth of one of the surfaces that the frame's rays hit, within
+    both errors. eye, direction: (3,) of the pixel's ray.
     """
     along = float((fix.position_world - eye) @ direction)
     own = float(np.sqrt(direction @ fix.covariance @ direction))

@@ -1,8 +1,8 @@
-"""Locate pixels: rays from the estimated pose, with covariance and every surface in reach.
+"""Locates pixels: rays from the estimated pose, with covariance and all possible surfaces.
 
-Paper, Sec. 3.3.2 (end): a query pixel is mapped to the map by a ray from the estimated pose. At a
-roof's edge the errors of pose and pixel decide which surface that ray meets. So a bundle of rays is
-cast that samples these errors, and every surface that it meets is told with its probability.
+Paper, Sec. 3.3.2 (end): a pixel is located by a ray from the estimated pose. At a roof's edge the
+errors of pose and pixel decide which surface the ray hits. So a bundle of rays samples these
+errors, and every surface hit is returned with its probability.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MIN_COSINE = 0.05
 @dataclass(frozen=True)
 class RaySpread:
     """Uncertainty of a ray's direction. sideways: (2, 3) unit vectors across the ray; pose, pixel:
-    (2, 2) rad² along them, what each of the two errs by, for a point at the given distance.
+    (2, 2) rad² along them, from the errors of pose and pixel.
     """
 
     sideways: Array
@@ -45,7 +45,7 @@ class RaySpread:
 
     @property
     def covariance(self) -> Array:
-        """Of both together, (2, 2) rad²."""
+        """Sum of both, (2, 2) rad²."""
         total: Array = self.pose + self.pixel
         return total
 
@@ -63,7 +63,7 @@ def ray_spread(
     distance: float,
     drift: tuple[float, float] = (0.0, 0.0),
 ) -> RaySpread:
-    """How far off the ray of a pixel may be, first order.
+    """Uncertainty of a pixel's ray, first order.
 
     A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel's error
     turns the ray by the camera model's own derivative. drift: one sigma of an error (pixels) along
@@ -84,11 +84,11 @@ def ray_spread(
 def surface_covariance(
     offset: Array, normal: Array, spread: RaySpread, map_sigma_m: float
 ) -> Array:
-    """Covariance (3, 3) in m², world axes, of a ray's meeting point with a surface.
+    """Covariance (3, 3) in m², world axes, of a ray's hit on a surface.
 
-    offset: (3,) from the camera to the point. First order about the tangent plane with normal n
-    (3,): what moves the ray across by e moves the point by ``M e``, ``M = I - d n' / (n' d)``. The
-    map's own error adds along the ray.
+    offset: (3,) from the camera to the hit; normal: (3,) of the surface; spread: of the ray. First
+    order about the tangent plane: a displacement e across the ray moves the hit by ``M e``, ``M = I
+    - d n' / (n' d)``. map_sigma_m is added along the ray.
     """
     distance = float(np.linalg.norm(offset))
     d = offset / distance
@@ -108,7 +108,7 @@ def locate(
     drift: tuple[float, float] = (0.0, 0.0),
     outline_sigma_m: float = 0.0,
 ) -> tuple[TargetSurface, ...]:
-    """The surfaces that a pixel may show, the most probable one first; none if it shows no map.
+    """The surfaces that a pixel may show, most probable first; empty if it shows no map.
 
     Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
     a surface's is the mean of its own hits. drift: as of `ray_spread`. outline_sigma_m: how far the

@@ -1,9 +1,7 @@
-"""Detects whether a standing target still looks as before: its middle, without the ground around
-it.
+"""Detects whether a static target still looks as before, by its middle without the surroundings.
 
-A template of a parked car beside a zebra crossing is the crossing's more than the car's: it is
-found again with the car gone. So the middle alone is compared, with how it looked a second ago: the
-view of what is not flat changes slowly, a car that leaves or a thing that comes before it at once.
+A whole template would match the surroundings with the target gone. The middle is compared with its
+image a second ago: a changing view changes it slowly, a departure or an obstacle suddenly.
 """
 
 from __future__ import annotations
@@ -26,9 +24,9 @@ _LEARNS_NS = 1_000_000_000  # what is usual, before anything is not
 _LATELY = 0.2  # weight of the newest in what is usual
 
 
-class StandingLook:
-    """One place's look over time. Not thread-safe. is_changed: it looks otherwise than before a
-    sudden change, and has since.
+class StaticAppearance:
+    """Appearance of one target over time. Not thread-safe. is_changed: it changed suddenly and has
+    stayed so.
     """
 
     def __init__(self) -> None:
@@ -39,7 +37,7 @@ class StandingLook:
         self.is_changed = False
 
     def see(self, time_ns: int, chart: Grey) -> None:
-        """The place's chart (square, of one size and course) in the next frame."""
+        """Process the target's chart (square, of one size and course) in the next frame."""
         while len(self._kept) > 1 and time_ns - self._kept[1][0] >= _BEFORE_NS:
             self._kept.popleft()
         before = self._before

@@ -1,13 +1,9 @@
-"""Estimates the position of a standing target: hypotheses that do not stay under its pixel are
-dropped.
+"""Estimates a static target's position from several viewpoints; wrong hypotheses are dropped.
 
-Every surface that a sighting's bundle of rays meets begins a hypothesis, a point on that surface's
-plane. As the aircraft moves, all rays so far pull at each of them (parallax), and each must have
-been in sight where the target was seen. A hypothesis beside the true surface is torn off its plane
-or left behind by the rays: its weight goes.
-
-A registration errs alike in two pictures of the same view. So rays are averaged by viewpoint:
-within one, only the pixels' own noise averages out; the pose's error counts in full.
+Every surface hit by an observation's rays starts a hypothesis, a point on that surface's plane. As
+the aircraft moves, parallax pulls wrong hypotheses off their planes or away from the rays, and each
+must have been visible where the target was seen. Pose errors repeat between images of the same
+view, so rays are averaged per viewpoint: only pixel noise averages out within one.
 """
 
 from __future__ import annotations
@@ -54,7 +50,7 @@ class SightedRay:
 
 @dataclass(frozen=True)
 class PositionHypothesis:
-    """Where the target may be. weight: probability; position: (3,) m; covariance: (3, 3) m²."""
+    """A possible target position. weight: probability; position: (3,) m; covariance: (3, 3) m²."""
 
     weight: float
     position: Array
@@ -120,7 +116,7 @@ class _Hypothesis:
 
 
 class StaticTarget:
-    """All hypotheses of a standing target; not thread-safe. map_sigma_m: of the surface."""
+    """All hypotheses of a static target; not thread-safe. map_sigma_m: of the surface."""
 
     def __init__(self, map_sigma_m: float) -> None:
         self._map_sigma_m = map_sigma_m
@@ -130,7 +126,7 @@ class StaticTarget:
         self.sightings = 0
 
     def update(self, ray: SightedRay, surfaces: tuple[TargetSurface, ...]) -> bool:
-        """Add a sighting of at least one surface; False, and unchanged, if it fits no place."""
+        """Add an observation of at least one surface; False, unchanged, if it fits none."""
         view = _View.of(ray, surfaces)
         if self._hypotheses:
             off = min(_mahalanobis(view, h) for h in self._hypotheses)
@@ -145,18 +141,18 @@ class StaticTarget:
 
     @property
     def strain(self) -> float:
-        """How much more the newest sightings disagree than their errors say, squared; 1: not."""
+        """Squared ratio of the newest residuals to their expected errors; 1: consistent."""
         n = len(self._recent)
         return max(1.0, sum(self._recent) / (2 * n)) if n else 1.0
 
     @property
     def moves(self) -> bool:
-        """Whether the newest sightings say that it does not stand still."""
+        """Whether the newest observations show that it moves."""
         n = len(self._recent)
         return n > 0 and sum(self._recent) > 2 * n + 8.0 * np.sqrt(n)
 
     def places(self) -> tuple[PositionHypothesis, ...]:
-        """The one of the smallest expected error first, then by weight."""
+        """The hypotheses: the one with the smallest expected error first, then by weight."""
         logs = np.array([h.log_weight for h in self._hypotheses])
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()
@@ -225,7 +221,7 @@ class StaticTarget:
 
 
 def thinned(views: Sequence[_Item]) -> list[_Item]:
-    """Every second, each once, the newest and the first among them: it was placed by that one."""
+    """Every second item, always with the newest and the first."""
     return [views[0], *views[:0:-2][::-1]]
 
 

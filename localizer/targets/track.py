@@ -1,8 +1,8 @@
-"""Track of one target: standing or moving, seen, held by geometry or hidden.
+"""Track of one target: static or moving; seen, held by geometry or hidden.
 
-A sighting feeds both what it would be if it stood still (`StaticTarget`) and if it moved
-(`TargetFilter`). It stands still until its rays deny that, and again after it has stood a while:
-a velocity is told of what was measured to move, and of nothing else.
+An observation updates both a static (`StaticTarget`) and a moving hypothesis (`TargetFilter`). The
+target is static until its rays contradict that, and again after it has stood for a while. A
+velocity is reported only if motion was measured.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from localizer.targets.limits import (
     RefusalReason,
     TargetRefusal,
     is_at_seen_depth,
-    is_by_hole,
+    is_near_map_hole,
     is_on_map,
 )
 from localizer.targets.locate import (
@@ -44,10 +44,10 @@ _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
 
 @dataclass(frozen=True)
 class TargetSettings:
-    """pixel_sigma: of a sighting, pixels; map_sigma_m: of the map's surface; max_sigma_m: nothing
-    is told that may be off by more; max_range_m: nor what is farther away; outline_sigma_m: of the
-    map's outlines, across the ray; confirm_s: for so long sightings must agree before the first is
-    told, 0 for what is seen once only.
+    """pixel_sigma: of an observation, pixels; map_sigma_m: of the map's surface; max_sigma_m,
+    max_range_m: limits of reported positions; outline_sigma_m: of the map's outlines, across the
+    ray; confirm_s: time over which observations must agree before the first report, 0 for single
+    ones.
     """
 
     pixel_sigma: float = 1.5
@@ -60,7 +60,7 @@ class TargetSettings:
 
 
 class TargetTrack:
-    """One target over time; not thread-safe. refusal: why the last `see` gave no fix."""
+    """Track of one target; not thread-safe. refusal: why the last `see` gave no position."""
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id = target_id
@@ -78,12 +78,12 @@ class TargetTrack:
 
     @property
     def moves(self) -> bool:
-        """Whether it was measured to move."""
+        """Whether motion was measured."""
         return self._moves
 
     @property
     def velocity(self) -> Array | None:
-        """(3,) m/s, world axes, of a target that moves; None where none was measured."""
+        """(3,) m/s, world axes, of a moving target; None otherwise."""
         return self._moving.velocity if self._moves else None
 
     def see(
@@ -94,7 +94,7 @@ class TargetTrack:
         drift: tuple[float, float] = (0.0, 0.0),
         pixel_sigma: float | None = None,
     ) -> TargetFix | None:
-        """Add the pixel of an accepted frame; None, and `refusal`, where nothing may be told."""
+        """Add the target's pixel in an accepted frame; None, with `refusal`, without a position."""
         settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
         time_ns, self.refusal = estimate.exposure_time_ns, None
         eye, d = ray_in_world(estimate, pixel)
@@ -107,7 +107,7 @@ class TargetTrack:
         distance = float(np.linalg.norm(surfaces[0].position - eye))
         if distance > settings.max_range_m:
             return self._refuse(TargetRefusal(RefusalReason.TOO_FAR, distance))
-        if self._last.fix is None and is_by_hole(eye, d, distance, self._cast):
+        if self._last.fix is None and is_near_map_hole(eye, d, distance, self._cast):
             self._begin_anew()
             return self._refuse(TargetRefusal(RefusalReason.HOLE))
         if any(drift):
@@ -152,7 +152,7 @@ class TargetTrack:
         self._last = LastPlace(round(self._settings.confirm_s * 1e9))
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
-        """Position (3,) and covariance (3, 3) where it should be at a time; None before a fix."""
+        """Predicted position (3,) and covariance (3, 3) at a time; None before the first."""
         if self._last.fix is None:
             return None
         if self._moves:
@@ -161,8 +161,8 @@ class TargetTrack:
         return best.position, best.covariance
 
     def coast(self, estimate: PoseEstimate) -> TargetFix | None:
-        """A moving target that is not seen, where its motion carries it; None of another, and where
-        that leads out of the picture or off the map.
+        """Predicted position of an unseen moving target; None for a static one, and outside the
+        image or the map.
         """
         expected = self.expected(estimate.exposure_time_ns) if self._moves else None
         if expected is None:
@@ -180,7 +180,7 @@ class TargetTrack:
         return fix if pixel is not None and is_on_map(fix, self._cast) else None
 
     def hold(self, estimate: PoseEstimate) -> TargetFix | None:
-        """A standing target where the pose projects it; None of one that moves, or before one."""
+        """A static target's position by the pose alone; None for a moving one or before a fix."""
         if self._moves or self._last.fix is None:
             return None
         fix = self._standing(estimate, None)
@@ -194,7 +194,7 @@ class TargetTrack:
         return replace(fix, pixel=pixel, visibility=seen)
 
     def is_hiding(self, estimate: PoseEstimate, position: Array) -> bool:
-        """Whether the map hides a moving target at (3,), or will within half a second.
+        """Whether the map hides a moving target at (3,) now or within half a second.
 
         What is seen of one that is half hidden pulls it aside.
         """
@@ -203,14 +203,14 @@ class TargetTrack:
         return self.is_hidden(estimate, position) or self.is_hidden(estimate, ahead)
 
     def is_hidden(self, estimate: PoseEstimate, point: Array, beyond_m: float = 0.0) -> bool:
-        """Whether the map stands before a point (3,), by more than `beyond_m` and 1.5 m."""
+        """Whether the map hides a point (3,), by more than `beyond_m` and 1.5 m."""
         eye = estimate.world_from_camera.translation
         distance = float(np.linalg.norm(point - eye))
         first = float(self._cast(eye, (point - eye)[None] / distance).distances[0])
         return distance - first > max(_HIDDEN_M, beyond_m)
 
     def places(self) -> tuple[PositionHypothesis, ...]:
-        """Where it may stand, the reported place first; none of one that moves."""
+        """Hypotheses of a static target, the reported one first; empty for a moving one."""
         return self._static.places() if self._last.fix is not None and not self._moves else ()
 
     def _standing(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
@@ -278,7 +278,7 @@ def _aim(
 
 
 def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
-    """The pixel of a world point (3,) in a frame; None beside the picture.
+    """Pixel of a world point (3,) in a frame; None outside the image.
 
     The lens model folds what is far beside the picture back into it: what does not come back to
     itself as a ray is not in view.

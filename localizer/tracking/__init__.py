@@ -1,1 +1,1 @@
-"""One frame's way: the two halves of the algorithm, the engine around them, motion, acceptance."""
+"""Processing of frames: reference rendering, localization, engine, motion, acceptance."""

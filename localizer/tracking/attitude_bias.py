@@ -40,7 +40,7 @@ _APART, _LEAST_APART_M = 0.5, 20.0  # of the distance; between two places that s
 
 @dataclass(frozen=True)
 class AttitudePrior:
-    """How accurately the autopilot's and the gimbal's attitude give the camera's roll and pitch."""
+    """Accuracy of the camera's roll and pitch from autopilot and gimbal."""
 
     tilt_sigma_deg: float = SENSORS.tilt_deg  # smallest error of roll and pitch, without the bias
     alignment_sigma_deg: float = (
@@ -49,7 +49,7 @@ class AttitudePrior:
 
     @classmethod
     def known_to(cls, sigma_deg: float) -> AttitudePrior:
-        """Roll and pitch, each with an error of such a sigma that is another in every image."""
+        """Roll and pitch with this sigma and no constant bias."""
         return cls(max(sigma_deg, _LEAST_SIGMA_DEG), _LEAST_SIGMA_DEG)
 
 
@@ -72,18 +72,18 @@ class AttitudeBias:
 
     @property
     def sigma_rad(self) -> float:
-        """Of the reported roll and pitch once they are corrected, along their worse axis."""
+        """Sigma of the reported roll and pitch after correction, along the worse axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1] + self.spread))
 
     @property
     def off_deg(self) -> tuple[float, float]:
-        """The constant: pitch, roll."""
+        """The estimated bias: pitch, roll."""
         pitch, roll = np.degrees(self.mean)
         return float(pitch), float(roll)
 
     @property
     def reported_deg(self) -> tuple[float, float, float]:
-        """The constant, and the sigma of the rest: for reports."""
+        """The bias (pitch, roll), and the sigma after correction: for reports."""
         pitch, roll, sigma = (
             round(float(v), 2) for v in (*self.off_deg, np.degrees(self.sigma_rad))
         )
@@ -97,8 +97,8 @@ def unknown(config: AttitudePrior) -> AttitudeBias:
 
 
 def horizontal_axes(rotation: Array) -> Array | None:
-    """(3, 2) unit vectors in the world: to the right of a camera of rotation (3, 3), and ahead of
-    it. None where it is rolled on its side.
+    """(3, 2) unit vectors in the world: to the right of a camera with rotation (3, 3), and ahead of
+    it. None if it is rolled on its side.
     """
     right = np.array([rotation[0, 0], rotation[1, 0], 0.0])
     length = float(np.hypot(right[0], right[1]))
@@ -109,8 +109,8 @@ def horizontal_axes(rotation: Array) -> Array | None:
 
 
 def constraint(bias: AttitudeBias, reported: Array) -> PoseConstraint | None:
-    """Roll and pitch of a camera, from its rotation (3, 3) as reported at a frame's exposure; None
-    where it is rolled on its side.
+    """Constraint of the camera's roll and pitch from its reported rotation (3, 3), corrected by the
+    bias; None if it is rolled on its side.
     """
     axes = horizontal_axes(reported)
     if axes is None:
@@ -124,8 +124,8 @@ def constraint(bias: AttitudeBias, reported: Array) -> PoseConstraint | None:
 
 @dataclass(frozen=True)
 class AttitudeObservation:
-    """A registration that no attitude has constrained, at `time_ns`. covariance: (6, 6) of its
-    pose, what map and calibration err by included; distance_m: of what it shows.
+    """A registration at `time_ns` that did not use the attitude. covariance: (6, 6) of its pose,
+    map and calibration errors included; distance_m: to the ground in view.
     """
 
     pose: Pose
@@ -135,13 +135,13 @@ class AttitudeObservation:
 
 
 def is_new_ground(bias: AttitudeBias, place: Array, distance_m: float) -> bool:
-    """Whether `place` (3,) gives an independent observation: over the same ground errors repeat."""
+    """Whether `place` (3,) gives an independent observation: errors repeat over the same ground."""
     apart_m = max(_LEAST_APART_M, _APART * distance_m)
     return bias.place is None or bool(np.hypot(*(place[:2] - bias.place)) >= apart_m)
 
 
 def passed(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
-    """The horizon at `place` (3,), from where nothing was learned: less sure, by the time."""
+    """The bias after uninformative ground at `place` (3,): its covariance grows with time."""
     apart_s = abs(time_ns - bias.time_ns) * 1e-9 if bias.place is not None else 0.0
     walked = np.eye(2) * _WALK_RAD**2 * min(apart_s, 60.0)
     covariance = bias.covariance + walked
@@ -151,7 +151,7 @@ def passed(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
 def measured(
     bias: AttitudeBias, config: AttitudePrior, reported: Array, sight: AttitudeObservation
 ) -> AttitudeBias:
-    """The horizon after another sight. reported: (3, 3) as in `constraint`."""
+    """The bias after another observation. reported: rotation (3, 3) as in `constraint`."""
     axes = horizontal_axes(reported)
     if axes is None:
         return bias
@@ -181,7 +181,7 @@ def measured(
 
 
 class AttitudeBiasEstimator:
-    """The horizon of one camera, from frame to frame; belongs to the localization thread.
+    """Estimates the attitude bias of one camera; use it on the localization thread.
 
     config: None constrains nothing. rotation_at: (3, 3) world_from_camera as reported of a time in
     ns, or None.
@@ -193,14 +193,14 @@ class AttitudeBiasEstimator:
         """None where nothing is constrained."""
 
     def constraint(self, time_ns: int) -> PoseConstraint | None:
-        """Roll and pitch of the camera at a frame's exposure."""
+        """Constraint of the camera's roll and pitch at a frame's exposure."""
         reported = self._rotation_at(time_ns)
         if self.bias is None or reported is None:
             return None
         return constraint(self.bias, reported)
 
     def is_due(self, place: Array, distance_m: float) -> bool:
-        """Whether a sight from `place` (3,) is wanted."""
+        """Whether an observation from `place` (3,) is wanted."""
         return self.bias is not None and is_new_ground(self.bias, place, distance_m)
 
     def pass_by(self, place: Array, time_ns: int) -> None:
@@ -211,7 +211,7 @@ class AttitudeBiasEstimator:
             self.bias = passed(self.bias, place, time_ns)
 
     def learn(self, sight: AttitudeObservation) -> None:
-        """Take a sight."""
+        """Add an observation."""
         reported = self._rotation_at(sight.time_ns)
         if self.bias is not None and self._config is not None and reported is not None:
             self.bias = measured(self.bias, self._config, reported, sight)

@@ -1,8 +1,8 @@
-"""Propagates the pose from frame to frame while the map does not match.
+"""Propagates the pose by odometry while the map does not match.
 
-Snow, a building site, the map's edge: the picture is good and the map says nothing. The odometry
-keeps every accepted frame as a possible beginning, which costs nothing, and steps on from it when
-frames are rejected (docs/explanation/odometry.md).
+Snow, a building site, the map's edge: the image is good but does not match the map. Every accepted
+frame is kept as a possible start, at no cost; after rejected frames odometry continues from it
+(docs/explanation/odometry.md).
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
 
 
-def fallen_m(place: Array) -> float:
-    """By how much the ground of a place (3,) lies below the plane through the world's origin, since
-    the Earth is round: 7.8 m at 10 km, where 50 m further on are another 0.08 m.
+def curvature_drop_m(place: Array) -> float:
+    """Height (m) by which the Earth's curvature lowers the ground at a position (3,) below the
+    tangent plane at the world's origin: 7.8 m at 10 km.
     """
     return float(place[:2] @ place[:2]) / (2.0 * EARTH_RADIUS_M)
 
@@ -56,8 +56,8 @@ class PropagationResult(Enum):
 
 @dataclass(frozen=True)
 class PropagatedPose:
-    """The odometry's answer for one frame. pose, covariance (6, 6), scale_sigma (see
-    `OdometryEstimate`): where it is CARRIED.
+    """The odometry's result for one frame. pose, covariance (6, 6), scale_sigma (see
+    `OdometryEstimate`): set if the status is CARRIED.
     """
 
     status: PropagationResult
@@ -77,7 +77,7 @@ _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
 
 class DeadReckoning:
-    """The odometry beside the map's registration; one thread, the localization thread's.
+    """Odometry beside the map's registration; use it on the localization thread.
 
     camera: the working pinhole, which follows a lens that zooms. sensors: other sensors' accounts
     of the camera, terrain: the ground's shape, ground: what is not known of it, see `Localizer`.
@@ -97,14 +97,14 @@ class DeadReckoning:
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is a pose to carry on from."""
+        """Whether there is a start pose."""
         return self._odometry.ready
 
     def begin(
         self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array,
         sweep: Sweep | None = None,
     ) -> None:  # fmt: skip
-        """The map has just located this frame: end earlier dead reckoning."""
+        """The map located this frame: end earlier dead reckoning and start here."""
         camera = followed(self._pinhole, estimate.camera)
         frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
         self._odometry.begin(
@@ -120,7 +120,7 @@ class DeadReckoning:
         self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None,
         sweep: Sweep | None = None,
     ) -> PropagatedPose:  # fmt: skip
-        """Carry the pose on to a frame. anchors: of the reference at the prediction, if any."""
+        """Propagate the pose to a frame. anchors: of the reference at the prediction, if any."""
         if not self._odometry.ready:
             return _NOTHING
         camera = followed(self._pinhole, frame.camera)
@@ -162,6 +162,6 @@ class DeadReckoning:
         if rotation is not None:
             known.append(attitude_constraint(rotation, _TILT_RAD, _HEADING_RAD))
         if height_m is not None:
-            world_z = height_m - fallen_m(about.translation)
+            world_z = height_m - curvature_drop_m(about.translation)
             known.append(height_constraint(world_z, _HEIGHT_M))
         return combine(*known) if known else None

@@ -1,12 +1,12 @@
-"""The dual-thread engine (paper, Sec. 3.2): rendering runs parallel to localization.
+"""The dual-thread engine (paper, Sec.
 
-The localization thread takes the newest frame, registers it against the newest reference and
-publishes the estimate; meanwhile the next frame's features are extracted on a thread of their own.
-Each estimate wakes the render thread, which predicts the pose at the next exposure, renders the
-reference for it, unless the last one still serves, and has the map loaded along the way ahead.
-None waits for a subscriber, and none dies of an error: errors are counted, logged and reported as
-the engine's health. While no place is known a further thread searches for one; what it finds is
-tried by the localization thread, which goes on trying meanwhile.
+3.2): rendering runs parallel to localization. The localization thread takes the newest frame,
+registers it against the newest reference and publishes the estimate. An extraction thread computes
+the next frame's features meanwhile. After each estimate the render thread predicts the pose at the
+next exposure, renders a reference there unless the last one is still valid, and prefetches the map
+ahead. No thread waits for a subscriber or ends because of an error; errors are counted, logged and
+reported as the engine's health. While no position is known, a further thread searches for one, and
+the localization thread tests its results.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from localizer.errors import LocalizerError
-from localizer.tracking.engine_health import EngineHealth, HealthBook
+from localizer.tracking.engine_health import EngineHealth, HealthCounters
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
 from localizer.tracking.prefetch import FeaturePrefetcher, PrefetchedFrame
@@ -89,7 +89,7 @@ class DualThreadEngine:
         self._interval_ns = _DEFAULT_INTERVAL_NS
         self._last_exposure_ns: int | None = None
         self._reference_ms: dict[str, float] = {}
-        self._book = HealthBook(localizer.renderer_name, localizer.features_name)
+        self._book = HealthCounters(localizer.renderer_name, localizer.features_name)
         self._stop = threading.Event()
         self._turns: dict[str, int] = {}
         self._threads = [
@@ -135,7 +135,7 @@ class DualThreadEngine:
         )
 
     def last_ticks_ns(self) -> dict[str, int]:
-        """When each thread that makes fixes began its newest turn, CLOCK_MONOTONIC ns, by name."""
+        """Start of each thread's newest cycle, CLOCK_MONOTONIC ns, by name."""
         return {n: self._turns[n] for n in _FIX_THREADS if n in self._turns}
 
     def _thread(self, name: str, once: Callable[[], None]) -> threading.Thread:

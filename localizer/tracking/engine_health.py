@@ -16,12 +16,11 @@ _REPORT_EVERY_S = 5.0
 
 @dataclass(frozen=True)
 class EngineHealth:
-    """Counters since the start, the text of the error that stands ("" when none does), and which
-    renderer, feature network and optimizer serve. map_loading: that error is that tiles are still
-    being read. searches, found: of places without a prior;
-    searching: whether one is under way; search_hangs: for so long that none will answer.
-    horizon_off_deg: what autopilot and gimbal are off by in pitch and roll, and the sigma of their
-    attitude once that is taken out; None where it is not used.
+    """Counters since the start, text of the present error ("" without one), and names of renderer,
+    features and optimizer. map_loading: the error is that tiles are being read. searches, found:
+    numbers of searches and results; searching: one is running; search_hangs: it no longer responds.
+    horizon_off_deg: attitude bias in pitch and roll, and the sigma after correction; None if not
+    used.
     """
 
     frames_in: int = 0
@@ -42,8 +41,8 @@ class EngineHealth:
     horizon_off_deg: tuple[float, float, float] | None = None
 
 
-class HealthBook:
-    """Collects the threads' counters; every method may be called by any of them."""
+class HealthCounters:
+    """Collects the threads' counters. Thread-safe."""
 
     def __init__(self, renderer: str, features: str) -> None:
         self._health = EngineHealth(renderer=renderer, features=features)
@@ -54,7 +53,7 @@ class HealthBook:
     def read(
         self, frames_dropped: int, optimizer: str, bias: AttitudeBias | None = None
     ) -> EngineHealth:
-        """A snapshot, with what only the engine knows."""
+        """A snapshot, with values that only the engine has."""
         with self._lock:
             error = next(iter(self._errors.values()), None)
             return replace(
@@ -73,12 +72,12 @@ class HealthBook:
             self._health = replace(h, **{k: getattr(h, k) + n for k, n in increments.items()})
 
     def set_searching(self, searching: bool) -> None:
-        """Whether a search for a place is under way; it begins or answers, so it does not hang."""
+        """Set whether a search is running; also resets `search_hangs`."""
         with self._lock:
             self._health = replace(self._health, searching=searching, search_hangs=False)
 
     def set_search_hangs(self, hangs: bool) -> None:
-        """Whether the one under way does not answer any more."""
+        """Set whether the running search no longer responds."""
         with self._lock:
             news = hangs and not self._health.search_hangs
             self._health = replace(self._health, search_hangs=hangs)
@@ -86,7 +85,7 @@ class HealthBook:
             _log.error("the search for a place does not answer: the flight goes on without it")
 
     def report(self, error: Exception) -> None:
-        """An error of this thread: it stands until the thread has done its work again."""
+        """Set this thread's error, until the thread works again."""
         with self._lock:
             self._errors[threading.current_thread().name] = error
         self.count(errors=1)
@@ -96,7 +95,7 @@ class HealthBook:
             _log.warning("%s", _text(error))
 
     def clear_error(self) -> None:
-        """This thread has done its work: an error of its own is over, another thread's is not."""
+        """This thread works again: clear its error, but no other thread's."""
         with self._lock:
             self._errors.pop(threading.current_thread().name, None)
 

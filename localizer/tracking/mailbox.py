@@ -1,4 +1,4 @@
-"""A hand-over between threads that holds one item; the newest wins, displaced ones are counted."""
+"""Passes the newest item between threads; replaced items are counted."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Mailbox(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """How many items were displaced before they were taken."""
+        """Number of items replaced before they were taken."""
         with self._changed:
             return self._dropped
 
     @property
     def is_full(self) -> bool:
-        """Whether an item waits, which the next one would displace."""
+        """Whether an item waits, which the next would replace."""
         with self._changed:
             return self._item is not None
 

@@ -75,7 +75,7 @@ class MotionState:
 
 
 def start(prior: PosePrior, config: MotionConfig) -> MotionState:
-    """A filter that knows `prior` and nothing else."""
+    """Filter state from a prior; the velocity is unknown."""
     mean = np.zeros(12)
     mean[:3] = prior.world_from_camera.translation
     known = prior.velocity is not None
@@ -92,7 +92,7 @@ def start(prior: PosePrior, config: MotionConfig) -> MotionState:
 def predict(
     state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None = None
 ) -> MotionState:
-    """The state moved to `time_ns`; a time before the state's own moves it back the same way.
+    """The state at `time_ns`, which may be earlier than the state's own time.
 
     Over more than 10 s it is `kept`.
     turn: rotation (3, 3) of the camera since the state's time in world axes (new = turn @ old), if
@@ -128,9 +128,9 @@ def update(ahead: MotionState, pose: Pose, covariance: Array) -> MotionState:
 
 
 def inflated(state: MotionState, config: MotionConfig) -> MotionState:
-    """The same motion believed half as much: what a good measurement contradicts is a manoeuvre
-    that the constant-velocity model did not foresee, or a wrong measurement. Doubling sigma lets
-    the former in after a frame or two, while the latter would have to repeat itself.
+    """The state with doubled sigmas, after a good measurement contradicted it: the vehicle
+    manoeuvred, or the measurement is wrong. A manoeuvre is then accepted after a frame or two; a
+    wrong measurement would have to repeat itself.
     """
     sigma = np.sqrt(state.covariance.diagonal())
     scale = np.clip(_limits(config) / sigma, 1.0, 2.0)
@@ -148,12 +148,12 @@ def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0
 
 
 def place_sigma_m(prior: PosePrior) -> float:
-    """Sigma of the prior's horizontal place along its least known axis."""
+    """Largest horizontal sigma of a prior's position."""
     return float(np.sqrt(max(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1], 0.0)))
 
 
 def is_beyond_capture(prior: PosePrior) -> bool:
-    """Whether a prediction is so unsure that no registration is expected to find the camera."""
+    """Whether a prediction is too uncertain for a registration to succeed."""
     turn = float(np.sqrt(prior.covariance.diagonal()[3:].max()))
     return place_sigma_m(prior) >= _FULL * _MAX_SIGMA_M or turn >= _FULL * _MAX_SIGMA_RAD
 
@@ -164,7 +164,7 @@ def pose_difference(a: Pose, b: Pose) -> Array:
 
 
 def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None) -> MotionState:
-    """The state's pose at another time, with the sigmas of a search about it; its motion unknown.
+    """The state's pose at another time with the sigmas of a search and unknown motion.
 
     For a camera whose clock jumped: pictures still follow each other, times do not. turn: as in
     `predict`.
@@ -191,13 +191,13 @@ class AuxiliarySensors:
 
 
 class MeasuredMotion:
-    """The motion model with the camera's rotation from another sensor."""
+    """The motion model with the rotation measured by another sensor."""
 
     def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
         self._config, self._rotation_at = config, rotation_at
 
     def ahead(self, state: MotionState, time_ns: int) -> MotionState:
-        """The state moved to `time_ns`."""
+        """Predict the state at `time_ns`."""
         turn = self._turn(state.time_ns, time_ns)
         return predict(state, time_ns, self._config, turn)
 
@@ -210,7 +210,8 @@ class MeasuredMotion:
         return kept(state, time_ns, self._config, turn)
 
     def sweep(self, ahead: MotionState, readout_ms: float) -> Sweep | None:
-        """The camera's motion while a frame at the state's time is read out; None: all at once.
+        """The camera's motion during the readout of a frame at the state's time; None for a global
+        shutter.
 
         Its turn by the other sensor, whose report reaches to both sides of the exposure; without
         one, by the motion model.

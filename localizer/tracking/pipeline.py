@@ -75,7 +75,7 @@ def working_camera(camera: Camera, width: int) -> Camera:
 
 
 class Undistorter:
-    """Turns frames of a (distorted) camera into the working pinhole's images."""
+    """Converts frames of a (distorted) camera to the working pinhole's images."""
 
     def __init__(self, source: Camera, target: Camera) -> None:
         self.source, self._target = source, target
@@ -124,9 +124,9 @@ def _shrink(image: Image, camera: Camera) -> Image:
     return shrunk
 
 
-def only_seen(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
-    """The features without confidence where the lens shows nothing: black is no ground, and
-    anchors that meet it would vote against the pose.
+def mask_unseen_features(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
+    """The features with zero confidence outside the lens's image circle, where anchors would
+    otherwise be compared with black.
     """
     if seen is None:
         return pyramid
@@ -239,7 +239,7 @@ class Localizer:
 
     @property
     def features_name(self) -> str:
-        """Which model computes the features, and on what."""
+        """Name of the feature model and what runs it."""
         return self._extractor.name
 
     @property
@@ -382,7 +382,7 @@ class Localizer:
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
-        return only_seen(self._extractor.extract(undistorter(frame)), undistorter.seen)
+        return mask_unseen_features(self._extractor.extract(undistorter(frame)), undistorter.seen)
 
     def localize(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None

@@ -20,7 +20,7 @@ _SHARE = 0.25  # of a new duration in the smoothed one
 
 @dataclass(frozen=True)
 class PrefetchedFrame:
-    """A frame, its features where they were extracted ahead, and the milliseconds that took."""
+    """A frame, its features if they were extracted ahead, and the extraction time, ms."""
 
     frame: Frame
     features: FeaturePyramid | None = None
@@ -29,22 +29,22 @@ class PrefetchedFrame:
 
 @dataclass
 class ProcessingTimes:
-    """How long an extraction and the taker's work take, smoothed, in seconds."""
+    """Smoothed durations of extraction and registration, seconds."""
 
     extract_s: float = 0.0
     busy_s: float = 0.0
 
     def extracted(self, spent_s: float) -> None:
-        """An extraction took so long."""
+        """Add the duration of an extraction."""
         self.extract_s += _SHARE * (spent_s - self.extract_s)
 
     def worked(self, spent_s: float) -> None:
-        """The taker was busy with a frame for so long."""
+        """Add the duration of a registration."""
         self.busy_s += _SHARE * (spent_s - self.busy_s)
 
     def pause_s(self, since_taken_s: float) -> float:
-        """How long to wait with the next extraction, for it to end when the taker does: a newer
-        frame may come till then.
+        """Wait time before the next extraction, so that it ends with the registration and can use a
+        newer frame.
         """
         return max(self.busy_s - self.extract_s - since_taken_s, 0.0)
 
@@ -68,20 +68,20 @@ class FeaturePrefetcher:
 
     @property
     def dropped(self) -> int:
-        """How many frames were displaced by a newer one before they were prepared."""
+        """Number of frames replaced by a newer one before they were prepared."""
         return self._frames.dropped
 
     @property
     def is_full(self) -> bool:
-        """Whether a frame waits that the next one would displace."""
+        """Whether a frame waits, which the next would replace."""
         return self._frames.is_full
 
     def put(self, frame: Frame) -> None:
-        """Offer a frame, over an older one that was not yet prepared; never waits."""
+        """Offer a frame; it replaces an unprepared one. Never waits."""
         self._frames.put(frame)
 
     def prepare(self, timeout_s: float) -> None:
-        """Prepare the newest frame as soon as it is time; some timeouts later without, if none is.
+        """Prepare the newest frame when it is due; return after the timeout without one.
 
         An extraction that fails is left to the taker, who meets its error with the frame.
         """
@@ -123,7 +123,7 @@ class FeaturePrefetcher:
         return prepared
 
     def close(self) -> None:
-        """Wake both threads for good."""
+        """Wake both threads and end."""
         self._frames.close()
         self._prepared.close()
         self._wanted.set()

@@ -1,4 +1,4 @@
-"""How long a reference view is used: while the camera's view is nearly the same."""
+"""Decides how long a reference view is used: while the camera's view is nearly the same."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _LONGEST_NS = 1_000_000_000  # finer tiles may have come, also for a camera that
 def is_still_valid(
     bundle: ReferenceBundle, pose: Pose, camera: Camera, time_ns: int, most_px: float
 ) -> bool:
-    """Whether a camera at `pose` sees the reference's anchors within `most_px` of where they are in
-    the reference, 95 of 100 of them. camera: the pinhole of now, which may have zoomed since.
+    """Whether a camera at `pose` sees 95 % of the reference's anchors within `most_px` of their
+    pixels in the reference.
 
-    Anchors are points of the map, so the registration does not care where they were seen from, as
-    long as they look alike and the picture's border does not run dry.
+    camera: the present pinhole, which may have zoomed. Anchors are map points, so the registration
+    works from any viewpoint at which they look alike and are in view.
     """
     if most_px <= 0 or not 0 <= time_ns - bundle.time_ns <= _LONGEST_NS:
         return False
@@ -32,12 +32,11 @@ def is_still_valid(
 def lead_share(
     bundle: ReferenceBundle, pose: Pose, later: Pose, most_px: float, frame: float
 ) -> float:
-    """How far on the way from `pose` to `later` the next reference is rendered, 0 to 1.
+    """Share (0 to 1) of the path from `pose` to `later` at which to render the next reference.
 
-    A reference serves before and after the camera is where it was rendered: so far ahead that it
-    serves now, with something left for what is not foreseen, it serves nearly twice as long. Where
-    it would serve one frame only without that, it is rendered where that frame is: a few
-    millimetres better. frame: share of the way that lies between two frames.
+    A reference rendered ahead, but still valid now with a margin, is valid nearly twice as long. If
+    it would then serve a single frame only, it is rendered at that frame's pose. frame: share of
+    the path between two frames.
     """
     camera = bundle.view.camera
     apart = _apart_px(bundle, (pose, camera), (later, camera))

@@ -28,8 +28,8 @@ _DRIFT_SIGMA_M = 0.2  # of the odometry over such a way
 
 @dataclass(frozen=True)
 class Rejoining:
-    """A series of registrations compared with the propagated pose: immutable, `with_answer` gives
-    the next.
+    """Rejected registrations compared with the propagated pose; immutable, `with_answer` returns
+    the next state.
 
     begun: the run's first answer; carried: the odometry's position (3,) then.
     """
@@ -43,8 +43,8 @@ class Rejoining:
         self, pose: Pose, covariance: Array, time_ns: int, carried: Pose, rotation: Array | None,
         config: IntegrityConfig,
     ) -> Rejoining:  # fmt: skip
-        """After one more answer that is good in itself. rotation: the autopilot's account of the
-        camera's, or None.
+        """Add a rejected registration of good quality. rotation: the camera's, by the autopilot, or
+        None.
         """
         first = Rejoining(TentativeTrack(pose, covariance, time_ns), carried.translation, 1)
         if self.begun is None or self.carried is None:

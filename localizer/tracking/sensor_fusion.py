@@ -27,7 +27,7 @@ from localizer.tracking.attitude_bias import (
     AttitudeObservation,
     AttitudePrior,
 )
-from localizer.tracking.dead_reckoning import fallen_m
+from localizer.tracking.dead_reckoning import curvature_drop_m
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import RegistrationStatus
 
@@ -46,8 +46,8 @@ class FusedRegistration:
 
 
 def with_map_error(result: Registration, height_sigma_m: float) -> Registration:
-    """The registration with the covariance that its image's patches and the map's heights give;
-    unchanged where there are no patches. height_sigma_m: of heights that the map does not have.
+    """The registration with the covariance from its image patches and the map's height error;
+    unchanged without patches. height_sigma_m: RMS of the heights that the map lacks.
     """
     votes = result.agreement
     if result.status is not RegistrationStatus.OK or votes is None:
@@ -81,7 +81,7 @@ def fused_registration(
 
 
 class SensorFusion:
-    """Use it on the localization thread.
+    """Fuses registrations with attitude and height; use it on the localization thread.
 
     attitude, height_sigma_m: how well roll and pitch, and the height, are known; None: not used.
     map_kind: None where it is not known.
@@ -100,7 +100,7 @@ class SensorFusion:
         self._is_surface = map_kind is not None and map_kind.has_buildings
 
     def fuse(self, result: Registration, time_ns: int) -> FusedRegistration:
-        """The registration of a frame exposed at `time_ns`, with attitude and height."""
+        """Fuse a frame's registration with attitude and height at `time_ns`."""
         known = self._constraints(result.world_from_camera, time_ns)
         return fused_registration(self._with_map_error(result), known)
 
@@ -110,7 +110,7 @@ class SensorFusion:
     def learn(
         self, result: Registration, place: Pose, unknown: Array, distance_m: float, time_ns: int
     ) -> None:
-        """Learn from a frame that was accepted while tracking, if it shows new ground.
+        """Update attitude bias and height error with an accepted frame, if it shows new ground.
 
         result: its registration before `fuse`; place: the pose that was accepted; unknown: (6, 6)
         covariance of what map and camera model err by; distance_m: of what is seen.
@@ -145,11 +145,11 @@ class SensorFusion:
             known.append(tilt)
         height_m = self._sensors.height_at(time_ns)
         if height_m is not None and self._height_sigma_m is not None:
-            world_z = height_m - fallen_m(about.translation)
+            world_z = height_m - curvature_drop_m(about.translation)
             known.append(height_constraint(world_z, self._height_sigma_m))
         return known
 
 
 def distance_m(points_world: Array, place: Array) -> float:
-    """Of what is seen, points (N, 3), from a place (3,): at least 1 m."""
+    """Distance from `place` (3,) to the centroid of points (N, 3) in view, at least 1 m."""
     return max(float(np.linalg.norm(points_world.mean(axis=0) - place)), 1.0)

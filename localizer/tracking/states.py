@@ -1,8 +1,8 @@
-"""The tracker's state: what runs of acceptances and rejections make of it.
+"""The tracker's state machine, driven by accepted and rejected registrations.
 
-Rejections lead from TRACKING over DEGRADED to LOST, or to BRIDGING as long as the odometry carries
-the pose on; from there acceptances in a row lead back. LOST lasts until a place was found again
-and confirmed (`localizer.integrity.confirmation`): a new guess is tried, it does not end it.
+Rejections lead from TRACKING over DEGRADED to LOST, or to BRIDGING while odometry propagates the
+pose; consecutive acceptances lead back. LOST lasts until a position was found and confirmed
+(`localizer.integrity.confirmation`).
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class TrackStatus:
 
     @property
     def wants_prior(self) -> bool:
-        """Whether a pose known outside is better than the prediction: before the first acceptance,
-        and when LOST, as long as nothing is on probation.
+        """Whether an external pose is better than the prediction: before the first acceptance, and
+        when LOST without a tentative track.
         """
         return self.state not in _SEES and self.accepted_in_row == 0
 
     def begun(self) -> TrackStatus:
-        """Begun again from a pose that is known."""
+        """The status after a start from a known pose."""
         return TrackStatus(last_fix_ns=self.last_fix_ns)
 
     def proposed(self, independent: bool) -> TrackStatus:
@@ -65,10 +65,9 @@ class TrackStatus:
 
 @dataclass(frozen=True)
 class RegistrationOutcome:
-    """A registration that was judged. covariance: (6, 6); time_ns: the frame's exposure; carry:
-    what the odometry made of a frame that the map rejected; beyond_capture: whether the prediction
-    was too unsure for a registration; counts: False where there was nothing to register against
-    and no odometry.
+    """A tested registration. covariance: (6, 6); time_ns: the frame's exposure; carry: the
+    odometry's result if the map rejected the frame; beyond_capture: the prediction was too
+    uncertain for a registration; counts: False without a reference and odometry.
     """
 
     acceptable: bool
@@ -89,7 +88,7 @@ def judge(
     outcome: RegistrationOutcome,
     evidence: IndependentEvidence = _NO_EVIDENCE,
 ) -> TrackStatus:
-    """The machine after one more frame; evidence: what other sensors say, for a place on trial."""
+    """The next status after one more frame. evidence: of other sensors, for a tentative track."""
     if not outcome.acceptable:
         return _after_rejection(track_status, config, outcome)
     if track_status.tentative:

@@ -1,4 +1,4 @@
-"""Writing and reading what a run saves."""
+"""Writes and reads checkpoints of a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from localizer.errors import ModelError
 
 
 def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
-    """Replace the checkpoint `path`; ModelError when that fails, with the older one untouched."""
+    """Replace the checkpoint atomically; `ModelError` if that fails, with the old one unchanged."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     try:
@@ -28,7 +28,7 @@ def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """The state that `Trainer` saved; ModelError when the file is not one."""
+    """Read the state of a `Trainer`; `ModelError` for another file."""
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except OSError as error:
@@ -42,7 +42,7 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
 
 
 def fill(network: nn.Module, weights: Mapping[str, Any], path: Path) -> None:
-    """Load `weights` of the checkpoint `path`; ModelError when they are another network's."""
+    """Load checkpoint weights into a network; `ModelError` if they are another network's."""
     try:
         network.load_state_dict(weights)
     except (RuntimeError, TypeError, AttributeError) as error:

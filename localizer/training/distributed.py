@@ -1,4 +1,4 @@
-"""The processes of one run, as torchrun starts them; one process without it."""
+"""The processes of one run under torchrun, or the single process without it."""
 
 from __future__ import annotations
 

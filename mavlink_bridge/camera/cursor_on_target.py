@@ -105,6 +105,7 @@ def aircraft_on_map(
     detail = ElementTree.SubElement(event, "detail")
     ElementTree.SubElement(detail, "contact", callsign=config.cot_callsign)
     azimuth_deg, elevation_deg, roll_deg = sensor_angles(view.quaternion_ned)
+    across, down = view.fov_deg or (camera.horizontal_fov_deg, camera.vertical_fov_deg)
     sensor = ElementTree.SubElement(
         detail,
         "sensor",
@@ -114,8 +115,8 @@ def aircraft_on_map(
         azimuth=f"{azimuth_deg:.1f}",
         elevation=f"{elevation_deg:.1f}",
         roll=f"{roll_deg:.1f}",
-        fov=f"{camera.horizontal_fov_deg:.1f}",
-        vfov=f"{camera.vertical_fov_deg:.1f}",
+        fov=f"{across:.1f}",
+        vfov=f"{down:.1f}",
         north="0",
     )
     if view.image_latitude_deg is not None and view.image_longitude_deg is not None:

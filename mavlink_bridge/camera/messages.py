@@ -113,8 +113,7 @@ def camera_fov_status(
         degrees_e7(view.image_longitude_deg),
         altitude_mm(view.image_height_m),
         list(view.quaternion_ned),
-        config.horizontal_fov_deg,
-        config.vertical_fov_deg,
+        *(view.fov_deg or (config.horizontal_fov_deg, config.vertical_fov_deg)),
     )
 
 

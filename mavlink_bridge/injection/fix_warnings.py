@@ -32,13 +32,13 @@ class FixWarnings:
         """Report firmware that is unknown or does not support the configured message."""
         if not state.connected or state.version is None:
             return
-        problem = None
-        if not profile.known:
-            problem = alert(AlertId.UNKNOWN_FIRMWARE)
-        elif self._config.message not in profile.messages:
-            message = Name(self._config.message.upper())
-            problem = alert(AlertId.MESSAGE_UNSUPPORTED, message=message)
-        self._teller.tell("profile", problem)
+        self._teller.tell("profile", None if profile.known else alert(AlertId.UNKNOWN_FIRMWARE))
+        sent = self._config.message
+        taken = sent in profile.messages
+        unsupported = (
+            None if taken else alert(AlertId.MESSAGE_UNSUPPORTED, message=Name(sent.upper()))
+        )
+        self._teller.tell("message", unsupported)
 
     def fixes(self, profile: FirmwareProfile, now_ns: int) -> None:
         """Report fixes that are late, not checked, or without a valid time."""

@@ -29,7 +29,7 @@ from mavlink_bridge.injection.encode import (
     attitude_of,
     vision_position_delta,
 )
-from mavlink_bridge.injection.propagate import FixPropagator, grown_protection
+from mavlink_bridge.injection.propagate import FixPropagator, propagated_protection
 from mavlink_bridge.injection.yaw_guard import YawGuard
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import VisionFix
@@ -100,7 +100,7 @@ class _FixRate:
 
 
 class WithheldMotion:
-    """Motion of the vehicle from fix to fix while its position is withheld."""
+    """Motion of the vehicle between two fixes while its position is withheld."""
 
     def __init__(self) -> None:
         self._before: VisionFix | None = None
@@ -309,7 +309,7 @@ class Injector:
             counter,
             fresh,
             repeated=fix.time_ns == self._sent_fix_ns,
-            protection_m=grown_protection(fix, position),
+            protection_m=propagated_protection(fix, position),
         )
         outcome = self._maker.make(estimate, now_ns, context)
         if isinstance(outcome, EncodedMessage):

@@ -49,7 +49,7 @@ class PropagatedFix:
         return float(np.sqrt(np.linalg.eigvalsh(self.velocity_covariance_ned)[-1]))
 
 
-def grown_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, float] | None:
+def propagated_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, float] | None:
     """The fix's protection levels, increased as its sigmas are by propagation."""
     if fix.protection_m is None:
         return None

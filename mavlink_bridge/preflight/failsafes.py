@@ -65,6 +65,7 @@ PX4_PARAMETERS = (
     "COM_POS_FS_EPH",
     "GF_MAX_VER_DIST",
     "COM_POSCTL_NAVL",
+    "EKF2_GPS_CTRL",
 )
 """What `px4_failsafes` reads."""
 
@@ -102,6 +103,11 @@ def px4_failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
         if value is not None:
             needed, ok = f"{least:g} to {most:g}", least <= value <= most
             lines.append(Failsafe(name, f"{value:g}", needed, why, ok))
+    gnss = read("EKF2_GPS_CTRL")
+    if gnss is not None and config.injection.message != "global_position_sensor":
+        why = "beside GNSS, EKF2 fits an offset to vision and keeps it when GNSS ends"
+        needed, ok = "bit 0 clear, or message: global_position_sensor", not int(gnss) & 1
+        lines.append(Failsafe("EKF2_GPS_CTRL", f"{gnss:g}", needed, why, ok))
     action = read("COM_POSCTL_NAVL")
     if action is not None:
         found = _PX4_ENDS.get(action, f"COM_POSCTL_NAVL {action:g}")

@@ -17,7 +17,7 @@ _FIRMWARES = {
 
 
 @dataclass(frozen=True)
-class MetAutopilot:
+class DetectedAutopilot:
     """MAVLink system id and firmware of a detected autopilot."""
 
     system_id: int
@@ -31,8 +31,8 @@ class _Greeting(VehicleClient):
         """Nothing else was asked for."""
 
 
-def meet(config: BridgeConfig) -> MetAutopilot:
+def meet(config: BridgeConfig) -> DetectedAutopilot:
     """Detect the autopilot at `config.connection`; `ConnectionSilentError` without one."""
     with _Greeting(config, "meeting", ()) as client:
         number = client.autopilot
-        return MetAutopilot(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))
+        return DetectedAutopilot(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))

@@ -38,7 +38,7 @@ def _longitude_scale(latitude_deg: float) -> float:
 
 
 def wrap_degrees(angle: float) -> float:
-    """The longitude in [-180, 180)."""
+    """The same longitude within -180 to 180 degrees."""
     return (angle + 180.0) % 360.0 - 180.0
 
 

@@ -1,25 +1,46 @@
-"""Video faults of the simulation: covered or blinded lens, frozen video, wrong time stamps."""
+"""Video faults of the simulation: covered or blinded lens, dusk, frozen video, wrong stamps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from localizer.types import Image
 
-PictureFaultKind = Literal["covered", "blinded", "frozen", "stamped_late", "late", "silent"]
+PictureFaultKind = Literal[
+    "covered", "blinded", "darkens", "frozen", "stamped_late", "late", "silent"
+]
 
 _COVERED_LEVEL, _COVERED_NOISE = 9.0, 4.0  # of 255: a lens cap, and the sensor's read noise
 _BLINDED_LEVEL, _BLINDED_NOISE = 205.0, 3.0  # inside a cloud: bright, even, next to no contrast
+_WHITE, _READ, _NATIVE_PX = 6000.0, 2.5, 1280  # electrons; a sensor of 1.5 um pixels
+_GAMMA, _QUALITY = 2.2, 70
+_MOST_GAIN = 16.0
+
+
+def darkened(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
+    """An image (H, W, 3) with so much of its light, coded as JPEG; smaller ones count as binned."""
+    binned = (_NATIVE_PX / rgb.shape[1]) ** 2
+    white, read = _WHITE * binned, _READ * np.sqrt(binned)
+    electrons = (rgb.astype(np.float32) / 255.0) ** _GAMMA * (white * light)
+    noise = rng.standard_normal(electrons.shape, dtype=np.float32)
+    electrons += noise * np.sqrt(electrons + read**2)
+    shown = np.clip(electrons * min(1.0 / light, most_gain) / white, 0.0, 1.0) ** (1.0 / _GAMMA)
+    dark = (shown * 255.0 + 0.5).astype(np.uint8)
+    _, data = cv2.imencode(".jpg", dark[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return np.ascontiguousarray(decoded[..., ::-1])
 
 
 @dataclass(frozen=True)
 class PictureFault:
     """A video fault that lasts until the next one.
 
-    covered: a lens cap. blinded: cloud or fog. frozen: the last frame is repeated with new time
+    covered: a lens cap. blinded: cloud or fog. darkens: the light halves every `seconds`, with a
+    gain of up to 16. frozen: the last frame is repeated with new time
     stamps, encoded anew. stamped_late: the time stamp is `seconds` after the exposure. late: sent
     `seconds` late and stamped when sent, as by a camera that ignores its own latency. silent:
     nothing is sent.
@@ -29,13 +50,14 @@ class PictureFault:
     seconds: float = 0.0
 
 
-class FaultyLens:
+class VideoFaultInjector:
     """Applies the current video fault, if any, to each frame."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 23])
         self._fault: PictureFault | None = None
         self._last: Image | None = None
+        self._began_ns: int | None = None
 
     @property
     def is_silent(self) -> bool:
@@ -44,11 +66,13 @@ class FaultyLens:
 
     def set(self, fault: PictureFault | None) -> None:
         """Set the fault from the next frame on; None ends it."""
-        self._fault = fault
+        self._fault, self._began_ns = fault, None
 
-    def picture(self, image: Image) -> Image:
+    def picture(self, image: Image, time_ns: int) -> Image:
         """The frame that is sent instead of `image` (H, W, 3) uint8."""
         kind = self._fault.kind if self._fault is not None else None
+        if self._began_ns is None:
+            self._began_ns = time_ns
         if kind == "frozen" and self._last is not None:
             return self._last
         self._last = image
@@ -56,6 +80,9 @@ class FaultyLens:
             return self._even(image, _COVERED_LEVEL, _COVERED_NOISE)
         if kind == "blinded":
             return self._even(image, _BLINDED_LEVEL, _BLINDED_NOISE)
+        if self._fault is not None and kind == "darkens":
+            halvings = (time_ns - self._began_ns) * 1e-9 / self._fault.seconds
+            return darkened(image, 0.5**halvings, _MOST_GAIN, self._rng)
         return image
 
     def stamp(self, exposure_ns: int) -> int:

@@ -28,7 +28,7 @@ from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.types import Image
 from sitl.camera.detector import Detector, DetectorErrors, DetectorView, Observed
-from sitl.camera.faults import FaultyLens, PictureFault
+from sitl.camera.faults import PictureFault, VideoFaultInjector
 from sitl.camera.movers import Mover
 from sitl.camera.realism import CameraClock, CameraRealism
 from sitl.camera.stream import LossyLink, VideoSender
@@ -255,7 +255,7 @@ class _Studio:
             if c.detections
             else None
         )
-        self._lens, self._zoom = FaultyLens(c.seed), ZoomLens(c.camera)
+        self._lens, self._zoom = VideoFaultInjector(c.seed), ZoomLens(c.camera)
         self._outbox: deque[_Waiting] = deque()
         self._track = PoseTrack()
         self._paused = self._stopped = False
@@ -327,7 +327,7 @@ class _Studio:
                 time_ns + self._lens.delay_ns,
                 time_ns,
                 self._lens.stamp(stamp_ns),
-                self._lens.picture(self._zoom.picture(exposure.image, time_ns)),
+                self._lens.picture(self._zoom.picture(exposure.image, time_ns), time_ns),
             )
         )
         if self._detector is not None:

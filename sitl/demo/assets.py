@@ -16,7 +16,7 @@ from pathlib import Path
 from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
 from localizer.synth.config import Character, WorldConfig, look_of
-from localizer.synth.visits.visit import Visit, surveyed_and_lived
+from localizer.synth.visits.visit import Visit, survey_and_flight_visits
 from localizer.synth.world import WorldInfo, build_visits
 from sitl.demo.satellite import build_satellite_map
 from sitl.demo.scenario import SatelliteMap
@@ -81,7 +81,7 @@ def prepare(
         if ideal:
             then, now = Visit("survey", look_of("survey")), Visit("live", look_of("live"))
         else:
-            then, now = surveyed_and_lived(config)
+            then, now = survey_and_flight_visits(config)
         visits = {survey: then, live: now}
         generating = f"generating world {seed} (a few minutes, once)"
         progress(generating, 0.0)

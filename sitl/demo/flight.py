@@ -73,7 +73,7 @@ class DemoRecord:
 
 
 @dataclass(frozen=True)
-class Onlookers:
+class FlightObservers:
     """Callbacks that report a flight's progress. progress: (phase, share done); connectable:
     address for a ground station ("tcp:HOST:PORT"); console: port of the console, if wanted;
     watchable: its address once it answers.
@@ -91,14 +91,14 @@ def fly(
     kind: VehicleChoice,
     seed: int,
     folder: Path,
-    onlookers: Onlookers | None = None,
+    onlookers: FlightObservers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
 ) -> DemoRecord:
     """Fly a scenario without GNSS; `folder` receives all records, also of an aborted flight.
 
     program: command of the companion.
     """
-    onlookers = onlookers or Onlookers()
+    onlookers = onlookers or FlightObservers()
     progress = onlookers.progress
     folder.mkdir(parents=True, exist_ok=True)
     cache = TileCache.open(assets.map_cache)

@@ -11,6 +11,7 @@ from types import FrameType
 from sitl.embedded.errors import VehicleError
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters, read_parameter_file
+from sitl.embedded.px4_parameters import Px4Parameters
 from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 
@@ -36,6 +37,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--params", type=Path, action="append", default=[], help=".parm file")
     parser.add_argument("--speedup", type=float, default=1.0, help="simulated s per real s")
     parser.add_argument("--seed", type=int, default=0, help="seed of all sensor noise and gusts")
+    parser.add_argument("--px4", action="store_true", help="PX4's interface and aiding")
     return parser.parse_args(argv)
 
 
@@ -48,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _arguments(argv)
     home, heading_deg = arguments.home
     try:
-        parameters = Parameters()
+        parameters = Px4Parameters() if arguments.px4 else Parameters()
         for path in arguments.params:
             for name, value in read_parameter_file(path).items():
                 if not parameters.set(name, value):
@@ -57,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
         system_id = int(parameters["SYSID_THISMAV"])
         ports = tuple(arguments.port + offset for offset in SERIAL_OFFSETS)
         print("compiling kernels, if this is the first start; the ports open then", flush=True)
-        _compile(home)
+        _compile(home, type(parameters)())
         while True:
             _run(home, heading_deg, parameters, MavlinkServer(ports, system_id), arguments.seed)
     except VehicleError as error:
@@ -81,9 +83,9 @@ def _run(
         server.close()
 
 
-def _compile(home: Location) -> None:
+def _compile(home: Location, parameters: Parameters) -> None:
     """Fly a moment without links, so that no client waits for the kernels' first compilation."""
-    vehicle = EmbeddedVehicle(home, 0.0, Parameters(), MavlinkServer((), 1))
+    vehicle = EmbeddedVehicle(home, 0.0, parameters, MavlinkServer((), 1))
     vehicle.aircraft.modes.arm()
     for _ in range(60):
         vehicle.step()

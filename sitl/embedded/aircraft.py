@@ -7,10 +7,12 @@ from math import cos, exp, radians, sin, sqrt
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded.control.arming import ArmingContext, arming_failures
+from sitl.embedded.control.arming import GYRO_SETTLE_S, ArmingContext, arming_failures
 from sitl.embedded.control.loop import advance
 from sitl.embedded.control.mission import MissionStore
 from sitl.embedded.control.modes import FlightModes
+from sitl.embedded.control.px4_modes import Px4Modes
+from sitl.embedded.ekf.ekf2_injection import Px4PositionInput
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.ekf.injection import ExternalNavInput
 from sitl.embedded.ekf.measurements import Baro, Compass, GpsData
@@ -56,10 +58,12 @@ class Aircraft:
         self.estimator = Estimator(parameters, self.notify)
         self.gimbal = Gimbal(parameters)
         self.mission = MissionStore()
-        self.modes = FlightModes(
+        px4 = parameters.is_px4
+        self.modes = (Px4Modes if px4 else FlightModes)(
             parameters, self.estimator, self.gimbal, self.mission, self.notify, self._reached
         )
-        self.injection = ExternalNavInput(parameters, self.estimator)
+        taken = Px4PositionInput if px4 else ExternalNavInput
+        self.injection: ExternalNavInput = taken(parameters, self.estimator)
         self.gps_sample: GpsSample | None = None
         self._gps_sample_at = -1e9
         self.barometer_m = 0.0
@@ -221,6 +225,9 @@ class Aircraft:
 
     def arming_failures(self) -> list[str]:
         """Texts of the failing arming checks."""
+        if isinstance(self.modes, Px4Modes):
+            settled = self.time_s >= GYRO_SETTLE_S and self.modes.position_ok
+            return [] if settled else ["no valid global position"]
         return arming_failures(
             ArmingContext(
                 self.time_s,

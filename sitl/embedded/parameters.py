@@ -109,6 +109,8 @@ _DEFAULTS: dict[str, tuple[float, int]] = {
 class Parameters:
     """A parameter table: values by name, in a fixed order."""
 
+    is_px4 = False
+
     def __init__(self, overrides: dict[str, float] | None = None) -> None:
         self._values = {name: value for name, (value, _) in _DEFAULTS.items()}
         for name, value in (overrides or {}).items():
@@ -130,22 +132,29 @@ class Parameters:
         """Set a known parameter; False when the vehicle has no such parameter."""
         if name not in self._values:
             return False
-        self._values[name] = value if type_of(name) == REAL32 else float(round(value))
+        self._values[name] = value if self.type_of(name) == REAL32 else float(round(value))
         return True
+
+    def type_of(self, name: str) -> int:
+        """MAV_PARAM_TYPE of a known parameter."""
+        return _DEFAULTS[name][1]
+
+    def sent(self, name: str) -> float:
+        """What PARAM_VALUE carries."""
+        return self[name]
+
+    def received(self, _name: str, value: float) -> float:
+        """What a value of PARAM_SET stands for."""
+        return value
 
     def name_at(self, index: int) -> str | None:
         """The parameter at a list index."""
-        names = list(self._values)
+        names = list(self)
         return names[index] if 0 <= index < len(names) else None
 
     def index_of(self, name: str) -> int:
         """A parameter's place in the list."""
-        return list(self._values).index(name)
-
-
-def type_of(name: str) -> int:
-    """MAV_PARAM_TYPE of a parameter."""
-    return _DEFAULTS[name][1]
+        return list(self).index(name)
 
 
 def read_parameter_file(path: Path) -> dict[str, float]:

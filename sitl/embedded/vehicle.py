@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.mavlink.commands import Commands
+from sitl.embedded.mavlink.px4_dialect import Px4Commands, Px4Telemetry
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.mavlink.telemetry import DEFAULT_STREAMS, TelemetryBuilder
 from sitl.embedded.parameters import Parameters
@@ -29,8 +30,10 @@ class EmbeddedVehicle:
         seed: int = 0,
     ) -> None:
         self.aircraft = Aircraft(home, heading_deg, parameters, server, seed)
-        self.telemetry = TelemetryBuilder(self.aircraft)
-        self.commands = Commands(self.aircraft, self.telemetry)
+        px4 = parameters.is_px4
+        self._sync_ticks = 10 if px4 else 1000
+        self.telemetry = (Px4Telemetry if px4 else TelemetryBuilder)(self.aircraft)
+        self.commands = (Px4Commands if px4 else Commands)(self.aircraft, self.telemetry)
         self._server = server
         self._announced = (False, False)
         for link in server.links:
@@ -61,9 +64,9 @@ class EmbeddedVehicle:
         self._server.flush()
 
     def _announce(self) -> None:
-        """What ArduPilot sends unasked: origin and home when they are set, TIMESYNC every 10 s."""
+        """Origin and home when they are set, TIMESYNC every 10 s (PX4: ten times a second)."""
         aircraft, server = self.aircraft, self._server
-        if aircraft.tick % 1000 == 0:
+        if aircraft.tick % self._sync_ticks == 0:
             server.broadcast(mavlink.MAVLink_timesync_message(0, aircraft.time_ms * 1_000_000))
         known = (aircraft.estimator.origin is not None, aircraft.modes.home is not None)
         if known != self._announced:

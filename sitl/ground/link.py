@@ -31,6 +31,7 @@ _STREAMS = {  # message id -> Hz
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5.0,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2.0,
 }
+_OF_PX4 = {mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS}
 _WALL_MARGIN_S = 30.0
 # Wall time. A busy machine may let one of the two wait for seconds: an answer that comes costs
 # nothing, and only a vehicle that is alive and silent takes that long.
@@ -74,7 +75,8 @@ class GroundLink:
                 f"no autopilot heartbeat at {self._connection.endpoint} in {timeout_s:g} s"
             )
         for message_id, hertz in _STREAMS.items():
-            self._request_stream(message_id, hertz)
+            px4s = _OF_PX4.get(message_id, message_id)
+            self._request_stream(px4s if self.record.is_px4 else message_id, hertz)
         self.wait(
             lambda: "SIM_STATE" in self.record.latest, 20.0, "the vehicle's true state (SIM_STATE)"
         )

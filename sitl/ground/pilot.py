@@ -17,7 +17,7 @@ from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.link import GroundLink
 from sitl.ground.mission_client import MissionClient
-from sitl.ground.vehicle_record import AUTOPILOT, MODES, VEHICLE
+from sitl.ground.vehicle_record import AUTOPILOT, MODES, PX4_MODES, VEHICLE
 
 _GUIDED_POSITION = 0xDF8  # position only
 _GIMBAL_YAW_LOCK = 16.0
@@ -39,6 +39,7 @@ class Pilot:
         self.link = GroundLink(endpoint, speedup, alive)
         self.record = self.link.record
         self.missions = MissionClient(self.link)
+        self._ground_m = 0.0  # AMSL, where it took off
 
     def __enter__(self) -> Pilot:
         self.link.connect()
@@ -80,7 +81,8 @@ class Pilot:
 
     def set_mode(self, name: str) -> None:
         """Change the mode and wait until the heartbeat reports it."""
-        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, 1, MODES[name])
+        numbers = PX4_MODES[name] if self.record.is_px4 else (MODES[name],)
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, 1, *numbers)
         self.link.wait(lambda: self.record.mode == name, _SHOWN_S, f"mode {name}")
 
     def arm(self, timeout_s: float = 60.0) -> None:
@@ -108,7 +110,9 @@ class Pilot:
     def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
         """Take off in GUIDED and wait for the true height above the take-off position."""
         ground = self.record.truth.altitude_m
-        self.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height_m)
+        self._ground_m = ground
+        height = height_m + ground if self.record.is_px4 else height_m  # PX4: AMSL
+        self.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height)
         self.link.wait(
             lambda: self.record.truth.altitude_m > ground + height_m - 2.0,
             timeout_s,
@@ -117,6 +121,9 @@ class Pilot:
 
     def go_to(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
         """Send the vehicle to a position and height above home in GUIDED; does not wait."""
+        if self.record.is_px4:
+            self._reposition(latitude_deg, longitude_deg, height_m)
+            return
         self.link.send(
             mavlink.MAVLink_set_position_target_global_int_message(
                 0,
@@ -128,6 +135,26 @@ class Pilot:
                 round(longitude_deg * 1e7),
                 height_m,
                 *([0.0] * 8),
+            )
+        )
+
+    def _reposition(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
+        """PX4 follows SET_POSITION_TARGET in Offboard only; Hold takes a place by this."""
+        self.link.send(
+            mavlink.MAVLink_command_int_message(
+                VEHICLE,
+                AUTOPILOT,
+                mavlink.MAV_FRAME_GLOBAL,
+                mavlink.MAV_CMD_DO_REPOSITION,
+                0,
+                0,
+                -1.0,
+                0.0,
+                0.0,
+                math.nan,
+                round(latitude_deg * 1e7),
+                round(longitude_deg * 1e7),
+                self._ground_m + height_m,
             )
         )
 

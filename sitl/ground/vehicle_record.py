@@ -27,6 +27,15 @@ _SECONDS_KEPT = 60 * 60
 
 MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9}
 _MODE_NAMES = {number: name for name, number in MODES.items()}
+# PX4's main and sub mode under the names of ArduPilot's that do the same; GUIDED: Hold.
+PX4_MODES = {
+    "STABILIZE": (7, 0),
+    "AUTO": (4, 4),
+    "GUIDED": (4, 3),
+    "RTL": (4, 5),
+    "LAND": (4, 6),
+}
+_PX4_MODE_NAMES = {main << 16 | sub << 24: name for name, (main, sub) in PX4_MODES.items()}
 
 
 def from_autopilot(message: Any) -> bool:
@@ -38,7 +47,8 @@ class VehicleRecord:
     """Stores a vehicle's messages; one thread writes, any thread reads.
 
     latest: the autopilot's newest message of each type; ekf_flags: EKF_STATUS_FLAGS; reached: the
-    mission items, in order; origin: of the EKF; mode: None before the first heartbeat.
+    mission items, in order; origin: of the EKF; mode: None before the first heartbeat,
+    which tells is_px4.
     """
 
     def __init__(self, speedup: float) -> None:
@@ -54,6 +64,7 @@ class VehicleRecord:
         self._text_log = TextLog()
         self.reached: list[int] = []
         self.mode: str | None = None
+        self.is_px4 = False
         self.armed = False
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._take_heartbeat,
@@ -62,6 +73,7 @@ class VehicleRecord:
             "GIMBAL_DEVICE_ATTITUDE_STATUS": self._take_gimbal,
             "LOCAL_POSITION_NED": self._take_position,
             "EKF_STATUS_REPORT": self._take_ekf,
+            "ESTIMATOR_STATUS": self._take_ekf,
             "GPS_GLOBAL_ORIGIN": self._take_origin,
             "MISSION_ITEM_REACHED": self._take_reached,
         }
@@ -145,7 +157,9 @@ class VehicleRecord:
             handler(message, received_ns)
 
     def _take_heartbeat(self, message: Any, _received_ns: int) -> None:
-        self.mode = _MODE_NAMES.get(message.custom_mode, str(message.custom_mode))
+        self.is_px4 = message.autopilot == mavlink.MAV_AUTOPILOT_PX4
+        names = _PX4_MODE_NAMES if self.is_px4 else _MODE_NAMES
+        self.mode = names.get(message.custom_mode, str(message.custom_mode))
         self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def _take_attitude(self, message: Any, received_ns: int) -> None:

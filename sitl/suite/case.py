@@ -31,19 +31,25 @@ class VehicleSpec(StrictModel):
     """Parameters of the vehicle: a named set and changes to it.
 
     vision: EK3_SRC1 on external navigation, no receiver. gnss_then_vision: a receiver in source
-    set 1, vision in set 2. gps_input: GPS_INPUT is the only receiver.
+    set 1, vision in set 2. gps_input: GPS_INPUT is the only receiver. px4, px4_with_gnss: PX4's
+    defaults, without and with a receiver; embedded vehicle only.
     origin_north_m: None leaves the EKF origin to the injector; a number sets it before, this far
     north of home.
     """
 
-    sources: Literal["vision", "gnss_then_vision", "gps_input"]
+    sources: Literal["vision", "gnss_then_vision", "gps_input", "px4", "px4_with_gnss"]
     parameters: dict[str, float] = Field(default_factory=dict)
     origin_north_m: float | None = None
 
     @property
     def receiver(self) -> bool:
         """Whether the simulated GNSS receiver is on at the start."""
-        return self.sources == "gnss_then_vision"
+        return self.sources in ("gnss_then_vision", "px4_with_gnss")
+
+    @property
+    def px4(self) -> bool:
+        """Whether the vehicle speaks PX4's dialect."""
+        return self.sources.startswith("px4")
 
     def all_parameters(self) -> dict[str, float]:
         """Everything that is set over the firmware's defaults."""
@@ -51,9 +57,10 @@ class VehicleSpec(StrictModel):
             "vision": vision_only_parameters,
             "gnss_then_vision": vision_parameters,
             "gps_input": gps_input_only_parameters,
-        }[self.sources]()
+        }
         off = {} if self.receiver else GPS_OFF
-        return {**named, **SPEEDS, **off, **self.parameters}
+        own = {} if self.px4 else named[self.sources]()
+        return {**own, **SPEEDS, **off, **self.parameters}
 
 
 class Flight(StrictModel):

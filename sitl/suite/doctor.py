@@ -21,7 +21,7 @@ class DoctorError(SimulationError):
     """`companion doctor` failed."""
 
 
-def consult(config: BridgeConfig) -> Doctor:
+def run_doctor(config: BridgeConfig) -> Doctor:
     """Run the doctor, `companion doctor --fix --yes`, and the doctor again.
 
     The exit codes are those of the flight controller's part: a suite has neither map nor camera,

@@ -18,7 +18,7 @@ from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.suite.case import Case, CaseEvent
-from sitl.suite.doctor import consult
+from sitl.suite.doctor import run_doctor
 from sitl.suite.record import CaseRecord, Text, VehicleSample
 from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink
 from sitl.vehicles.launch import VehicleSetup, open_vehicle
@@ -40,7 +40,9 @@ _ARMING_TRIES = 3
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
     """Fly a scenario on a vehicle. `SimulationError` if it could not be flown."""
     with ExitStack() as stack:
-        setup = VehicleSetup(parameters=case.vehicle.all_parameters(), seed=seed)
+        setup = VehicleSetup(
+            parameters=case.vehicle.all_parameters(), seed=seed, px4=case.vehicle.px4
+        )
         vehicle = open_vehicle(kind, HOME, setup)
         return _CaseFlight(case, stack.enter_context(vehicle), stack, seed).run()
 
@@ -121,7 +123,7 @@ class _CaseFlight:
         case = self._case
         config = bridge_config(case, self._vehicle.companion_endpoint)
         if case.before.doctor:
-            self._record.doctor = consult(config)
+            self._record.doctor = run_doctor(config)
             boots = self._vehicle.boots
             self._pilot.reboot()
             self._pilot.link.close()

@@ -9,7 +9,13 @@ from typing import Literal
 
 from sitl.geodesy import Location
 from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.vehicles.process import BASE_PORT, PARAMETERS, PORTS_PER_INSTANCE, VehicleProcess
+from sitl.vehicles.process import (
+    BASE_PORT,
+    PARAMETERS,
+    PORTS_PER_INSTANCE,
+    VehicleProcess,
+    VehicleProcessError,
+)
 
 VISION_SOURCE = 2  # MAV_CMD_SET_EKF_SOURCE_SET
 
@@ -104,7 +110,7 @@ def _sources(number: int, *, position: int, velocity: int, climb: int) -> dict[s
 
 
 class EmbeddedSitl(VehicleProcess):
-    """The embedded vehicle (`sitl.embedded`) as a process of its own."""
+    """The embedded vehicle as a process of its own. px4: see `sitl.embedded.px4_parameters`."""
 
     kind = "embedded"
     start_timeout_s = 300.0  # the first start compiles the kernels
@@ -117,8 +123,10 @@ class EmbeddedSitl(VehicleProcess):
         speedup: float = 1.0,
         seed: int = 0,
         log: Path | None = None,
+        px4: bool = False,
     ) -> None:
         super().__init__(parameters, speedup, log)
+        self._px4 = px4
         self._home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
         self._seed = seed
 
@@ -133,13 +141,14 @@ class EmbeddedSitl(VehicleProcess):
             f"--params={PARAMETERS}",
             f"--speedup={self.speedup:g}",
             f"--seed={self._seed}",
+            *(["--px4"] if self._px4 else []),
         ]
 
 
 @dataclass(frozen=True)
 class VehicleSetup:
     """Start conditions of a vehicle. parameters: added to the defaults; seed: of the embedded
-    vehicle's noise; log: file for its output.
+    vehicle's noise; log: file for its output; px4: the embedded vehicle with PX4's interface.
     """
 
     heading_deg: float = 0.0
@@ -147,6 +156,7 @@ class VehicleSetup:
     speedup: float = 1.0
     seed: int = 0
     log: Path | None = None
+    px4: bool = False
 
 
 def open_vehicle(
@@ -159,6 +169,8 @@ def open_vehicle(
     home: altitude AMSL.
     """
     s = setup or VehicleSetup()
+    if s.px4 and kind == "ardupilot":
+        raise VehicleProcessError("a scenario of PX4 flies on the embedded vehicle: --fc embedded")
     if kind == "ardupilot" or (kind == "auto" and find_arducopter() is not None):
         return ArduPilotSitl(home, s.heading_deg, s.parameters, s.speedup, s.log)
-    return EmbeddedSitl(home, s.heading_deg, s.parameters, s.speedup, s.seed, s.log)
+    return EmbeddedSitl(home, s.heading_deg, s.parameters, s.speedup, s.seed, s.log, s.px4)

@@ -307,7 +307,7 @@ FIX = VisionFix(
 TARGET = TargetReport(
     SECOND, *HOME, 500.0, (0.0, 0.0, 0.0), 1.0, 1.0, (0.5, 0.5), 1, 0.1, (0.1, 0.1, 0.2, 0.2), 0.5
 )
-VIEW = CameraView(SECOND, *HOME, 500.0, (1.0, 0.0, 0.0, 0.0), *HOME, 400.0, 1.0, 1.0)
+VIEW = CameraView(SECOND, *HOME, 500.0, (1.0, 0.0, 0.0, 0.0), *HOME, 400.0, 1.0, 1.0, (60.0, 40.0))
 
 
 def spoilt_as(before: Any) -> Iterator[Any]:

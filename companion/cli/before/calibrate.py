@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.errors import ConfigError
-from companion.terminal.steps import shown_count
+from companion.terminal.steps import show_count
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -46,7 +46,7 @@ def flight_command(
     if write and config is None:
         raise ConfigError("--write needs --config: which deployment file is to be changed?")
     loaded = load_record(record, 0.0, tlog, map_cache)
-    with shown_count(Console(stderr=True), "pictures") as count:
+    with show_count(Console(stderr=True), "pictures") as count:
         found = calibrate(loaded, frames, count)
     wanted = changes(loaded.config, found)
     console = Console()

@@ -13,7 +13,7 @@ from rich.markup import escape
 from companion.config import CompanionConfig, parse_config
 from companion.errors import CompanionError, ConfigError
 from companion.redaction import redacted
-from companion.terminal.steps import shown_work
+from companion.terminal.steps import show_work
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
@@ -73,7 +73,7 @@ def init_command(
         fov = _asked("horizontal field of view, degrees", "--camera or --fov", _DEFAULT_FOV_DEG)
     size = None
     if listen:
-        with shown_work(Console(stderr=True), f"waiting for a picture of {redacted(feed)}"):
+        with show_work(Console(stderr=True), f"waiting for a picture of {redacted(feed)}"):
             size = _stream_size(feed, notes)
     placed = feed if "://" in feed else str(Path(feed).resolve())
     settings["camera"] = {"source": placed, "model": _model(camera, fov, size, notes)}
@@ -84,7 +84,7 @@ def init_command(
     settings["record"] = {"folder": str((record / "flight").resolve())}
     config = parse_config(settings, str(out))
     if listen:
-        with shown_work(Console(stderr=True), f"waiting for the autopilot at {wire}"):
+        with show_work(Console(stderr=True), f"waiting for the autopilot at {wire}"):
             config = _with_vehicle(config, notes)
     write_deployment(deployment_text(config, notes), out, overwrite)
     for note in notes:
@@ -148,10 +148,10 @@ def _pinned(map_cache: Path) -> str:
 
 def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
     from companion.redaction import redacted
-    from companion.setup.asking import first_picture
+    from companion.setup.asking import read_stream_size
 
     try:
-        seen = first_picture(feed)
+        seen = read_stream_size(feed)
     except (CompanionError, LocalizerError) as error:
         notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
         return None

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from companion.terminal.steps import shown_work
+from companion.terminal.steps import show_work
 from companion.writing import made_folder
 
 _SPEED_M_S = 10.0
@@ -50,7 +50,7 @@ def check_command(
         pixel_rad, half_view_deg = 1 / camera.fx, camera.horizontal_fov_deg / 2
     opened = TileCache.open(cache)
     made_folder(out, "--out")
-    with shown_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
+    with show_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
         made = check_map(opened, MapUse(height, pixel_rad, half_view_deg))
     for name, rgb in made.pictures.items():
         write_picture(out / f"{name}.png", rgb)

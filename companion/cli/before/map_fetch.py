@@ -17,13 +17,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.errors import ConfigError
-from companion.terminal.steps import READING, shown_count, shown_work
+from companion.terminal.steps import READING, show_count, show_work
 from companion.writing import refuse_input
 
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
     from localizer.map.fetch.catalogue import CatalogueSource
-    from localizer.map.fetch.polite import PoliteClient
+    from localizer.map.fetch.polite import HttpClient
     from localizer.map.fetch.raster import FetchPlan
     from localizer.map.footprints.footprint import Footprints
 
@@ -45,7 +45,7 @@ class _Part:
 
     source: CatalogueSource
     plan: FetchPlan
-    client: PoliteClient
+    client: HttpClient
     folder: Path
     out: Path
 
@@ -109,7 +109,7 @@ def fetch_command(
         (role, choose(known, area, role, name))
         for role, name in (("imagery", imagery), ("heights", heights))
     ]
-    with shown_work(Console(stderr=True), "asking what the services have"):
+    with show_work(Console(stderr=True), "asking what the services have"):
         parts = [_planned(one, area, resolution, most_mb, work, role) for role, one in chosen]
     if buildings is not None and parts[1].source.role != "terrain":
         raise ConfigError(
@@ -143,7 +143,7 @@ def raise_command(
     refuse_input(out, "--out", terrain, footprints)
     from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
 
-    with shown_work(Console(stderr=True), "raising buildings"):
+    with show_work(Console(stderr=True), "raising buildings"):
         done = raise_buildings(terrain, read_footprints(footprints, height_property), out)
     Console().print(f"{out}: {done.line()}", markup=False, highlight=False, soft_wrap=True)
 
@@ -222,9 +222,9 @@ def _planned(
     source: CatalogueSource, area: Area, resolution: float, most_mb: float, work: Path, role: str
 ) -> _Part:
     from localizer.map.fetch.fetch import make_plan
-    from localizer.map.fetch.polite import PoliteClient, RequestLimits
+    from localizer.map.fetch.polite import HttpClient, RequestLimits
 
-    client = PoliteClient(RequestLimits(source.rate_per_s, round(most_mb * _MB)))
+    client = HttpClient(RequestLimits(source.rate_per_s, round(most_mb * _MB)))
     wanted = source.resolution_m if source.has_heights else max(source.resolution_m, resolution)
     plan = make_plan(source, area, wanted, client)
     return _Part(source, plan, client, work / f"{role}-pieces", work / f"{role}.tif")
@@ -271,7 +271,7 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
 @contextmanager
 def _told_count(what: str) -> Iterator[Callable[[int, int], None]]:
     try:
-        with shown_count(Console(stderr=True), what) as progress:
+        with show_count(Console(stderr=True), what) as progress:
             yield progress
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what has come")
@@ -283,7 +283,7 @@ def _raised(console: Console, part: _Part, footprints: Footprints) -> _Part:
     from localizer.map.footprints.raise_buildings import raise_buildings
 
     out = part.out.with_name("raised.tif")
-    with shown_work(Console(stderr=True), "raising buildings"):
+    with show_work(Console(stderr=True), "raising buildings"):
         done = raise_buildings(part.out, footprints, out)
     console.print(f"{footprints.path.name}: {done.line()}", markup=False, highlight=False,
                   soft_wrap=True)  # fmt: skip
@@ -315,11 +315,11 @@ def _built(
         workers=workers,
         apart=True,
     )
-    with shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
+    with show_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
         manifest = build_cache([parts[1].out, parts[0].out], out, options, progress=bar)
     for text in manifest.warnings:
         console.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
-    with shown_work(Console(stderr=True), "verifying the cache"):
+    with show_work(Console(stderr=True), "verifying the cache"):
         found = verify(TileCache.open(out))
     for line in found.damaged:
         console.print(f"[red]{escape(line)}")

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.config import load_config
-from companion.terminal.steps import shown_count, shown_work
+from companion.terminal.steps import show_count, show_work
 from companion.writing import made_folder
 
 
@@ -75,10 +75,10 @@ def plan_command(
         Question(mission, conditions, MissionLimits(sigma)),
         spacing_m=spacing, speed_m_s=speed, pitch_deg=pitch, seek=alternatives,
     )  # fmt: skip
-    with shown_count(Console(stderr=True), "places") as count:
+    with show_count(Console(stderr=True), "places") as count:
         plan = make_plan(planned, cache, deployment, question, count)
     camera = deployment.camera.model.camera().without_distortion()
-    with shown_work(Console(stderr=True), "drawing the pictures"):
+    with show_work(Console(stderr=True), "drawing the pictures"):
         sheet = pictures.sheet_of(plan, cache)
         aim = aim_of(deployment, pitch)
         shown = (

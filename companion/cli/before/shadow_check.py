@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
-from companion.terminal.steps import COMPILES, shown_count
+from companion.terminal.steps import COMPILES, show_count
 from companion.writing import result_file, writing
 
 if TYPE_CHECKING:
@@ -63,13 +63,13 @@ def shadow_check_command(
             model = told.camera.model.camera()
             camera.write_text(json.dumps(model.to_dict()), encoding="utf-8")
         options = FootageOptions(Path(work), 60, None, log, camera, fov, mount_pitch)
-        with shown_count(console, "reading footage") as count:
+        with show_count(console, "reading footage") as count:
             flight = read_footage(video, options, count)
         if told is None:
             deployment = _deployment(flight, map_cache)
         else:
             deployment = told.model_copy(update={"map": map_cache})
-        playing = shown_count(console, "playing the flight, s", begins=COMPILES)
+        playing = show_count(console, "playing the flight, s", begins=COMPILES)
         with playing as count, _quiet("mavlink_bridge.status"):
             found = shadow_check(
                 flight, video, deployment, rate_hz, lambda s, total: count(round(s), round(total))

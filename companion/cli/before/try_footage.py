@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.links import file_link
-from companion.terminal.steps import COMPILES, shown_count, shown_steps
+from companion.terminal.steps import COMPILES, show_count, show_steps
 from companion.writing import made_folder, refuse_input
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def try_command(
     refuse_edited(report / "deployment.yaml")
     console = Console(stderr=True)
     options = FootageOptions(report, frames, places, log, camera, fov, mount_pitch)
-    with shown_count(console, "reading footage") as count:
+    with show_count(console, "reading footage") as count:
         flight = read_footage(footage, options, count)
     if map_cache is None:
         _tell_map(flight)
@@ -92,12 +92,12 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
     console = Console(stderr=True)
 
     def stage(what: str) -> AbstractContextManager[Callable[..., None]]:
-        return shown_count(console, what, begins=COMPILES if what == "localizing" else "begun")
+        return show_count(console, what, begins=COMPILES if what == "localizing" else "begun")
 
     trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
     judgement = judge(trial)
     _tell_notes(flight, trial.notes)
-    with shown_steps(console) as say:
+    with show_steps(console) as say:
         page = write_trial(report, trial, judgement, map_cache, say)
     deployment = write_trial_deployment(report / "deployment.yaml", trial, map_cache)
     out = Console()

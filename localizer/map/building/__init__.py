@@ -1,1 +1,1 @@
-"""From a source to a tile cache: levels of detail, pools of workers, atomic publishing."""
+"""Converts a map source to a tile cache: levels of detail, worker pools, atomic publishing."""

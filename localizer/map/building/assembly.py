@@ -1,4 +1,4 @@
-"""Assemble imported tiles to a cache: tree, index and manifest."""
+"""Assembles imported tiles to a cache: tree, index and manifest."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def _covers(node: _Node) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """index, and manifest as far as the tiles tell; leaves: the finest tiles; volumes: the ECEF
-    corners (8, 3) that the source states of nodes, with their tiles.
+    """A cache before publishing. manifest: as far as the tiles determine it; leaves: the finest
+    tiles; volumes: ECEF corners (8, 3) that the source states for nodes, with their tiles.
     """
 
     index: TileIndex
@@ -82,9 +82,7 @@ class Assembled:
 def assemble(
     tree: SourceTree, records: dict[int, TileRecord], staged: Staging, frame: LocalFrame
 ) -> Assembled:
-    """Put the imported tiles in their places in the staging folder. `MapSourceError` if no tile has
-    a surface.
-    """
+    """Place the imported tiles in the staging folder. `MapSourceError` if no tile has a surface."""
     root = _graft(tree.root, records)
     nodes = [root]
     child_start = []

@@ -1,4 +1,4 @@
-"""Building a tile cache: every importer's tiles go through here, in parallel, atomically."""
+"""Builds a tile cache from any importer's tiles, in parallel and atomically."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def _origin(tree: SourceTree, lift: float) -> Geodetic:
 
 
 def fingerprint(files: Iterable[Path]) -> str:
-    """What changes when one of the files does: of their names, sizes and times."""
+    """Hash of files' names, sizes and times, to detect changes."""
     digest = hashlib.sha256()
     for path in files:
         try:

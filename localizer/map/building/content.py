@@ -9,7 +9,7 @@ import numpy as np
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.map.building.staging import StoredTile
-from localizer.map.cache.tile import facing_fault
+from localizer.map.cache.tile import orientation_fault
 from localizer.map.importers.rules import ImportRules
 
 _SLACK_M, _SLACK_SHARE = 1.0, 0.1  # beyond a volume: of its size
@@ -24,7 +24,7 @@ def require_upright(
     """
     if up_axis is None:  # heights, which can only face up
         return []
-    fault = facing_fault(np.sum([tile.area for tile in leaves], axis=0))
+    fault = orientation_fault(np.sum([tile.area for tile in leaves], axis=0))
     if fault is None:
         return []
     other = "z" if up_axis == "y" else "y"

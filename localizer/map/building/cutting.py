@@ -1,4 +1,4 @@
-"""Squares cut out of textured meshes, with just their part of the texture."""
+"""Cuts squares out of textured meshes, with the part of the texture that they use."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ _PADDING = 2  # texels around a packed chart
 
 
 def cropped(mesh: SourceMesh, left: float, top: float, size: float) -> SourceMesh | None:
-    """The triangles whose centroids lie in a square (x, y; metres), with just their part of the
-    texture; None where there are none. left, top: its western and northern edge, m; size: its side,
-    m.
+    """The triangles with centroids in a square (x, y; metres) and their part of the texture; None
+    without any. left, top: western and northern edge, m; size: side, m.
     """
     centroid = mesh.positions[mesh.faces, :2].mean(axis=1)
     here = (
@@ -64,7 +63,7 @@ def _repacked(mesh: SourceMesh) -> SourceMesh:
 
 
 def shelves(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """Places (N, 2) of rectangles (N, 2: width, height) packed in rows, and their extent."""
+    """Pack rectangles (N, 2: width, height) in rows; positions (N, 2) and total size."""
     limit = max(int(np.sqrt(1.1 * sizes.prod(axis=1).sum())), int(sizes[:, 0].max()))
     places = np.zeros_like(sizes)
     x = y = row = widest = 0

@@ -93,7 +93,7 @@ def extent_warnings(
     source: str,
     rules: ImportRules,
 ) -> list[str]:
-    """Doubts about a finished map. extent: (latitude, longitude) corners; heights: ellipsoidal."""
+    """Warnings about a map's extent (latitude, longitude) and ellipsoidal heights."""
     warnings = []
     low, high = (height - separation_m for height in height_range_m)
     if low < LOWEST_M or high > HIGHEST_M:

@@ -25,8 +25,8 @@ _NO_DRIVERS = "HTTP,WMS,WCS,WMTS,WFS,OAPIF,OGCAPI,DAAS,EEDAI,PLMOSAIC,STACTA,STA
 def call_apart(
     function: Callable[..., _Result], *args: object, rules: ImportRules, what: str
 ) -> _Result:
-    """The function's result, or the exception that it raised; `MapSourceError` where its process
-    died or took too long. what: that it does, for the message.
+    """Call a function in its own process; returns its result or raises its exception.
+    `MapSourceError` if the process died or was too slow. what: for that message.
     """
     context = multiprocessing.get_context("spawn")  # OpenCV's threads do not survive a fork
     here, there = context.Pipe(duplex=False)
@@ -80,7 +80,7 @@ def _answer(
 
 
 def confine(rules: ImportRules) -> None:
-    """Limit this process's memory, keep GDAL off the network, end with the parent."""
+    """Limit this process's memory, disable GDAL's network access, and end with the parent."""
     os.environ["GDAL_SKIP"] = _NO_DRIVERS
     with open("/proc/self/statm") as statm:
         used = int(statm.read().split()[5]) * _PAGE  # data and stacks
@@ -92,7 +92,7 @@ def confine(rules: ImportRules) -> None:
 
 
 def out_of_memory(rules: ImportRules) -> str:
-    """The error for a `MemoryError`."""
+    """Error text for a `MemoryError`."""
     return f"does not fit into memory ({rules.memory_mb} MiB; --limit memory_mb=NUMBER)"
 
 

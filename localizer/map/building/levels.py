@@ -1,4 +1,4 @@
-"""Levels of detail for tilesets that have none, and smaller tiles where theirs are huge."""
+"""Adds levels of detail to tilesets without any, and cuts huge tiles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from localizer.errors import MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.geometry.pose import Array
 from localizer.map.building.quadtree import mips_of, quadtree
-from localizer.map.building.topdown import Textured, made_error, seen_from_above
+from localizer.map.building.topdown import Textured, seen_from_above, tile_error_m
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import ContentFile
 from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource
@@ -23,7 +23,7 @@ _SMALL_BYTES = 1 << 20  # files up to here are not larger
 
 @dataclass(frozen=True)
 class ContentModel:
-    """A tile's content in ENU axes about an origin; one `Model`. key: what tells it from others."""
+    """A tile's content in ENU axes about an origin; implements `Model`. key: identifies it."""
 
     content: ContentFile = field(compare=False)
     origin: Geodetic
@@ -49,9 +49,9 @@ class ContentModel:
 
 
 @dataclass(frozen=True, eq=False)
-class MadeTile:
-    """The surface of other tiles from above; one `TileSource`. left, top, size: the square that
-    holds them, ENU metres about the origin.
+class TopViewTile:
+    """Coarser tile: the surface of other tiles seen from above; implements `TileSource`. left, top,
+    size: its square, ENU metres about the origin.
     """
 
     parts: tuple[ContentFile, ...]
@@ -82,7 +82,7 @@ class MadeTile:
 
 
 def with_levels(tree: SourceTree) -> SourceTree:
-    """The tree with huge leaves cut up, and with coarser levels if it has none at all."""
+    """The tree with huge leaves cut, and with coarser levels if it has none."""
     lat, lon, h = (float(x) for x in geodetic_from_ecef(tree.centre))
     origin = Geodetic(lat, lon, h)
     nodes = [node for node in tree.root.walk() if node.tiles and not node.children]
@@ -157,7 +157,7 @@ def _grouped(leaves: list[_Leaf], origin: Geodetic) -> SourceNode:
     high = np.max([leaf.high for leaf in leaves], axis=0)
     size = 1.0001 * float((high - low).max())
     parts = tuple(part for leaf in leaves for part in leaf.parts)
-    tile = MadeTile(parts, origin, float(low[0]), float(high[1]), size)
+    tile = TopViewTile(parts, origin, float(low[0]), float(high[1]), size)
     children = [leaf.node for leaf in leaves]
     if len(leaves) > GROUP:
         middles = np.array([0.5 * (leaf.low + leaf.high) for leaf in leaves])
@@ -171,7 +171,7 @@ def _grouped(leaves: list[_Leaf], origin: Geodetic) -> SourceNode:
                 for group in groups
                 if group
             ]
-    return SourceNode(made_error(size), True, (tile,), children, stands_in=False)
+    return SourceNode(tile_error_m(size), True, (tile,), children, stands_in=False)
 
 
 def _in_frame(content: ContentFile, frame: LocalFrame) -> list[SourceMesh]:

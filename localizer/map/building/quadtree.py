@@ -1,4 +1,4 @@
-"""The quadtree of a mesh: leaves are cut out of it, coarser levels are drawn from above."""
+"""Quadtree of a mesh: leaves are cut out of it, coarser levels are rendered from above."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from localizer.geometry.pose import Array
 from localizer.map.building.cutting import cropped
 from localizer.map.building.staging import texel_size
-from localizer.map.building.topdown import TEXELS, made_error, seen_from_above
+from localizer.map.building.topdown import TEXELS, seen_from_above, tile_error_m
 from localizer.map.cache.tile import build_mips
 from localizer.map.importers.rules import ImportRules
 from localizer.map.source import SourceMesh, SourceNode
@@ -22,19 +22,19 @@ LEAF_TRIANGLES = 30_000
 
 
 class Model(Protocol):
-    """A mesh in axes of its own (metres, z up).
+    """A mesh in its own axes (metres, z up).
 
     Equal models are the same mesh: what was loaded for a tile is kept for the next one.
     """
 
     @property
     def name(self) -> str:
-        """How errors name it."""
+        """Name for errors."""
         ...
 
     @property
     def rules(self) -> ImportRules:
-        """What its import may take."""
+        """Limits of the import."""
         ...
 
     def load(self) -> list[SourceMesh]:
@@ -60,7 +60,7 @@ class MeshGrid:
 
 @dataclass(frozen=True)
 class MeshTile:
-    """Tile (column, row) of a level, 0 the coarsest; one `TileSource`."""
+    """Tile (column, row) of a level, 0 the coarsest; implements `TileSource`."""
 
     model: Model
     grid: MeshGrid
@@ -93,7 +93,7 @@ class MeshTile:
 
 
 def bounds(model: Model) -> tuple[Array, Array]:
-    """Lowest and highest corner (3,) of a model, in its axes."""
+    """Lowest and highest corner (3,) of a model in its axes."""
     meshes = _loaded(model)
     low = np.min([m.positions.min(axis=0) for m in meshes], axis=0)
     high = np.max([m.positions.max(axis=0) for m in meshes], axis=0)
@@ -101,7 +101,7 @@ def bounds(model: Model) -> tuple[Array, Array]:
 
 
 def quadtree(model: Model) -> SourceNode:
-    """The tree of a model, as deep as its triangles and texels ask for."""
+    """The tile tree of a model, as deep as its triangles and texels require."""
     meshes = _loaded(model)
     low, high = bounds(model)
     extent = float((high - low)[:2].max()) * 1.0001
@@ -127,7 +127,7 @@ def _node(tile: MeshTile) -> SourceNode:
         for row in (2 * tile.row, 2 * tile.row + 1):
             for column in (2 * tile.column, 2 * tile.column + 1):
                 children.append(_node(replace(tile, level=tile.level + 1, column=column, row=row)))
-    return SourceNode(made_error(tile.size) if children else 0.0, True, (tile,), children)
+    return SourceNode(tile_error_m(tile.size) if children else 0.0, True, (tile,), children)
 
 
 @lru_cache(maxsize=1)
@@ -142,5 +142,5 @@ def _mips(model: Model) -> list[tuple[Image, ...]]:
 
 
 def mips_of(mesh: SourceMesh) -> tuple[Image, ...]:
-    """The mesh's texture and its coarser levels."""
+    """The mesh's texture and its coarser mip levels."""
     return (mesh.image,) if mesh.palette else build_mips(mesh.image)

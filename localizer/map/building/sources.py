@@ -1,4 +1,4 @@
-"""Telling sources apart: which importer reads what."""
+"""Selects the importer of a map source."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _IMPORTABLE = (
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a source is to be read, beyond what it says. up_axis: of meshes; height_unit, nodata: of
-    a DSM, see `read_rasters`.
+    """Reading options for values that a source does not state. up_axis: of meshes; height_unit,
+    nodata: of a DSM, see `read_rasters`.
     """
 
     up_axis: UpAxis | None = None
@@ -89,7 +89,7 @@ def _read_mesh(
 
 
 def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) -> SourceTree:
-    """The tree of a mesh. Its up axis is else y for glTF and z for OBJ."""
+    """The tree of a mesh. Default up axis: y for glTF, z for OBJ."""
     axis: UpAxis = options.up_axis or ("z" if path.suffix.lower() == ".obj" else "y")
     model = MeshFile(path, axis, georeference, options.rules)
     low, high = bounds(model)

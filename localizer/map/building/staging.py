@@ -1,4 +1,4 @@
-"""A build in progress: a folder beside the cache that survives kill -9 and becomes it by rename."""
+"""A build in progress: a folder beside the cache that survives a crash and replaces it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Staging:
         self.folder = folder
 
     def record(self, key: int) -> TileRecord | None:
-        """The record of a source tile that is finished, its files present."""
+        """The record of a finished source tile whose files exist."""
         try:
             data = json.loads(self._record_path(key).read_bytes())
             tiles = tuple(_stored_from_json(t) for t in data["tiles"])
@@ -79,7 +79,7 @@ class Staging:
         return record
 
     def tile_path(self, key: int, part: int) -> Path:
-        """Where a source tile's part lies while the build runs."""
+        """Path of a source tile's part during the build."""
         return self.folder / "parts" / f"{key // 1000:04d}" / f"{key:07d}-{part}.safetensors"
 
     def store(self, key: int, meshes: list[SourceMesh]) -> TileRecord:
@@ -113,10 +113,10 @@ def _stored_from_json(data: dict[str, Any]) -> StoredTile:
 
 @contextmanager
 def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterator[Staging]:
-    """The staging folder of a build, locked; what an interrupted build of the same `parameters`
-    left there is kept. On an exception it stays for the next try, `out` is not touched.
-    `MapCacheError` if the cache exists (unless it may be replaced), the folder cannot be made, or
-    another build holds it. overwrite: an existing cache may be replaced.
+    """Context manager: the locked staging folder of a build; the work of an interrupted build with
+    the same `parameters` is kept. After an exception the folder stays and `out` is unchanged.
+    `MapCacheError` if the cache exists and may not be replaced (overwrite), the folder cannot be
+    made, or another build uses it.
     """
     if out.exists() and not overwrite:
         raise MapCacheError(
@@ -147,7 +147,7 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
 
 
 def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache:
-    """Write index and manifest: the staging folder opens as a cache, and is not published yet."""
+    """Write index and manifest, and open the staging folder as a cache, before publishing."""
     digest = index.save(staged.folder / INDEX_NAME)
     final = manifest.model_copy(update={"index_sha256": digest})
     _write(staged.folder / MANIFEST_NAME, final.model_dump_json(indent=1).encode())
@@ -155,9 +155,8 @@ def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache
 
 
 def publish(staged: Staging, out: Path, manifest: Manifest) -> Manifest:
-    """Write the manifest of a `complete` cache and rename the folder to `out`; nothing is half done
-    after it. MapCacheError while someone reads what is there: the next try publishes what is
-    staged.
+    """Publish a `complete` cache atomically by a rename to `out`. `MapCacheError` while a reader
+    uses the old cache.
     """
     folder = staged.folder
     _write(folder / MANIFEST_NAME, manifest.model_dump_json(indent=1).encode())
@@ -176,7 +175,7 @@ def _is_empty(path: Path) -> bool:
 
 
 def stored_tile(mesh: SourceMesh) -> tuple[bytes, StoredTile]:
-    """A tile's file and record, from a mesh in ENU metres."""
+    """Encode a mesh in ENU metres as tile file and record."""
     used = np.unique(mesh.faces)  # also drops vertices that no face uses
     lookup = np.zeros(len(mesh.positions), np.int32)
     lookup[used] = np.arange(len(used), dtype=np.int32)

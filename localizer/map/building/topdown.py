@@ -1,8 +1,4 @@
-"""Coarse levels where a source has none: its surface as height fields, drawn from above.
-
-Seen from where coarse levels are used (several pixels to a grid step) that is what is left of a
-surface.
-"""
+"""Makes coarse levels for sources without any: height fields of their surface, seen from above."""
 
 from __future__ import annotations
 
@@ -32,17 +28,16 @@ _DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera axes: x east, 
 Textured = tuple[SourceMesh, tuple[Image, ...]]  # a mesh and its mips
 
 
-def made_error(size: float) -> float:
-    """Geometric error of a tile of `size` metres that `seen_from_above` made."""
+def tile_error_m(size: float) -> float:
+    """Geometric error (m) of a tile of `size` metres made by `seen_from_above`."""
     return ERROR_PER_STEP * size / CELLS
 
 
 def seen_from_above(
     groups: Iterable[Sequence[Textured]], left: float, top: float, size: float
 ) -> list[SourceMesh]:
-    """A square (metres, z up) of the meshes as one textured height field; the groups are drawn one
-    after the other, so that only one need be in memory. left, top: the square's western and
-    northern edge; size: its side.
+    """Render the meshes of a square (metres, z up) as one textured height field. groups: rendered
+    one after the other to save memory. left, top: western and northern edge; size: side.
     """
     step = size / CELLS
     heights = np.full((CELLS + 1, CELLS + 1), -np.inf)

@@ -1,4 +1,4 @@
-"""Importing every tile of a source: here, in a pool of processes or on a Dask cluster."""
+"""Imports every tile of a source: in this process, in a pool of processes or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class ImportWorkers:
 
 
 def tiles_of(root: SourceNode) -> Iterator[TileSource]:
-    """Every tile of a tree, in the order that numbers them."""
+    """Yield every tile of a tree in numbering order."""
     for node in root.walk():
         yield from node.tiles
 
@@ -187,7 +187,7 @@ def _run_alone(job: ImportJob, key: int, tile: TileSource) -> TileRecord:
 
 
 def worker_pool(workers: int, rules: ImportRules) -> ProcessPoolExecutor:
-    """Processes that end with this one, each under the limits of the rules."""
+    """A pool of processes with the limits of `rules`, which end with this process."""
     # Not fork: OpenCV's and the caller's threads do not survive it.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(

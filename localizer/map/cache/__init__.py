@@ -1,1 +1,1 @@
-"""The tile cache on disk, tiles in memory, selection, streaming and picking. Renders nothing."""
+"""The tile cache: files, tiles in memory, selection, streaming and picking. No rendering."""

@@ -71,7 +71,7 @@ class Manifest(BaseModel):
 
     @property
     def imagery_date(self) -> str | None:
-        """Of the map's images; an older build kept it beside its other options."""
+        """Date of the imagery; older builds kept it among other options."""
         stated = self.build.get("imagery_date") if self.kind is None else self.kind.imagery_date
         return str(stated) if re.fullmatch(IMAGERY_DATE, str(stated)) else None
 
@@ -228,7 +228,7 @@ def encode_tile(
     repeat: bool = False,
     finest_jpeg: bytes | None = None,
 ) -> bytes:
-    """A tile's file. finest_jpeg: the source's own JPEG of mips[0], kept as it is."""
+    """Encode a tile file. finest_jpeg: the source's JPEG of mips[0], stored unchanged."""
     arrays: dict[str, NDArray[Any]] = {
         "positions": np.ascontiguousarray(positions, np.float32),
         "uvs": np.ascontiguousarray(uvs, np.float32),

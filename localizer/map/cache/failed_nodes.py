@@ -1,4 +1,4 @@
-"""Nodes of a cache that could not be read, and when each is tried again."""
+"""Tracks nodes of a cache that could not be read, and when to retry."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FailedNodes:
         return len(self._failures)
 
     def note(self, node: int, error: MapCacheError) -> None:
-        """Try it again later, and later still: a disk may come back."""
+        """Record a failure; retries are delayed longer each time."""
         before = self._failures.get(node)
         if before is None:
             _log.error("%s", error)
@@ -50,7 +50,7 @@ class FailedNodes:
         self._failures.pop(node, None)
 
     def is_waiting(self, node: int) -> bool:
-        """Whether a node could not be read and it is not time to try again."""
+        """Whether a node has failed and its retry is not due."""
         failure = self._failures.get(node)
         return failure is not None and self._clock() < failure.again_s
 

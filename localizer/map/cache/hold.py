@@ -1,7 +1,7 @@
-"""A program that streams a cache locks its folder, so that no build replaces it meanwhile.
+"""Locks a cache folder while a program streams it, so that no build replaces it.
 
-A lock of the kernel on the folder: it ends with the process, however that ends, and a cache that
-may only be read can be held. Where a file system knows no such locks, nobody is kept from anything.
+It is a kernel lock, which ends with the process and also works for read-only caches. On file
+systems without such locks it has no effect.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class CacheLock:
             raise MapCacheError(f"{path}: is just being replaced; open it again") from error
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the lock."""
         if self._folder is not None:
             os.close(self._folder)
             self._folder = None
@@ -37,7 +37,7 @@ class CacheLock:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[None]:
-    """Lock for the replacement of the cache at `path`; MapCacheError while a reader holds it."""
+    """Lock for replacing the cache at `path`; `MapCacheError` while it is being read."""
     if not path.exists():
         yield
         return

@@ -22,8 +22,8 @@ _CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.bool_)
 
 @dataclass(frozen=True)
 class BundleHits:
-    """Where the rays of a bundle meet the map. distances: (N,) in multiples of the directions, NaN
-    where there is nothing; normals: (N, 3) unit, world axes, of the triangle, towards the eye.
+    """Hits of a ray bundle on the map. distances: (N,) in multiples of the directions, NaN without
+    a hit; normals: (N, 3) unit, world axes, towards the origin.
     """
 
     distances: Array
@@ -32,8 +32,8 @@ class BundleHits:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """What four planes through the eye enclose. axes: (3, 3) rows x, y, and z times the slope;
-    inside |x| and |y| are at most z.
+    """Four planes through the origin that enclose a ray bundle. axes: (3, 3) rows x, y, and z times
+    the slope; inside, |x| and |y| are at most z.
     """
 
     axes: Array
@@ -48,13 +48,13 @@ class Pyramid:
         return cls(np.vstack([sideways, axis * (float(slopes.max()) * (1 + 1e-9) + 1e-9)]))
 
     def beyond(self, points: Array) -> NDArray[np.uint8]:
-        """Which planes each point (..., 3), from the eye, lies beyond: (...) four bits."""
+        """For each point (..., 3), a bit for each of the four planes that it is outside of."""
         x, y, z = np.moveaxis(points @ self.axes.T, -1, 0)
         z = z + _SEAM_M
         return np.asarray((x > z) + 2 * (-x > z) + 4 * (y > z) + 8 * (-y > z), np.uint8)
 
     def meets_boxes(self, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Which boxes (N,) with corners (N, 3), from the eye, are not wholly beyond a plane."""
+        """Whether each box (N,) with corners (N, 3) is not entirely outside one plane."""
         corners = np.where(_CORNERS[None, :, :], high[:, None, :], low[:, None, :])
         meets: NDArray[np.bool_] = np.bitwise_and.reduce(self.beyond(corners), axis=1) == 0
         return meets
@@ -63,7 +63,8 @@ class Pyramid:
 def pick(
     view: RenderedView, pixels: ArrayLike, meshes: Sequence[TileMesh] = ()
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Surface points (N, 3) in world metres under pixels (N, 2), and which of them exist.
+    """Surface points (N, 3) in world metres under pixels (N, 2) of a rendered view, and a mask of
+    those that exist.
 
     1/z is linear in the image on a plane, so it is interpolated bilinearly. Where neighbouring
     depths jump (a roof's edge, the skyline) that would invent points in mid-air: there the nearest
@@ -83,7 +84,8 @@ def pick(
 
 
 def cast_rays(meshes: Sequence[TileMesh], origin: ArrayLike, directions: ArrayLike) -> Array:
-    """Multiples (N,) of `directions` (N, 3) at which rays from `origin` (3,) first meet a triangle.
+    """Distances (N,), in multiples of `directions` (N, 3), at which rays from `origin` (3,) first
+    hit a triangle.
 
     World frame; NaN where a ray meets nothing. Both sides of a triangle count.
     """
@@ -108,7 +110,7 @@ def _nearest(
 
 
 def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) -> BundleHits:
-    """The nearest hits of rays from `origin` (3,) close about one direction: directions (N, 3).
+    """The nearest hits of rays from `origin` (3,) with similar directions (N, 3).
 
     For N rays about as fast as `cast_rays` for one: a triangle on the far side of one of the
     bundle's four bounding planes is passed over for all of them.
@@ -144,7 +146,7 @@ def _nearest_of_bundle(
 
 
 def warm_up() -> None:
-    """Compile what casts bundles: a first target in flight must not wait for it."""
+    """Compile the ray-casting kernels before the first target in flight."""
     corner = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
     faces, beyond = np.array([[0, 1, 2]], np.int32), np.zeros(3, np.uint8)
     hit, nearest = np.zeros(1, np.int32), np.full(1, np.inf)

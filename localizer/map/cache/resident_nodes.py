@@ -1,4 +1,4 @@
-"""The tiles in memory, least recently used first out."""
+"""Nodes in memory; the least recently used are evicted first."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ResidentNodes:
         self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
 
     def touched(self, node: int) -> Sequence[TileMesh]:
-        """A resident node's meshes; it counts as used."""
+        """A resident node's meshes; marks it as used."""
         self._meshes.move_to_end(node)
         return self._meshes[node]
 

@@ -1,4 +1,4 @@
-"""Which tiles a view needs: screen-space error, frustum and horizon culling (numba kernel)."""
+"""Selects the tiles of a view by screen-space error, frustum and horizon culling (numba kernel)."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _UNSEEN, _CULLED, _WANTED, _REFINED = 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class DetailLimits:
-    """When a node is fine enough. max_error_px: its geometric error in the image; max_texel_px: how
-    many image pixels one of its texels may cover.
+    """Limits of detail. max_error_px: a node's geometric error in the image; max_texel_px: image
+    pixels per texel.
     """
 
     max_error_px: float = 8.0
     max_texel_px: float = 1.5
 
     def relaxed(self, factor: float) -> DetailLimits:
-        """Coarser by `factor`."""
+        """The limits, coarser by `factor`."""
         return DetailLimits(self.max_error_px * factor, self.max_texel_px * factor)
 
 
@@ -48,7 +48,7 @@ class Selection:
 
 
 class TileSelector:
-    """Selection on a tile index; holds no state between calls."""
+    """Selects nodes of a tile index; has no state."""
 
     def __init__(self, index: TileIndex, frame: LocalFrame) -> None:
         self._index = index
@@ -66,7 +66,7 @@ class TileSelector:
         resident: NDArray[np.bool_],
         limits: DetailLimits,
     ) -> Selection:
-        """Nodes for a view. resident: (N,) bool, nodes all of whose tiles are in memory."""
+        """The nodes of a view. resident: (N,) bool, nodes whose tiles are all in memory."""
         i = self._index
         n = len(i.refine)
         nodes = np.empty((3, n), np.int32)

@@ -1,8 +1,8 @@
-"""Streaming: the tiles of a view from memory, the missing ones loaded behind its back.
+"""Streams tiles: a view's tiles come from memory, missing ones are loaded in the background.
 
-`select` never waits for the disk unless it is told to. Missing detail is replaced by resident
-parents and loaded by one thread (decoding releases the GIL); least recently used nodes leave when
-the byte budget is full.
+`select` does not wait for the disk unless told to. Resident parents replace missing detail. One
+thread loads tiles (decoding releases the GIL); least recently used nodes are evicted when the byte
+budget is full.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CLOSE_S = 10.0  # for a tile to be read to its end
 
 @dataclass(frozen=True)
 class StreamCounters:
-    """Since the streamer was made.
+    """Counters since the streamer was made.
 
     hits, misses: wanted nodes that were in memory or not; complete: selections at the wanted detail
     throughout; stalls: selections with a hole; failures: attempts at nodes that could not be read;
@@ -52,7 +52,7 @@ class StreamCounters:
 
 
 class TileStreamer:
-    """Tiles of a cache within a byte budget; one thread selects and prefetches."""
+    """Streams tiles of a cache within a byte budget; one thread selects and prefetches."""
 
     def __init__(
         self,
@@ -122,8 +122,8 @@ class TileStreamer:
             return list(self._current)
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """Load what views (world_from_camera) to come will need, the first one's first, after what
-        the current one needs and as far as the budget reaches.
+        """Load the tiles of future views (world_from_camera) in order, after those of the current
+        view, as far as the budget allows.
         """
         limits = [self._fitting_limits(view, camera) for view in views]
         with self._lock:
@@ -146,7 +146,7 @@ class TileStreamer:
             self._lock.notify_all()
 
     def counters(self) -> StreamCounters:
-        """What has happened so far."""
+        """Counters so far."""
         with self._lock:
             now = {
                 "resident_bytes": self._nodes.bytes + self._arrived_bytes,
@@ -158,7 +158,7 @@ class TileStreamer:
 
     @property
     def idle(self) -> bool:
-        """Whether the loader waits and has nothing to load or to free."""
+        """Whether the loader has nothing to do."""
         with self._lock:
             return self._waiting and not (self._nodes.evicted or self._to_load())
 

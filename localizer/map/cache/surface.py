@@ -1,4 +1,4 @@
-"""The map's surface at full detail for single rays, whatever is being drawn."""
+"""Casts single rays on the map's surface at full detail."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST_NODES = 64  # of a ray along the horizon: what comes later is not looked f
 
 
 class MapSurface:
-    """Casts rays into a cache's finest tiles, of which it reads the geometry alone.
+    """Casts rays into a cache's finest tiles, of which it reads only the geometry.
 
     What the renderer shows is chosen for its picture: its tiles may be off by several pixels, which
     at a target is metres. Safe to use from several threads; a cast may wait for the disk.
@@ -35,7 +35,8 @@ class MapSurface:
         warm_up()
 
     def cast(self, origin: Array, directions: Array) -> BundleHits:
-        """The nearest hits of rays close about one: origin (3,), directions (N, 3), world frame.
+        """The nearest hits of rays with similar directions: origin (3,), directions (N, 3), world
+        frame.
 
         `MapCacheError` for a tile that cannot be read.
         """

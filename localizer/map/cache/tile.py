@@ -1,4 +1,4 @@
-"""One drawable piece of the map: `TileMesh`, its texture in the layout that kernels read, mips."""
+"""One drawable tile of the map: `TileMesh`, its texture layout for kernels, mips."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PackedTexture:
 
 @dataclass(frozen=True, eq=False)
 class TileMesh:
-    """A textured triangle mesh with its place in the world.
+    """A textured triangle mesh with its pose in the world.
 
     positions: (V, 3) float32 metres, tile-local; uvs: (V, 2) float32, v down (texture row 0 is
     v = 0); faces: (F, 3) int32; mips: (h, w, 3) uint8 RGB each, finest first; world_from_tile: to
@@ -109,7 +109,7 @@ class TileMesh:
         return int(own + sum(m.nbytes for m in self.mips))
 
     def placed(self, world_from_tile: Pose) -> TileMesh:
-        """The same mesh elsewhere; arrays are shared."""
+        """The same mesh at another pose; arrays are shared."""
         return TileMesh.from_packed(
             self.positions,
             self.uvs,
@@ -121,15 +121,15 @@ class TileMesh:
 
 
 def vector_area(positions: Array, faces: NDArray[np.int32]) -> Array:
-    """Sum of a mesh's normals, each as long as its triangle's area (3,), m²: walls that face each
-    other cancel, so that what is left of a map's points up, whatever stands on it.
+    """Sum (3,) of triangle normals weighted by area, m². Opposite walls cancel, so a map's vector
+    area points up.
     """
     a, b, c = (positions[faces[:, k]].astype(np.float64) for k in range(3))
     return np.asarray(0.5 * np.cross(b - a, c - a).sum(axis=0))
 
 
-def facing_fault(area: Array) -> str | None:
-    """What is wrong with a map whose `vector_area` (ENU) is this; None where most faces up."""
+def orientation_fault(area: Array) -> str | None:
+    """Why a map with this `vector_area` (ENU) is wrongly oriented; None if most of it faces up."""
     up, aside = float(area[2]), float(np.hypot(area[0], area[1]))
     if up >= aside:
         return None
@@ -141,7 +141,7 @@ def mesh_fault(
     uvs: NDArray[np.floating[Any]],
     faces: NDArray[np.integer[Any]],
 ) -> str | None:
-    """What a renderer's kernels, which check no index, must never be given; None for a sound mesh.
+    """Why a mesh is invalid for the renderer's kernels, which check no index; None if it is valid.
 
     positions: (V, 3); uvs: (V, 2); faces: (F, 3).
     """

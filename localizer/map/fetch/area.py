@@ -1,4 +1,4 @@
-"""The ground that is wanted."""
+"""A rectangle of ground to fetch."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ class Area:
         return found
 
     def within(self, other: tuple[float, float, float, float]) -> bool:
-        """Whether it lies inside another rectangle: west, south, east, north."""
+        """Whether it lies inside another rectangle (west, south, east, north)."""
         west, south, east, north = other
         return (
             west <= self.west and self.east <= east and south <= self.south and self.north <= north
         )
 
     def meets(self, other: Sequence[float]) -> bool:
-        """Whether it has a point in common with west, south, east, north."""
+        """Whether it overlaps another rectangle (west, south, east, north)."""
         west, south, east, north = other
         return (
             west <= self.east and self.west <= east and south <= self.north and self.south <= north
@@ -85,8 +85,8 @@ class Area:
 
 
 def around(points: Array, margin_m: float) -> Area:
-    """What lies within `margin_m` of places, (n, 2) latitude and longitude in degrees.
-    `MapFetchError` without a place, or if the margin is not above 0 and at most 100 km.
+    """The rectangle within `margin_m` of positions (n, 2), latitude and longitude in degrees.
+    `MapFetchError` without a position, or if the margin is not above 0 and at most 100 km.
     """
     at = np.asarray(points, np.float64).reshape(-1, 2)
     if not len(at) or not np.isfinite(at).all():
@@ -104,7 +104,7 @@ def around(points: Array, margin_m: float) -> Area:
 
 
 def utm_zone(area: Area) -> CRS:
-    """The UTM zone of its centre."""
+    """The UTM zone of the area's centre."""
     latitude, longitude = area.centre
     base = 32600 if latitude >= 0 else 32700
     return CRS.from_epsg(base + int((longitude + 180) // 6) % 60 + 1)

@@ -1,4 +1,4 @@
-"""The file of sources: which service has what, where, how fine, and under which licence."""
+"""Catalogue of map services: what each has, where, at which resolution and licence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_BYTES = 1 << 20
 
 
 class CatalogueSource(BaseModel):
-    """One service. A key that is not known here is an error."""
+    """One map service. Unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -83,12 +83,12 @@ class CatalogueSource(BaseModel):
 
     @property
     def has_heights(self) -> bool:
-        """Whether its numbers are heights."""
+        """Whether it has heights (not imagery)."""
         return self.role != "imagery"
 
     @property
     def area_deg2(self) -> float:
-        """By which a national service goes before one of the whole world."""
+        """Size of its area, by which national services precede worldwide ones."""
         west, south, east, north = self.bounds
         return (east - west) * (north - south)
 
@@ -96,8 +96,8 @@ class CatalogueSource(BaseModel):
 def load_sources(
     more: tuple[Path, ...] = (), shipped: Path = SHIPPED
 ) -> tuple[CatalogueSource, ...]:
-    """The shipped file's sources, and those of other files, which replace shipped ones of the same
-    name. `MapFetchError` names what does not hold, and what is refused.
+    """Sources of the shipped file and of other files, which replace those of the same name.
+    `MapFetchError` for invalid or forbidden ones.
     """
     found: dict[str, CatalogueSource] = {}
     for path in (shipped, *more):
@@ -132,9 +132,9 @@ def _entries(path: Path) -> list[Any]:
 def choose(
     sources: tuple[CatalogueSource, ...], area: Area, role: str, name: str | None = None
 ) -> CatalogueSource:
-    """The source of that name, else the finest whose bounds hold the area. role: imagery, or
-    heights, which takes a surface before a terrain and a world's model only as the last resort.
-    `MapFetchError` if there is none.
+    """The source of that name, otherwise the finest that covers the area. role: imagery or heights;
+    surface models precede terrain models, and worldwide ones come last. `MapFetchError` if there is
+    none.
     """
     fitting = [s for s in sources if s.has_heights == (role == "heights")]
     if name is not None:

@@ -1,5 +1,6 @@
-"""Cloud-optimised GeoTIFFs: of large files only the blocks that are needed, by HTTP ranges; named
-by an address or found in a STAC catalogue.
+"""Cloud-optimised GeoTIFFs: reads only the required blocks of remote files by HTTP ranges.
+
+Files are given by URL or found in a STAC catalogue.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, utm_zone
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.heights import UNITS, metres_of
-from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.polite import HttpClient, shown
 from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, cut, grid_over
 from localizer.map.importers.raster_file import offline
 
@@ -43,11 +44,11 @@ class NoFileError(MapFetchError):
 
 
 class RangeFile(io.RawIOBase):
-    """A file on a server, read in blocks that are asked for once; one thread. failed: is given the
-    errors, of which GDAL's own would only say that something could not be read.
+    """A remote file as a Python file object, read in cached blocks; one thread. failed: receives
+    errors, which GDAL would replace by a generic one.
     """
 
-    def __init__(self, url: str, client: PoliteClient, failed: list[MapFetchError]) -> None:
+    def __init__(self, url: str, client: HttpClient, failed: list[MapFetchError]) -> None:
         super().__init__()
         self._url, self._client, self._failed = url, client, failed
         self._at = 0
@@ -124,8 +125,8 @@ class RangeFile(io.RawIOBase):
 
 @dataclass(frozen=True)
 class CloudFile:
-    """One file. bounds: west, south, east, north in degrees, of which it has something. may_lack:
-    whether there may be no such file, since its address is made and not found in a catalogue.
+    """A remote GeoTIFF. bounds: west, south, east, north in degrees, which it covers in part.
+    may_lack: it may not exist, because its URL was constructed.
     """
 
     url: str
@@ -135,11 +136,10 @@ class CloudFile:
 
 def plan_files(
     source: CatalogueSource, area: Area, resolution_m: float, files: Sequence[CloudFile],
-    client: PoliteClient,
+    client: HttpClient,
 ) -> FetchPlan:  # fmt: skip
-    """Windows of the files that meet an area. The grid is the files' own where they share it.
-    `MapFetchError` if there is no file or there are too many, `NoFileError` if none of the named
-    ones exists.
+    """Plan the windows of the files that meet an area, on the files' common grid if there is one.
+    `MapFetchError` if there is no file or there are too many, `NoFileError` if none exists.
     """
     wanted = [f for f in files if area.meets(f.bounds)]
     if not wanted:
@@ -168,8 +168,8 @@ def plan_files(
 
 
 def degree_files(source: CatalogueSource, area: Area) -> list[CloudFile]:
-    """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file. A degree that
-    is all sea has no file, nor has some land whose heights are not public: nothing says which.
+    """Files of a model cut by whole degrees (Copernicus GLO-30), otherwise the single file. Files
+    of sea areas and of some restricted land do not exist.
     """
     if "{lat}" not in source.url:
         return [CloudFile(source.url, source.bounds)]
@@ -184,7 +184,7 @@ def degree_files(source: CatalogueSource, area: Area) -> list[CloudFile]:
 
 
 def _grid_of(
-    files: Sequence[CloudFile], area: Area, resolution_m: float, client: PoliteClient
+    files: Sequence[CloudFile], area: Area, resolution_m: float, client: HttpClient
 ) -> FetchGrid:
     """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
     crs, transform = _lie_of(files[0], client)
@@ -199,7 +199,7 @@ def _grid_of(
     return grid_over(area.bounds_in(flat), pixel, flat, (transform.c, transform.f))
 
 
-def _lie_of(file: CloudFile, client: PoliteClient) -> tuple[CRS, Any]:
+def _lie_of(file: CloudFile, client: HttpClient) -> tuple[CRS, Any]:
     """A file's CRS and transform."""
     with _opened(file.url, client, []) as data:
         if data.crs is None:
@@ -207,7 +207,7 @@ def _lie_of(file: CloudFile, client: PoliteClient) -> tuple[CRS, Any]:
         return CRS(data.crs), data.transform
 
 
-def _exists(file: CloudFile, client: PoliteClient) -> bool:
+def _exists(file: CloudFile, client: HttpClient) -> bool:
     return client.get(file.url, {"Range": "bytes=0-0"}, (_NOT_THERE,)).status != _NOT_THERE
 
 
@@ -224,7 +224,7 @@ def _meets(window: FetchGrid, file: CloudFile) -> bool:
     return bool(west <= there[2] and there[0] <= east and south <= there[3] and there[1] <= north)
 
 
-def _opened(url: str, client: PoliteClient, failed: list[MapFetchError]) -> Any:
+def _opened(url: str, client: HttpClient, failed: list[MapFetchError]) -> Any:
     """A dataset that reads through the client; GDAL itself stays off the network."""
 
     def opener(path: str, mode: str = "rb", **_: object) -> RangeFile:
@@ -242,7 +242,7 @@ def _opened(url: str, client: PoliteClient, failed: list[MapFetchError]) -> Any:
 
 
 def check_depth(name: str, dtype: str) -> None:
-    """`MapFetchError` for more than 8 bits: which of them are black and white is not said."""
+    """`MapFetchError` for images of more than 8 bits, whose value range is unknown."""
     if dtype != "uint8":
         raise MapFetchError(
             f"{name} has pixels of {dtype}, no picture of 8 bits; ask for another layer or "
@@ -251,7 +251,10 @@ def check_depth(name: str, dtype: str) -> None:
 
 
 def _window(
-    source: CatalogueSource, window: FetchGrid, files: Sequence[CloudFile], client: PoliteClient
+    source: CatalogueSource,
+    window: FetchGrid,
+    files: Sequence[CloudFile],
+    client: HttpClient,
 ) -> bytes | None:
     """The first file that knows a pixel gives it."""
     bands = 1 if source.has_heights else 3
@@ -269,7 +272,7 @@ def _window(
 
 
 def _of_file(
-    source: CatalogueSource, window: FetchGrid, url: str, client: PoliteClient
+    source: CatalogueSource, window: FetchGrid, url: str, client: HttpClient
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """A window's bands (n, height, width) of one file, and where it knows them."""
     bands = 1 if source.has_heights else 3
@@ -311,7 +314,7 @@ def _warped(data: Any, window: FetchGrid, how: Resampling, source: CatalogueSour
 
 
 def as_geotiff(bands: np.ndarray, known: np.ndarray, window: FetchGrid) -> bytes:
-    """A piece as a file. bands: (n, height, width); known: where they hold."""
+    """Encode a piece as GeoTIFF. bands: (n, height, width); known: mask of valid pixels."""
     heights = bands.dtype == np.float32
     values = np.where(known, bands, NODATA if heights else 0).astype(bands.dtype)
     profile: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""One source over one area, into one GeoTIFF: planned, estimated, fetched piece by piece."""
+"""Fetches one source over one area into one GeoTIFF: plan, estimate, download."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import degree_files, plan_files
 from localizer.map.fetch.mosaic import assemble, check_piece
-from localizer.map.fetch.polite import PoliteClient
+from localizer.map.fetch.polite import HttpClient
 from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.fetch.stac import stac_files
 from localizer.map.fetch.tiles import plan_tiles
@@ -29,7 +29,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class FetchEstimate:
-    """What fetching would take."""
+    """Estimated size and time of a download."""
 
     requests: int
     bytes: float
@@ -38,9 +38,9 @@ class FetchEstimate:
 
 
 def make_plan(
-    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+    source: CatalogueSource, area: Area, resolution_m: float, client: HttpClient
 ) -> FetchPlan:
-    """All pieces. It may ask the service what it has (capabilities, a catalogue, a file's head)."""
+    """Plan all requests; may query the service (capabilities, catalogue, file header)."""
     if source.kind in ("wms", "wcs"):
         return plan_blocks(source, area, resolution_m, client)
     if source.kind in ("xyz", "tms", "wmts"):
@@ -53,19 +53,19 @@ def make_plan(
 
 
 def estimate(source: CatalogueSource, plan: FetchPlan) -> FetchEstimate:
-    """Before anything large is asked for."""
+    """Estimate the download before it starts."""
     seconds = max(plan.requests / source.rate_per_s, plan.bytes / _LINE_BYTES_PER_S)
     size = plan.grid.width, plan.grid.height
     return FetchEstimate(plan.requests, plan.bytes, seconds, size)
 
 
 def fetch(
-    source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path, client: PoliteClient,
+    source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path, client: HttpClient,
     progress: Progress = lambda _done, _total: None,
 ) -> float:  # fmt: skip
-    """The raster `out`. Pieces that lie in the folder from a run that was cut off are not asked for
-    again; those of another plan are removed. Returns the share of the raster that is known.
-    `MapFetchError` if the source has too little of the area.
+    """Download the raster to `out`. Pieces of an interrupted run in `folder` are reused; those of
+    another plan are removed. Returns the share of valid pixels. `MapFetchError` if the source has
+    too little of the area.
     """
     _claim(source, plan, folder)
     missing = [p for p in plan.pieces if not (folder / p.name).exists()]
@@ -101,7 +101,7 @@ def fetch(
     return known
 
 
-def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: PoliteClient) -> None:
+def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: HttpClient) -> None:
     """A piece becomes a file when it is whole; an empty one says that there is nothing."""
     data = piece.get(client)
     if data is not None:

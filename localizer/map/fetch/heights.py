@@ -18,9 +18,9 @@ UNITS = ("m",)
 
 
 def metres_of(source: CatalogueSource, name: str, data: Any, crs: CRS) -> HeightBand:
-    """How a file's numbers become metres: its unit, scale and offset. data: as rasterio opens it;
-    crs: where it has none of its own. `MapFetchError` where nothing tells the unit, or where it
-    says another datum than the source.
+    """Conversion of a file's numbers to metres, by its unit, scale and offset. data: opened by
+    rasterio; crs: if the file has none. `MapFetchError` if the unit is unknown or the datum
+    contradicts the source.
     """
     try:
         stated = stated_heights(crs if data.crs is None else CRS(data.crs), data.units[0], name)

@@ -1,4 +1,4 @@
-"""Pieces on disk become one GeoTIFF."""
+"""Joins downloaded pieces to one GeoTIFF."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _LOWEST_M, _HIGHEST_M = -1000.0, 9500.0
 
 
 def assemble(source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path) -> float:
-    """Write the raster; what no piece has is masked. Returns the share of it that is known.
-    `MapFetchError` if the pieces make no raster.
+    """Write the raster; missing pixels are masked. Returns the share of valid ones. `MapFetchError`
+    if the pieces make no raster.
     """
     grid, heights = plan.grid, source.has_heights
     profile: dict[str, Any] = {
@@ -68,8 +68,8 @@ def assemble(source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path) 
 
 
 def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
-    """`MapFetchError` for what is no whole image, of more than 8 bits, or not of the size that was
-    asked for.
+    """`MapFetchError` if a piece is no complete image, has more than 8 bits, or another size than
+    requested.
     """
     try:
         if data[:4] in _TIFF:

@@ -35,7 +35,7 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True)
 class RequestLimits:
-    """rate_per_s: requests a second to one host; bytes: that all answers together may have."""
+    """rate_per_s: requests a second to one host; most_bytes: limit of all answers together."""
 
     rate_per_s: float = 4.0
     most_bytes: int = 4 << 30
@@ -43,7 +43,7 @@ class RequestLimits:
 
 @dataclass(frozen=True)
 class HttpAnswer:
-    """What came. status: 200 or 206."""
+    """An HTTP response. status: 200 or 206."""
 
     status: int
     kind: str
@@ -60,9 +60,9 @@ class _Request:
     body: bytes | None = None
 
 
-class PoliteClient:
-    """GET and POST, from any number of threads. `MapFetchError` says what a server refused, or that
-    a limit was reached. sleep, clock: seconds.
+class HttpClient:
+    """Sends GET and POST requests from any thread, within limits. `MapFetchError` for a refusal or
+    an exceeded limit. sleep, clock: seconds.
     """
 
     def __init__(
@@ -95,13 +95,13 @@ class PoliteClient:
         headers: Mapping[str, str] | None = None,
         missing: Collection[int] = (),
     ) -> HttpAnswer:
-        """The answer to a GET, redirections followed, repeated while the server is busy. missing:
-        statuses that mean that there is nothing, and are an answer, too.
+        """Send a GET; follows redirections and retries while the server is busy. missing: HTTP
+        statuses that mean "no data" and are returned.
         """
         return self._followed(_Request(url, headers or {}), missing)
 
     def post(self, url: str, document: object) -> HttpAnswer:
-        """The answer to a POST of a JSON document, as of `get`."""
+        """Send a POST of a JSON document; see `get`."""
         body = json.dumps(document).encode()
         return self._followed(_Request(url, {"Content-Type": "application/json"}, body), ())
 
@@ -176,7 +176,7 @@ class PoliteClient:
 
 
 def shown(url: str) -> str:
-    """An address without what may be a key."""
+    """A URL without possible keys, for messages."""
     parts = urlsplit(url)
     return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
 

@@ -1,4 +1,4 @@
-"""The raster that is put together, and the pieces that it is asked for in."""
+"""Grid of the raster to fetch, and its pieces."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from affine import Affine
 from pyproj import CRS
 
 from localizer.errors import MapFetchError
-from localizer.map.fetch.polite import PoliteClient
+from localizer.map.fetch.polite import HttpClient
 
 _MOST_PIXELS = 1e9
 _MOST_PIECES = 200_000
@@ -39,7 +39,7 @@ class FetchGrid:
         return Affine(self.pixel[0], 0.0, self.left, 0.0, -self.pixel[1], self.top)
 
     def window(self, column: int, row: int, width: int, height: int) -> FetchGrid:
-        """A part of it."""
+        """A part of the grid."""
         left, top = self.left + column * self.pixel[0], self.top - row * self.pixel[1]
         return FetchGrid(self.crs, left, top, self.pixel, width, height)
 
@@ -52,9 +52,8 @@ class FetchGrid:
 
 @dataclass(frozen=True)
 class Piece:
-    """What is asked for at once. column, row: of its first pixel in the whole, which may be
-    negative; get: its image, as bytes that GDAL reads, None where the service has nothing; placed:
-    whether the image says itself where it lies.
+    """One request. column, row: of its first pixel in the grid, may be negative; get: fetches its
+    image as bytes for GDAL, None without data; placed: whether the image has its own georeference.
     """
 
     name: str
@@ -62,15 +61,14 @@ class Piece:
     row: int
     width: int
     height: int
-    get: Callable[[PoliteClient], bytes | None]
+    get: Callable[[HttpClient], bytes | None]
     placed: bool = False
 
 
 @dataclass(frozen=True)
 class FetchPlan:
-    """All that is needed of one source. bytes_per_pixel: of what is sent, a guess; requests: of all
-    pieces, a guess where a piece takes several. lacking: names of files that the server does not
-    have: nothing is known where they would be.
+    """All requests to one source. bytes_per_pixel: estimated; requests: number, estimated if a
+    piece needs several; lacking: files missing on the server, whose area stays empty.
     """
 
     grid: FetchGrid
@@ -81,7 +79,7 @@ class FetchPlan:
 
     @property
     def bytes(self) -> float:
-        """That will come, about."""
+        """Estimated download size."""
         return self.bytes_per_pixel * sum(p.width * p.height for p in self.pieces)
 
 
@@ -91,7 +89,7 @@ def grid_over(
     crs: CRS,
     origin: tuple[float, float] = (0.0, 0.0),
 ) -> FetchGrid:
-    """The pixels that cover bounds; their corners lie at multiples of a pixel from an origin."""
+    """The grid that covers bounds, aligned to multiples of a pixel from an origin."""
     left, bottom, right, top = bounds
     first = math.floor((left - origin[0]) / pixel[0]), math.floor((origin[1] - top) / pixel[1])
     last = math.ceil((right - origin[0]) / pixel[0]), math.ceil((origin[1] - bottom) / pixel[1])
@@ -116,12 +114,12 @@ def cut(grid: FetchGrid, side: int) -> list[tuple[int, int, int, int]]:
 
 
 def north_first(crs: CRS) -> bool:
-    """Whether the CRS by its own definition names northing or latitude first."""
+    """Whether the CRS defines northing or latitude as the first axis."""
     return bool(crs.axis_info) and crs.axis_info[0].direction.lower() in ("north", "south")
 
 
 def metres_per_unit(crs: CRS, latitude_deg: float) -> tuple[float, float]:
-    """Of its first and second axis at a latitude. Web Mercator's metres are stretched ones."""
+    """Ground metres per unit of the first and second axis, at a latitude."""
     if crs.is_geographic:
         return 111_320.0 * math.cos(math.radians(latitude_deg)), 110_574.0
     factor = float(crs.axis_info[0].unit_conversion_factor)

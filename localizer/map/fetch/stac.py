@@ -13,7 +13,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile
-from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.polite import HttpClient, shown
 from localizer.map.fetch.terms import require_allowed
 
 _MOST_ITEMS, _MOST_PAGES = 2000, 50
@@ -21,7 +21,7 @@ _PAGE = 100  # items that are asked for at once; a service may give fewer
 _TIFFS = ("image/tiff", "image/vnd.stac.geotiff")
 
 
-def stac_files(source: CatalogueSource, area: Area, client: PoliteClient) -> list[CloudFile]:
+def stac_files(source: CatalogueSource, area: Area, client: HttpClient) -> list[CloudFile]:
     """The asset of each item that meets the area; of items of one place the newest comes first.
     `MapFetchError` if pystac is missing, the answer cannot be read, or it has no GeoTIFF or too
     many items.
@@ -68,7 +68,7 @@ def _asset(source: CatalogueSource, item: Any) -> Any:
     return None
 
 
-def _searched(source: CatalogueSource, area: Area, client: PoliteClient) -> Iterator[Any]:
+def _searched(source: CatalogueSource, area: Area, client: HttpClient) -> Iterator[Any]:
     """Item Search of the STAC API, page by page: by GET, or by POST where only that is offered."""
     import pystac
 
@@ -96,12 +96,12 @@ class _Page:
     asked: dict[str, Any] | None
 
     @classmethod
-    def got(cls, url: str, asked: dict[str, Any] | None, client: PoliteClient) -> _Page:
+    def got(cls, url: str, asked: dict[str, Any] | None, client: HttpClient) -> _Page:
         """Ask for it."""
         answer = client.get(url) if asked is None else client.post(url, asked)
         return cls(url, json.loads(answer.data), asked)
 
-    def next(self, client: PoliteClient) -> _Page | None:
+    def next(self, client: HttpClient) -> _Page | None:
         """The page after it. A link may say POST, with a body that replaces or is merged into what
         was posted before (STAC API 1.0, Item Search, paging).
         """
@@ -115,7 +115,7 @@ class _Page:
         return None
 
 
-def _first_page(source: CatalogueSource, area: Area, client: PoliteClient) -> _Page:
+def _first_page(source: CatalogueSource, area: Area, client: HttpClient) -> _Page:
     box = [round(v, 7) for v in (area.west, area.south, area.east, area.north)]
     home = source.url.rstrip("/")
     landing = json.loads(client.get(home).data)
@@ -133,7 +133,7 @@ def _first_page(source: CatalogueSource, area: Area, client: PoliteClient) -> _P
     return _Page.got(f"{there}?{urlencode(parameters)}", None, client)
 
 
-def _walked(source: CatalogueSource, area: Area, client: PoliteClient) -> Iterator[Any]:
+def _walked(source: CatalogueSource, area: Area, client: HttpClient) -> Iterator[Any]:
     """A static catalogue, but not what lies elsewhere or in another collection."""
     import pystac
     from pystac.stac_io import DefaultStacIO

@@ -1,4 +1,4 @@
-"""Services whose terms forbid to keep, cut or show their data without their program."""
+"""Rejects services whose terms forbid storing their data or using them outside their program."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ALLOWED = ("storage.googleapis.com",)
 
 
 def require_allowed(url: str) -> None:
-    """`MapFetchError` for a service whose terms forbid it, and for what is no web address."""
+    """`MapFetchError` for a forbidden service or an invalid URL."""
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise MapFetchError(f"{url}: no address of http or https")

@@ -1,4 +1,4 @@
-"""Pictures that are ready as tiles: XYZ, TMS and WMTS."""
+"""Fetches imagery tiles: XYZ, TMS and WMTS."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pyproj.exceptions import CRSError
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.polite import HttpClient, shown
 from localizer.map.fetch.raster import (
     FetchPlan,
     Piece,
@@ -36,7 +36,7 @@ _SLACK = 1.3  # a level may be that much coarser than wished: the next has four 
 
 @dataclass(frozen=True)
 class Level:
-    """One level of tiles. left, top: of the first tile; pixel: CRS units; address: with {column}
+    """One zoom level. left, top: of the first tile; pixel: CRS units; address: URL with {column}
     and {row}, rows from the north.
     """
 
@@ -51,10 +51,10 @@ class Level:
 
 
 def plan_tiles(
-    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+    source: CatalogueSource, area: Area, resolution_m: float, client: HttpClient
 ) -> FetchPlan:
-    """The tiles over an area, of the level that is about as fine as wished. `MapFetchError` if the
-    source has none there.
+    """Plan the tiles over an area, at about the requested resolution. `MapFetchError` if the source
+    has none there.
     """
     if source.kind == "wmts":
         level = _wmts_level(source, area, resolution_m, client)
@@ -99,7 +99,7 @@ def _mercator_level(source: CatalogueSource, area: Area, resolution_m: float) ->
 
 
 def _wmts_level(
-    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+    source: CatalogueSource, area: Area, resolution_m: float, client: HttpClient
 ) -> Level:
     service = _capabilities(source, client)
     layer = service.contents.get(source.layer)
@@ -126,7 +126,7 @@ def _wmts_level(
     )  # fmt: skip
 
 
-def _capabilities(source: CatalogueSource, client: PoliteClient) -> Any:
+def _capabilities(source: CatalogueSource, client: HttpClient) -> Any:
     try:
         from owslib.wmts import WebMapTileService
     except ImportError as error:
@@ -211,7 +211,7 @@ def _get_tile_methods(service: Any) -> list[str]:
     return []
 
 
-def _tile(url: str, client: PoliteClient) -> bytes | None:
+def _tile(url: str, client: HttpClient) -> bytes | None:
     answer = client.get(url, missing=_GAP)
     if answer.status in _GAP or not answer.data:
         return None

@@ -11,7 +11,7 @@ from pyproj import CRS
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.polite import HttpClient, shown
 from localizer.map.fetch.raster import (
     FetchGrid,
     FetchPlan,
@@ -28,7 +28,7 @@ _MARGIN = 2  # pixels of a coverage that is cut by its own grid, so that no seam
 
 
 def plan_blocks(
-    source: CatalogueSource, area: Area, resolution_m: float, client: PoliteClient
+    source: CatalogueSource, area: Area, resolution_m: float, client: HttpClient
 ) -> FetchPlan:
     """WMS GetMap or WCS GetCoverage for each block of a grid in the source's CRS."""
     crs = CRS(source.crs)
@@ -53,7 +53,7 @@ def plan_blocks(
 
 
 def wms_url(source: CatalogueSource, window: FetchGrid) -> str:
-    """GetMap; OGC 06-042. Version 1.3.0 names a CRS's axes in its own order."""
+    """URL of GetMap (OGC 06-042). Version 1.3.0 uses the CRS's own axis order."""
     version = source.version or "1.3.0"
     left, bottom, right, top = window.bounds
     bounds = (left, bottom, right, top)
@@ -73,7 +73,7 @@ def wms_url(source: CatalogueSource, window: FetchGrid) -> str:
 
 
 def wcs_1_url(source: CatalogueSource, window: FetchGrid) -> str:
-    """GetCoverage of 1.0.0 (OGC 03-065r6): a rectangle, east first, in so many pixels."""
+    """URL of GetCoverage 1.0.0 (OGC 03-065r6): a rectangle, east first, and its pixel size."""
     bounds = ",".join(f"{v:.10g}" for v in window.bounds)
     return _with(
         source.url,
@@ -87,7 +87,7 @@ def wcs_1_url(source: CatalogueSource, window: FetchGrid) -> str:
 
 
 def wcs_2_url(source: CatalogueSource, window: FetchGrid, axes: tuple[str, str]) -> str:
-    """GetCoverage of 2.0.1 (OGC 09-147r3): by its own pixels, with some more about them."""
+    """URL of GetCoverage 2.0.1 (OGC 09-147r3): at its native resolution, with a margin."""
     left, bottom, right, top = window.bounds
     east, south = (_MARGIN * p for p in window.pixel)
     url = _with(
@@ -104,7 +104,7 @@ def wcs_2_url(source: CatalogueSource, window: FetchGrid, axes: tuple[str, str])
     return url + "".join(f"&SUBSET={n}({low:.10g},{high:.10g})" for n, low, high in subsets)
 
 
-def _axes(source: CatalogueSource, client: PoliteClient) -> tuple[str, str]:
+def _axes(source: CatalogueSource, client: HttpClient) -> tuple[str, str]:
     """Names of easting and northing: as the file says, or as the coverage does."""
     if source.axes is not None or source.version.startswith("1."):
         return source.axes or ("", "")
@@ -125,14 +125,14 @@ def _axes(source: CatalogueSource, client: PoliteClient) -> tuple[str, str]:
     raise MapFetchError(f"{shown(url)}: does not name the axes of {source.layer}; set `axes`")
 
 
-def _document(client: PoliteClient, url: str) -> Element:
+def _document(client: HttpClient, url: str) -> Element:
     try:
         return parsed(client.get(url).data)
     except ParseError as error:
         raise MapFetchError(f"{shown(url)}: no XML: {error}") from error
 
 
-def _image(url: str, client: PoliteClient) -> bytes:
+def _image(url: str, client: HttpClient) -> bytes:
     answer = client.get(url)
     if "xml" in answer.kind or "html" in answer.kind or answer.kind == "text/plain":
         raise MapFetchError(f"{shown(url)}: refused: {texts(answer.data)}")

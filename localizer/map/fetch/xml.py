@@ -1,4 +1,4 @@
-"""Parse a server's XML without entities and external references."""
+"""Parses a server's XML without entities and external references."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _MOST_BYTES = 32 << 20
 
 
 def parsed(data: bytes) -> ElementTree.Element:
-    """The root. Document types are refused: entities can make a small file large. ParseError for
-    what is no XML.
+    """Parse XML; returns the root. Document types are rejected, because entities can expand without
+    limit. ParseError for invalid XML.
     """
     if len(data) > _MOST_BYTES or b"<!ENTITY" in data:
         raise MapFetchError("a server's XML is too long, or brings entities of its own")
@@ -19,7 +19,7 @@ def parsed(data: bytes) -> ElementTree.Element:
 
 
 def texts(data: bytes) -> str:
-    """What a message says, for an error; of XML its texts alone."""
+    """The text of a server's message, for an error; for XML without tags."""
     try:
         words = " ".join(t.strip() for t in parsed(data[:65536]).itertext() if t.strip())
     except (ElementTree.ParseError, MapFetchError):

@@ -1,1 +1,1 @@
-"""Buildings on a bare terrain: footprints with heights, from GeoJSON or CityGML, into a surface."""
+"""Raises buildings on bare terrain from footprints with heights (GeoJSON or CityGML)."""

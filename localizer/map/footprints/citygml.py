@@ -1,4 +1,4 @@
-"""Footprints of a CityGML file, 1.0 to 3.0 (OGC 12-019, 20-010): buildings and their parts."""
+"""Reads footprints of buildings and their parts from CityGML 1.0 to 3.0 (OGC 20-010)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ADV = re.compile(r"ETRS89_UTM(\d\d)")  # Germany's surveys
 
 
 def read_citygml(path: Path) -> Footprints:
-    """Buildings by measuredHeight, else by what their solids span. `MapSourceError` for no GML."""
+    """Buildings with measuredHeight or else their solids' height, or `MapSourceError`."""
     try:
         data = plain_bytes(path, MOST_BYTES)
         if b"<!ENTITY" in data or b"<!DOCTYPE" in data:

@@ -29,9 +29,9 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Footprints:
-    """A file's. crs: as pyproj takes it; either_order: whether its CRS may be written north first;
-    by_storeys: how many have their height by their number of storeys; left_out: how many have no
-    height or no area; attribution: whose they are, as far as the file says.
+    """Buildings of a file. crs: as pyproj takes it; either_order: its CRS may be written north
+    first; by_storeys: number with heights from storeys; left_out: number without height or area;
+    attribution: as the file states.
     """
 
     path: Path
@@ -43,7 +43,7 @@ class Footprints:
     attribution: str = ""
 
     def require(self) -> Footprints:
-        """Itself; `MapSourceError` where it holds no building, or too many."""
+        """Itself; `MapSourceError` if it has no building, or too many."""
         if not self.buildings:
             raise MapSourceError(
                 f"{self.path}: no building with a height ({self.left_out} without one): GeoJSON "
@@ -56,7 +56,7 @@ class Footprints:
 
 
 def ring_of(places: object) -> Array | None:
-    """(N, 2) of a closed ring; None where it is none, or has no area."""
+    """(N, 2) of a closed ring; None if it is invalid or has no area."""
     try:
         ring = np.array([[float(p[0]), float(p[1])] for p in places])  # type: ignore[attr-defined]
     except (TypeError, ValueError, IndexError, KeyError, OverflowError):
@@ -71,7 +71,7 @@ def ring_of(places: object) -> Array | None:
 
 
 def one_line(text: object) -> str:
-    """A text from a file for the map's manifest: printable, in one line, not endless."""
+    """A file's text for the map's manifest: printable, one line, limited length."""
     if not isinstance(text, str):
         return ""
     plain = "".join(c if c.isprintable() else " " for c in text)
@@ -79,7 +79,7 @@ def one_line(text: object) -> str:
 
 
 def sane_height(value: object) -> float | None:
-    """Metres of a number or a text as "12.5" or "12.5 m"; None where that is no building's."""
+    """Metres of a number or of text such as "12.5 m"; None if implausible."""
     if isinstance(value, str):
         value = value.strip().removesuffix("m").strip()
     if isinstance(value, bool) or not isinstance(value, str | int | float):

@@ -1,4 +1,4 @@
-"""Footprints of a GeoJSON file (RFC 7946; OpenStreetMap's and cadastres' properties)."""
+"""Reads footprints of a GeoJSON file (RFC 7946) with properties of OpenStreetMap or cadastres."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WHOSE = ("copyright", "attribution", "licence", "license")
 
 
 def read_geojson(path: Path, height_property: str | None = None) -> Footprints:
-    """Polygons with a height, else with storeys of 3 m. `MapSourceError` for what is none."""
+    """Polygons with a height, otherwise with storeys of 3 m. `MapSourceError` for another file."""
     try:
         document = json.loads(plain_text(path, MOST_BYTES))
         features = document["features"]

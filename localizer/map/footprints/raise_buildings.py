@@ -37,7 +37,7 @@ _GML = (".gml", ".xml", ".citygml")
 
 @dataclass(frozen=True)
 class RaiseResult:
-    """Counts. missed: buildings outside the terrain; small: smaller than a cell."""
+    """Numbers of buildings. missed: outside the terrain; small: smaller than a cell."""
 
     raised: int
     missed: int
@@ -47,7 +47,7 @@ class RaiseResult:
     cell_m: float
 
     def line(self) -> str:
-        """In words."""
+        """The result as text."""
         parts = [f"{self.raised} buildings raised in cells of {self.cell_m:.2f} m"]
         if self.by_storeys:
             parts.append(f"{self.by_storeys} of them by their storeys at 3 m")
@@ -61,15 +61,15 @@ class RaiseResult:
 
 
 def read_footprints(path: Path, height_property: str | None = None) -> Footprints:
-    """Of a GeoJSON or CityGML file, told by its name's end."""
+    """Read footprints of a GeoJSON or CityGML file, by its suffix."""
     if path.suffix.lower() in _GML:
         return read_citygml(path)
     return read_geojson(path, height_property)
 
 
 def raise_buildings(terrain: Path, footprints: Footprints, out: Path) -> RaiseResult:
-    """Write the surface `out`, a GeoTIFF in the terrain's own CRS. `MapSourceError` where no
-    building meets the terrain, or its heights are not in metres.
+    """Write the surface `out`, a GeoTIFF in the terrain's CRS. `MapSourceError` if no building is
+    on the terrain, or its heights are not in metres.
     """
     try:
         with offline(), open_raster(terrain) as data:

@@ -1,1 +1,1 @@
-"""Map importers: each reader converts its source to meshes with ECEF positions."""
+"""Map importers: each converts its source to meshes with ECEF positions."""

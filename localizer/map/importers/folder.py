@@ -1,4 +1,4 @@
-"""A folder as a source: finds its content and whether it can be imported in one way only."""
+"""Finds the map source in a folder, and whether there is only one way to import it."""
 
 from __future__ import annotations
 
@@ -31,16 +31,14 @@ _OFFSETS = ("georef.json", "georeference.json", "coords.txt", "offset.txt")
 
 @dataclass(frozen=True)
 class FoundSource:
-    """One way to import what a folder holds. sources: as `read_source` takes them; georeference:
-    the file that goes with a mesh.
-    """
+    """A map source. sources: as `read_source` takes them; georeference: a mesh's file."""
 
     sources: tuple[Path, ...]
     georeference: Path | None = None
 
     @property
     def arguments(self) -> str:
-        """As the command line takes it."""
+        """As command-line arguments."""
         georeference = f" --georeference {self.georeference}" if self.georeference else ""
         return " ".join(map(str, self.sources)) + georeference
 

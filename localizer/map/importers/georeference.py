@@ -48,7 +48,7 @@ class Georeference:
         return LocalFrame(self.origin).ecef_from_enu.apply(points @ turn.T)
 
     def datum_doubt(self, points: Array) -> str | None:
-        """What is not known of the way from its CRS to WGS84, see `height_crs.datum_doubt`."""
+        """Warning about the transformation from its CRS to WGS84, see `height_crs.datum_doubt`."""
         if self.crs is None:
             return None
         placed = points.mean(axis=0) + np.array(self.offset)
@@ -56,7 +56,7 @@ class Georeference:
         return datum_doubt(CRS(self.crs), float(lon), float(lat)) if np.isfinite(lon) else None
 
     def far_outside(self, points: Array) -> str | None:
-        """What points (N, 3) of the mesh lie far outside of, see `height_crs.far_outside`."""
+        """Warning if points (N, 3) are far outside the CRS's area, see `height_crs.far_outside`."""
         if self.crs is None:
             return None
         placed = points + np.array(self.offset)

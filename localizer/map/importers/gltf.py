@@ -1,7 +1,7 @@
-"""GLB and glTF to plain arrays: what photogrammetry and tilesets use of glTF 2.0.
+"""Reads GLB and glTF 2.0 to arrays, as far as photogrammetry and tilesets use it.
 
-Draco, quantised attributes, texture transforms, unlit and PBR base colours are read. Anything that
-this module cannot decode raises `MapSourceError` with the extension's name.
+Draco, quantised attributes, texture transforms, unlit and PBR base colours are supported. Anything
+else raises `MapSourceError` with the extension's name.
 """
 
 from __future__ import annotations

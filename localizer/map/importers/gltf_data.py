@@ -27,7 +27,7 @@ Reader = Callable[[str], bytes]  # resolves a relative URI of the file; raises M
 
 
 class GltfData:
-    """A document's JSON and the bytes that it refers to."""
+    """A glTF document's JSON and its binary data."""
 
     def __init__(self, data: bytes, read_uri: Reader) -> None:
         self._read_uri = read_uri
@@ -35,7 +35,7 @@ class GltfData:
         self._buffers: dict[int, bytes] = {}
 
     def picture(self, index: int) -> bytes:
-        """An image as it is stored: JPEG, PNG, WebP."""
+        """An encoded image: JPEG, PNG, WebP."""
         image = item(self.json.get("images", []), index, "image")
         if "bufferView" in image:
             return self.buffer_view(image["bufferView"])[0]
@@ -97,7 +97,7 @@ class GltfData:
 
 
 def checked_count(accessor: dict[str, Any]) -> int:
-    """How many elements an accessor claims, within what can be. `MapSourceError` otherwise."""
+    """Number of elements of an accessor; `MapSourceError` if it is impossible."""
     count = whole(accessor.get("count", 0), "count")
     if not 0 < count <= MAX_ELEMENTS:
         raise MapSourceError(f"an accessor has {count} elements; 1 to {MAX_ELEMENTS} can be")
@@ -147,14 +147,14 @@ def normalised(array: NDArray[Any], accessor: dict[str, Any]) -> NDArray[Any]:
 
 
 def normalised_bounds(bounds: Array, accessor: dict[str, Any]) -> Array:
-    """An accessor's min and max as its elements are read: they are stated before normalising."""
+    """An accessor's min and max, normalised as its elements are."""
     dtype = np.dtype(_COMPONENT_TYPES[accessor.get("componentType", 5126)])
     return np.asarray(normalised(bounds.astype(dtype), accessor), np.float64)
 
 
 def vector(values: Any, length: int, what: str) -> Array:
-    """Numbers of the JSON as (length,); `what` names them in the error. `MapSourceError` if they
-    are not so many finite numbers.
+    """Numbers of the JSON as (length,). what: name for the error. `MapSourceError` for other
+    values.
     """
     try:
         array = np.asarray(values, dtype=np.float64)
@@ -166,14 +166,14 @@ def vector(values: Any, length: int, what: str) -> Array:
 
 
 def whole(value: Any, what: str) -> int:
-    """A whole number of the JSON, from 0 up. `MapSourceError` for another value."""
+    """A non-negative integer of the JSON; `MapSourceError` for another value."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
         raise MapSourceError(f"{what} is {reprlib.repr(value)}, not a whole number from 0 up")
     return value
 
 
 def item(items: Any, index: Any, what: str) -> dict[str, Any]:
-    """The object at an index of one of the JSON's lists. `MapSourceError` if there is none."""
+    """The object at an index of a list of the JSON; `MapSourceError` if there is none."""
     if (
         not isinstance(items, list)
         or not isinstance(index, int)

@@ -1,4 +1,4 @@
-"""Unit and vertical datum of heights, from a CRS and a raster's tags."""
+"""Determines unit and vertical datum of heights from a CRS and a raster's tags."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ class StatedHeights:
 
     @property
     def other_geoid(self) -> bool:
-        """Heights above sea level that are not EGM96's, which the lift is computed with."""
+        """Whether heights are above another geoid than EGM96, which the conversion uses."""
         return self.datum == "amsl" and _EGM96 not in self.crs.upper()
 
 
 def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeights:
-    """Of a source's CRS and its band's unit tag; `GeoreferenceError` where they contradict. where:
-    the source; of a GeoTIFF its keys are read, too, where the CRS says nothing of heights.
+    """Unit and datum by a source's CRS and its band's unit tag; `GeoreferenceError` if they
+    contradict. where: the source; a GeoTIFF's keys are used if the CRS has no vertical part.
     """
     keys = geo_keys(where) if isinstance(where, Path) else {}
     unit, datum, name = _keyed_heights(keys, where)
@@ -119,9 +119,7 @@ def _keyed_heights(
 
 
 def geo_keys(path: Path) -> dict[int, int]:
-    """The numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty where it has none
-    that can be read.
-    """
+    """Numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty without one."""
     try:
         with path.open("rb") as file:
             return _geo_keys(file)
@@ -149,14 +147,14 @@ def _geo_keys(file: BinaryIO) -> dict[int, int]:
 
 
 def horizontal_unit_m(crs: CRS) -> float:
-    """Metres per unit of a projected CRS; 1 for degrees, which say nothing of heights."""
+    """Metres per unit of a projected CRS; 1 for degrees."""
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     return float(flat.axis_info[0].unit_conversion_factor) if flat.is_projected else 1.0
 
 
 def far_outside(crs: CRS, lon: Array, lat: Array) -> str | None:
-    """What places (N,), degrees, lie far outside of: the area that a CRS is for; None where they
-    do not, or it is not known. Easting and northing swapped lead there.
+    """Warning if positions (N,), degrees, are far outside a CRS's area of use, for example because
+    easting and northing are swapped; None otherwise.
     """
     flat = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
     area = flat.area_of_use
@@ -178,7 +176,8 @@ def far_outside(crs: CRS, lon: Array, lat: Array) -> str | None:
 
 
 def datum_doubt(crs: CRS, lon: float, lat: float) -> str | None:
-    """What is not known of the way from a CRS to WGS84 at a place, degrees; None below 1.5 m.
+    """Warning if the transformation from a CRS to WGS84 at a position (degrees) is uncertain by 1.5
+    m or more; None otherwise.
 
     An older national datum needs a grid that may not be installed; without it a map is silently
     metres off (EPSG:27700: 2 to 21 m, NAD27: 8 to 20 m).
@@ -202,7 +201,7 @@ def datum_doubt(crs: CRS, lon: float, lat: float) -> str | None:
 
 
 def unit_of(name: str) -> float:
-    """Metres per unit of a name; `GeoreferenceError` for one that is not known."""
+    """Metres per unit by its name; `GeoreferenceError` for an unknown one."""
     found = _unit(name)
     if found is None:
         raise GeoreferenceError(f"height unit {name!r}: m, ft, us-ft, cm and mm are known")

@@ -1,4 +1,4 @@
-"""Meshes from height grids, for the raster importer and for generated coarse levels."""
+"""Makes meshes from height grids, for rasters and for generated coarse levels."""
 
 from __future__ import annotations
 

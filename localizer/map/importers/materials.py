@@ -1,4 +1,4 @@
-"""Appearance of a material as common viewers draw it: colour, texture, and holes."""
+"""Appearance of a material as common viewers draw it: colour, texture, transparency."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.map.importers.gltf_data import vector
 from localizer.map.importers.referenced_files import file_of
-from localizer.plain_files import legible
+from localizer.plain_files import decode_lenient
 from localizer.types import Float32
 
 _BLACK = 1 / 255  # linear light; a base so dark shows nothing of its own
@@ -30,8 +30,8 @@ _CENTRE = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6.0  # baryce
 
 @dataclass(frozen=True, eq=False)
 class GltfMaterial:
-    """A glTF material. factor: (3,) linear, of the picture or alone; texture: its textureInfo;
-    opacity: times the picture's alpha; cutoff: below it nothing is there, None where all is opaque.
+    """A glTF material. factor: (3,) linear, multiplied with the image or alone; texture: its
+    textureInfo; opacity: times the image's alpha; cutoff: transparent below it, None if opaque.
     """
 
     factor: Array
@@ -41,12 +41,12 @@ class GltfMaterial:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether nothing is there, whatever the picture."""
+        """Whether it is completely transparent."""
         return self.cutoff is not None and self.opacity < self.cutoff
 
 
 def material_of(material: dict[str, Any]) -> GltfMaterial:
-    """Of a glTF material.
+    """Parse a glTF material.
 
     Specular-glossiness goes before the metallic fallback, where it has a picture or the other has
     none. Emission stands for a base that is black or has no picture: so unlit photographs were
@@ -81,8 +81,8 @@ def cut_out(
     *,
     repeat: bool,
 ) -> tuple[Array, Float32, NDArray[np.int32]]:
-    """A mesh without what its picture says is not there. opaque: (h, w) of texels; repeat: whether
-    the picture goes on beyond its edges. Triangles across a border are cut, to within some texels.
+    """A mesh without its transparent parts. opaque: (h, w) of texels; repeat: whether the texture
+    wraps. Triangles across a border are cut, to within some texels.
     """
     h, w = opaque.shape
     table = np.zeros((h + 1, w + 1), np.int64)
@@ -142,9 +142,9 @@ def _halved(
 
 @dataclass(frozen=True)
 class MtlMaterial:
-    """A material of an OBJ's library. colour: (3,) from 0 to 1; picture, mask: its files, the mask
-    of opacity; missing: names of pictures that are not there; scale, offset: of its texture
-    coordinates; clamped: the picture does not go on beyond its edges.
+    """A material of an OBJ's library. colour: (3,) from 0 to 1; picture, mask: its texture and
+    opacity files; missing: names of missing files; scale, offset: of its texture coordinates;
+    clamped: the texture does not wrap.
     """
 
     name: str
@@ -158,12 +158,12 @@ class MtlMaterial:
 
 
 def read_mtl(library: Path, obj_folder: Path) -> list[MtlMaterial]:
-    """The materials of a library, in its order. A picture of the ambient or emissive colour stands
-    for that of the diffuse one where that has none.
+    """The materials of a library in order. The ambient or emissive texture replaces a missing
+    diffuse one.
     """
     made: list[MtlMaterial] = []
     rank = 0
-    for line in legible(library.read_bytes()).splitlines():
+    for line in decode_lenient(library.read_bytes()).splitlines():
         key, rest = ([*line.split(maxsplit=1), "", ""])[:2]
         key, rest = key.lower(), rest.strip()
         if key == "newmtl":

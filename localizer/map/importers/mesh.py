@@ -1,4 +1,4 @@
-"""glTF, GLB and OBJ meshes with a georeference: cut into tiles, coarser levels made for them."""
+"""Imports georeferenced glTF, GLB and OBJ meshes: cuts tiles and makes coarser levels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_pl
 from localizer.map.importers.textures import palette_mesh, require_readable
 from localizer.map.importers.tiles3d import inside, read_file
 from localizer.map.source import SourceMesh
-from localizer.plain_files import legible
+from localizer.plain_files import decode_lenient
 
 _LINE_BYTES = 1 << 16  # of an OBJ
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t]")
@@ -38,7 +38,7 @@ _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file and where it stands; one `Model`."""
+    """A georeferenced mesh file; implements `Model`."""
 
     path: Path
     up_axis: UpAxis
@@ -86,9 +86,7 @@ def _has_area(mesh: SourceMesh) -> bool:
 
 
 def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
-    """The materials of an OBJ's libraries by name, and what of its picture is not there, as
-    sentences.
-    """
+    """The materials of an OBJ's libraries by name, and its missing textures as sentences."""
     libraries = [p for p in files_beside(path) if p.suffix.lower() == ".mtl" and p.is_file()]
     found = [m for library in libraries for m in read_mtl(library, path.parent)]
     doubts = [f"its texture {name!r} is not there" for m in found for name in m.missing]
@@ -97,7 +95,7 @@ def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         if not libraries and _MENTIONS_LIBRARY.search(text):
             doubts.append("its material library is not there: it has no picture")
-        used = {legible(match[1]).strip() for match in _USE.finditer(text)}
+        used = {decode_lenient(match[1]).strip() for match in _USE.finditer(text)}
         unknown = sorted(used - {m.name for m in found} - {""})
         if unknown:
             doubts.append(

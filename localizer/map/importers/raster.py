@@ -1,7 +1,7 @@
-"""DSM and orthophoto to tiles: a quadtree of height-field meshes, read window by window.
+"""Imports DSM and orthophoto: a quadtree of height-field meshes, read window by window.
 
-The grid of the finest level is the DSM's own, so its heights are kept as they are; each coarser
-level averages 2 x 2. Vertical skirts along the tile borders hide the cracks between levels.
+The finest level has the DSM's own grid and heights; each coarser level averages 2 x 2. Vertical
+skirts along the tile borders hide the cracks between levels.
 """
 
 # ruff: noqa: RUF005 (sums of arrays are meant, not lists)
@@ -77,8 +77,8 @@ class HeightGrid:
 
 @dataclass(frozen=True)
 class RasterTile:
-    """Tile (column, row) of a level, 0 the coarsest; one `TileSource`. colours: the orthophoto's
-    bands of red, green and blue.
+    """Tile (column, row) of a level, 0 the coarsest; implements `TileSource`. colours: the
+    orthophoto's bands of red, green and blue.
     """
 
     dsm: Path

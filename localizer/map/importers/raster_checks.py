@@ -1,4 +1,4 @@
-"""Doubts about a DSM and an orthophoto that can be seen before they are imported."""
+"""Checks DSM and orthophoto before the import."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LEAST_OVERLAP, _GOOD_OVERLAP = 0.05, 0.5
 def check_heights(
     path: Path, data: DatasetReader, band: HeightBand, rules: ImportRules
 ) -> list[str]:
-    """Warnings about a DSM's numbers; `MapSourceError` where they cannot be heights."""
+    """Warnings about a DSM's values; `MapSourceError` if they cannot be heights."""
     raw = _sampled(data, band)
     known = raw.compressed()
     if not len(known):
@@ -181,7 +181,7 @@ def _stand_alone(metres: Array, step_m: float) -> list[tuple[int, int, float]]:
 
 
 def check_colours(path: Path, data: DatasetReader, bands: tuple[int, int, int]) -> list[str]:
-    """A warning about an orthophoto of one colour: nothing can be registered against it."""
+    """A warning about a single-colour orthophoto, which cannot be registered against."""
     shape = min(data.height, _COLOUR_SAMPLES), min(data.width, _COLOUR_SAMPLES)
     how = {"out_shape": shape, "resampling": rasterio.enums.Resampling.nearest}
     shown = data.dataset_mask(**how) > 0
@@ -198,7 +198,7 @@ def check_colours(path: Path, data: DatasetReader, bands: tuple[int, int, int]) 
 def check_overlap(
     dsm: DatasetReader, band: HeightBand, ortho: DatasetReader, rules: ImportRules
 ) -> list[str]:
-    """Warnings where the orthophoto shows little of the DSM's ground; an error where nothing."""
+    """Warnings if the orthophoto covers little of the DSM; an error if nothing."""
     share = _covered_share(dsm, band, ortho)
     if share >= _GOOD_OVERLAP:
         return []

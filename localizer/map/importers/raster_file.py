@@ -57,7 +57,7 @@ def offline() -> Iterator[None]:
 
 
 def open_raster(path: Path) -> DatasetReader:
-    """A GeoTIFF; `MapSourceError` for what only bears its name. Use under `offline`."""
+    """Open a GeoTIFF; `MapSourceError` for another file. Use under `offline`."""
     require_plain_file(path)
     _require_tiff(path)
     for beside in (f"{path}.ovr", f"{path}.msk"):
@@ -72,8 +72,8 @@ def open_raster(path: Path) -> DatasetReader:
 
 
 def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRules) -> Path:
-    """A height model of one height below an orthophoto that has none: a flat map's.
-    `MapSourceError` or `GeoreferenceError` where the orthophoto has heights or no place.
+    """Write a constant height model below an orthophoto, for a flat map. `MapSourceError` or
+    `GeoreferenceError` if the orthophoto has heights or no georeference.
     """
     with offline(), open_raster(ortho) as data:
         require_sane(ortho, data, rules)
@@ -92,7 +92,7 @@ def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRul
 
 
 def opened(path: Path) -> DatasetReader:
-    """`open_raster`, kept for the next tile of the same process while the file is the same."""
+    """As `open_raster`, cached for the next tile of the same process."""
     stat = path.stat()
     return _kept(path, stat.st_mtime_ns, stat.st_size)
 
@@ -125,8 +125,8 @@ def _require_plain_sidecar(path: Path) -> None:
 
 
 def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
-    """What every raster of a map must have: a size within the limits, a CRS and a place. Returns
-    the doubts that were set aside. `GeoreferenceError` if one is missing or singular.
+    """Check size, CRS and georeference of a raster; returns accepted doubts as warnings.
+    `GeoreferenceError` if one is missing or singular.
     """
     rules.require("pixels", float(data.width) * data.height, path)
     if data.crs is None:
@@ -177,14 +177,12 @@ def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
 
 
 def has_own_mask(data: DatasetReader) -> bool:
-    """Whether the file itself says which pixels are missing: nodata, alpha or a mask."""
+    """Whether the file marks missing pixels: nodata, alpha or a mask."""
     return MaskFlags.all_valid not in data.mask_flag_enums[0]
 
 
 def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
-    """Red, green and blue of an orthophoto, by what its bands are called. `MapSourceError` if they
-    are indices into a palette.
-    """
+    """Band numbers of red, green and blue; `MapSourceError` for a palette."""
     meaning = list(data.colorinterp)
     if meaning[0] == ColorInterp.palette:
         raise MapSourceError(
@@ -201,7 +199,7 @@ def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
 
 
 def stated_imagery(data: DatasetReader) -> tuple[str | None, str | None]:
-    """Date (year, month or day) and sensor of an orthophoto, by its tags; None where none says it.
+    """Date (year, month or day) and sensor of an orthophoto, by its tags; None if unknown.
 
     GDAL's IMAGERY tags, and what vendors write among the plain ones. TIFFTAG_DATETIME is when the
     file was written, and not when its photos were taken.
@@ -214,19 +212,19 @@ def stated_imagery(data: DatasetReader) -> tuple[str | None, str | None]:
 
 
 def has_separate_mask(data: DatasetReader) -> bool:
-    """Whether the missing pixels stand in a mask, which warping does not carry on by itself."""
+    """Whether missing pixels are in a mask, which warping does not transform by itself."""
     flags = data.mask_flag_enums[0]
     return MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags
 
 
 def applied(transform: Affine, x: Array, y: Array) -> tuple[Array, Array]:
-    """A transform of points; affine's own operator for it depends on its version."""
+    """Apply an affine transform to points; independent of affine's version."""
     t = transform
     return t.a * x + t.b * y + t.c, t.d * x + t.e * y + t.f
 
 
 def inside(data: DatasetReader, crs: str, x: Array, y: Array) -> NDArray[np.bool_]:
-    """Which points of a CRS lie on the raster's pixels. x, y: of one shape."""
+    """Whether points of a CRS are on the raster. x, y: of one shape."""
     transformer = _flat(crs, CRS(data.crs).to_wkt())
     source_x, source_y = transformer.transform(x, y)
     column, row = applied(~data.transform, np.asarray(source_x), np.asarray(source_y))
@@ -246,8 +244,8 @@ def _flat(source: str, target: str) -> Transformer:
 
 @dataclass(frozen=True)
 class HeightBand:
-    """How a DSM's numbers become metres: value * gain + offset; missing: a number that means
-    nothing, besides what the file says.
+    """Conversion of a DSM's values to metres: value * gain + offset; missing: an additional nodata
+    value.
     """
 
     gain: float = 1.0
@@ -255,7 +253,7 @@ class HeightBand:
     missing: float | None = None
 
     def metres(self, values: Array) -> Array:
-        """Of the file's numbers; the same array where they are metres."""
+        """Convert values; the same array if they are metres already."""
         if (self.gain, self.offset) == (1.0, 0.0):
             return values
         return values * self.gain + self.offset

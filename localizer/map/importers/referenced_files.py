@@ -1,7 +1,6 @@
-"""The files that a mesh or a tile's content refers to: its source has changed when they have.
+"""Finds the files that a mesh or tile refers to, so that changes of a source are detected.
 
-`file_of` finds a file by its name as programs write it. What files refer to is found by the names
-in headers alone, and never raises: what is wrong is told by the importer that reads them.
+Names are taken from file headers only; errors are left to the importer.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from localizer.plain_files import legible
+from localizer.plain_files import decode_lenient
 
 _LONGEST_JSON = 1 << 30
 _LONGEST_PACKED = 64 << 20  # of a compressed header
@@ -27,10 +26,9 @@ _PICTURE = re.compile(r"(?im)^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(
 
 
 def file_of(folder: Path, name: str) -> Path:
-    """The file that a name means, beside `folder`: as it stands; else with backslashes for slashes
-    and in other letter case, as Windows has it; else, for an absolute name of another machine, the
-    file of that name in `folder`. What is not found is returned as it stands. The result may lie
-    outside of `folder`.
+    """The file that a name in a mesh means: as written; else with slashes for backslashes and in
+    other letter case (Windows); else, for an absolute path of another machine, the file of that
+    name in `folder`. An unknown name is returned as it is. The result may be outside of `folder`.
     """
     plain = folder / name
     if "\0" in name or _exists(plain):
@@ -71,7 +69,7 @@ def _exists(path: Path) -> bool:
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
-    """What an OBJ, glTF, GLB or b3dm file refers to, each once, in order of name."""
+    """Files that an OBJ, glTF, GLB or b3dm refers to, sorted by name."""
     if not path.is_file():  # a pipe would never end
         return ()
     try:
@@ -88,11 +86,11 @@ def _of_obj(path: Path) -> Iterator[Path]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         libraries = [match[1] for match in _LIBRARY.finditer(text)]
     for names in libraries:
-        line = legible(names)
+        line = decode_lenient(names)
         for library in {*_named(path.parent, line), *_each(path.parent, line)}:
             yield library
             if library.is_file():
-                for match in _PICTURE.finditer(legible(library.read_bytes())):
+                for match in _PICTURE.finditer(decode_lenient(library.read_bytes())):
                     yield from _named(path.parent, match[1])
 
 

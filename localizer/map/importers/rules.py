@@ -1,4 +1,4 @@
-"""Limits of an import, and implausible input that stops it unless the user trusts it."""
+"""Limits of an import, and doubts that stop it unless the user accepts them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ LOWEST_M, HIGHEST_M = -500.0, 9000.0  # of ground, buildings and mines' edges, i
 
 @dataclass(frozen=True)
 class ImportRules:
-    """Limits of one import, each with what it counts; trusted: names of `DOUBTS` set aside, which
-    become warnings.
+    """Limits of one import; trusted: names of `DOUBTS` that the user accepts, which become
+    warnings.
     """
 
     nodes: int = field(default=1_000_000, metadata={"counts": "nodes of a tileset, glTF or raster"})
@@ -57,8 +57,8 @@ class ImportRules:
 
     @classmethod
     def of(cls, limits: Iterable[str] = (), trusted: Iterable[str] = ()) -> ImportRules:
-        """From the command line's ``NAME=NUMBER`` and names of doubts. `MapSourceError` for another
-        name or no number.
+        """From the command line's ``NAME=NUMBER`` and names of doubts. `MapSourceError` for invalid
+        ones.
         """
         given: dict[str, Any] = {}
         for text in limits:
@@ -78,7 +78,7 @@ class ImportRules:
         return {name: getattr(self, name) for name in limit_names()}
 
     def require(self, name: str, amount: float, where: object) -> None:
-        """`MapSourceError` where a source asks for more than a limit."""
+        """`MapSourceError` if a source exceeds a limit."""
         limit = getattr(self, name)
         if amount > limit:
             counts = next(f.metadata["counts"] for f in fields(self) if f.name == name)
@@ -88,19 +88,19 @@ class ImportRules:
             )
 
     def doubt(self, name: str, text: str) -> str:
-        """The text as a warning where the doubt is trusted, else `MapSourceError`."""
+        """The text as a warning if the user accepts the doubt, else `MapSourceError`."""
         if name not in self.trusted:
             raise MapSourceError(f"{text}; if that is meant: --trust {name}")
         return text
 
 
 def limit_names() -> tuple[str, ...]:
-    """Names of the limits."""
+    """Names of the limits that an import option may raise."""
     return tuple(f.name for f in fields(ImportRules) if "counts" in f.metadata)
 
 
 def require_plain_file(path: Path) -> None:
-    """`MapSourceError` for a pipe, socket or device, whose reading may never end."""
+    """`MapSourceError` for a pipe, socket or device, which may block for ever."""
     try:
         mode = path.stat().st_mode
     except OSError as error:

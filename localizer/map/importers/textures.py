@@ -1,4 +1,4 @@
-"""Textures of sources: pictures decoded within bounds, flat colours, meshes merged by picture."""
+"""Textures of sources: decoding with limits, flat colours, merging of meshes by image."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
 
 
 def require_readable(path: Path, rules: ImportRules) -> None:
-    """`MapSourceError` for a picture that does not decode: trimesh would show the mesh grey."""
+    """`MapSourceError` if an image cannot be decoded; trimesh would show the mesh grey."""
     try:
         with PillowImage.open(path) as picture:
             width, height = picture.size
@@ -58,7 +58,7 @@ def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
 
 
 def decode_alpha(data: bytes) -> NDArray[np.uint8] | None:
-    """(h, w) of a picture that `decode_image` has read; None where all of it is opaque."""
+    """Alpha (h, w) of an image; None if it is opaque."""
     with PillowImage.open(io.BytesIO(data)) as picture:
         if not picture.has_transparency_data:
             return None
@@ -67,7 +67,7 @@ def decode_alpha(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> SourceMesh:
-    """A mesh of flat-coloured faces. colours: (F, 3) uint8; they become blocks of a texture."""
+    """A mesh of flat-coloured faces. colours: (F, 3) uint8, stored as blocks of a texture."""
     unique, which = np.unique(colours.reshape(-1, 3), axis=0, return_inverse=True)
     if len(unique) > 65536:
         unique, which = np.unique(colours & 0xF8, axis=0, return_inverse=True)
@@ -84,8 +84,8 @@ def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> 
 
 
 def placed(mesh: SourceMesh, T: Array) -> SourceMesh:
-    """The mesh under a transform (4, 4). One that mirrors turns the order of the corners, too, so
-    that the same side stays the front (glTF 2.0, 3.7.4).
+    """The mesh after a transform (4, 4). A mirroring transform also reverses the corner order, so
+    that the front side stays (glTF 2.0, 3.7.4).
     """
     made = replace(mesh, positions=mesh.positions @ T[:3, :3].T + T[:3, 3])
     if np.linalg.det(T[:3, :3]) < 0:
@@ -94,7 +94,7 @@ def placed(mesh: SourceMesh, T: Array) -> SourceMesh:
 
 
 def merged_by_picture(parts: list[SourceMesh]) -> list[SourceMesh]:
-    """One mesh per image; all palettes become one."""
+    """One mesh per image; all flat colours become one palette."""
     groups: dict[tuple[int, bool], list[SourceMesh]] = {}
     palettes = [p for p in parts if p.palette]
     for part in parts:
@@ -142,7 +142,7 @@ def srgb(linear: Array) -> Image:
 
 
 def tinted(image: Image, factor: Array) -> Image:
-    """An sRGB image times linear factors (3,)."""
+    """An sRGB image multiplied by linear factors (3,)."""
     levels = np.arange(256) / 255
     linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
     table = srgb(linear[:, None] * factor)

@@ -1,4 +1,4 @@
-"""3D Tiles 1.0 and 1.1, explicit tilesets: the tree and the content (b3dm, glb, glTF)."""
+"""Reads 3D Tiles 1.0 and 1.1, explicit tilesets: tree and content (b3dm, glb, glTF)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ContentFile:
         return str(self.path.relative_to(self.folder))
 
     def size_bytes(self) -> int:
-        """Of the file; 0 where it cannot be read."""
+        """Size of the file; 0 if it cannot be read."""
         try:
             return self.path.stat().st_size
         except OSError:
@@ -167,9 +167,7 @@ def _gunzipped(data: bytes, path: Path, rules: ImportRules) -> bytes:
 
 
 def inside(folder: Path, base: Path, uri: str) -> Path:
-    """The file that `uri` means, relative to `base`; it must lie within `folder`. `MapSourceError`
-    otherwise.
-    """
+    """The file of a `uri` relative to `base`; `MapSourceError` if it is outside `folder`."""
     parts = urlsplit(uri)
     if parts.scheme or parts.netloc:
         raise MapSourceError(f"{uri!r} is not a local file; download the tileset first")
@@ -277,16 +275,16 @@ class _Reader:
 
     def _doubted(self, T: Array, path: Path) -> Array:
         """A tile's transform, which should move and turn only."""
-        text = stretch_of(T)
+        text = transform_warning(T)
         if text is not None:
             name = "mirrored" if np.linalg.det(T[:3, :3]) < 0 else "scaled"
             self.warnings.append(self.rules.doubt(name, f"{path}: a tile's transform {text}"))
         return T
 
 
-def stretch_of(T: Array) -> str | None:
-    """Text on how a transform (4, 4) mirrors or scales what it places; None if it does neither, up
-    to 1 % of scale. `MapSourceError` if it flattens space or projects it.
+def transform_warning(T: Array) -> str | None:
+    """Warning text if a transform (4, 4) mirrors, or scales by more than 1 %; None otherwise.
+    `MapSourceError` if it is singular or a projection.
     """
     sizes = np.linalg.svd(T[:3, :3], compute_uv=False)
     if sizes[-1] <= 1e-12 * max(sizes[0], 1e-300) or not np.allclose(T[3], (0, 0, 0, 1)):

@@ -1,4 +1,4 @@
-"""Offset of a map's imagery from its surface, by the edges of both."""
+"""Offset of a map's imagery from its surface, from the edges of both."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class ImageryOffset:
 
     @property
     def known(self) -> bool:
-        """Whether there are edges enough, and one shift at which they meet."""
+        """Whether there are enough edges and one significant offset."""
         return self.edges >= _LEAST_EDGES and self.peak >= _LEAST_PEAK
 
     @property
     def distance_m(self) -> float:
-        """Of the shift."""
+        """Length of the offset."""
         return float(np.hypot(self.east_m, self.north_m))
 
 

@@ -1,4 +1,4 @@
-"""A map's outline for other programs: GeoJSON (RFC 7946) and KML 2.2."""
+"""A map's outline as GeoJSON (RFC 7946) and KML 2.2."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Hole:
 
 @dataclass(frozen=True)
 class Verification:
-    """damaged: why each bad tile is bad; holes: largest first; covered_m2: ground covered."""
+    """damaged: text for each damaged tile; holes: largest first; covered_m2: ground area."""
 
     tiles: int
     damaged: tuple[str, ...]
@@ -61,7 +61,7 @@ class Verification:
 
     @property
     def ok(self) -> bool:
-        """Whether every tile is intact; holes may be in the source."""
+        """Whether every tile is intact; holes do not count."""
         return not self.damaged
 
 
@@ -88,7 +88,7 @@ def levels(cache: TileCache) -> list[LevelSummary]:
 
 
 def verify(cache: TileCache) -> Verification:
-    """Read every tile against its hash, and look for holes in the finest surface."""
+    """Check every tile's hash, and find holes in the finest surface."""
     damaged: list[str] = []
     leaf = set(_leaf_tiles(cache))
     seen = _Occupancy(cache)
@@ -121,7 +121,7 @@ def camera_pose(
 
 
 def render_view(cache: TileCache, world_from_camera: Pose, camera: Camera) -> RenderedView:
-    """One view at full detail; `OutsideMapError` when it shows nothing of the map."""
+    """Render one view at full detail; `OutsideMapError` if the map is not in view."""
     with TileStreamer(cache) as streamer:
         renderer = NumbaRenderer(streamer)
         try:
@@ -159,7 +159,7 @@ def depth_picture(depth: NDArray[np.float32]) -> Image:
 
 
 def write_picture(path: Path, rgb: Image) -> None:
-    """Write an RGB image; the suffix says the format. OSError where it cannot be written."""
+    """Write an RGB image in the format of the suffix; OSError if that fails."""
     # imencode, because imwrite prints a warning and keeps the reason for itself.
     coded = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
     path.write_bytes(coded.tobytes())

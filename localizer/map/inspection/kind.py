@@ -1,4 +1,4 @@
-"""Measuring what kind of map a tile cache is, from views of it straight down."""
+"""Measures the kind of map in a tile cache, from vertical views."""
 
 from __future__ import annotations
 
@@ -102,8 +102,8 @@ def _heights(sampler: _Sampler) -> Heights:
 
 
 def objects(height: Float32, cell_m: float) -> NDArray[np.bool_]:
-    """Which cells of heights (h, w), NaN where unknown, belong to something that stands on the
-    ground: narrower than 60 m, more than 2 m high, most of its border a wall.
+    """Cells of a height grid (h, w), NaN where unknown, that belong to buildings or trees: narrower
+    than 60 m, higher than 2 m, most of the border steep.
     """
     known = np.isfinite(height)
     if not known.any():
@@ -164,7 +164,8 @@ def _frequencies() -> Array:
 
 
 def resolved(power: Array) -> float:
-    """Cycles a texel, up to a half, from which on an image of this spectrum shows no more detail.
+    """Spatial frequency, cycles a texel up to 0.5, above which an image with this spectrum has no
+    detail.
 
     power: (bands,) at equally wide bands of frequency up to half a cycle a texel.
     """

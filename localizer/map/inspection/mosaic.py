@@ -1,4 +1,4 @@
-"""Image of a whole map from above, with its heights."""
+"""Image and heights of a whole map from above."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _FINEST_M = 0.25  # per pixel
 
 @dataclass(frozen=True)
 class Mosaic:
-    """North up. rgb: (h, w, 3), holes painted over; height: (h, w) float32 world z, NaN where there
-    is no map; west, north: of its corner, m; gsd_m: per pixel.
+    """North up. rgb: (h, w, 3), holes filled; height: (h, w) float32 world z, NaN without map;
+    west, north: of its corner, m; gsd_m: metres per pixel.
     """
 
     rgb: Image
@@ -35,12 +35,12 @@ class Mosaic:
         return self.west + column * self.gsd_m, self.north - row * self.gsd_m
 
     def pixel(self, east: float, north: float) -> tuple[float, float]:
-        """(row, column) of a place."""
+        """(row, column) of a position."""
         return (self.north - north) / self.gsd_m, (east - self.west) / self.gsd_m
 
 
 def mosaic_of(cache: TileCache, most_px: int = _MOST_PX) -> Mosaic:
-    """The map's whole rectangle, as fine as it is and as `most_px` allow."""
+    """Render the map's bounding rectangle at its resolution, at most `most_px`."""
     low, high = cache.index.box_min[0], cache.index.box_max[0]
     extent = (high - low)[:2]
     finest = max(cache.manifest.gsd_m, _FINEST_M)

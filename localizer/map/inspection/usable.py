@@ -1,4 +1,4 @@
-"""The part of a map that may be flown over where its edges or other parts will not do."""
+"""Finds the part of a map that is free of faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _RIM = 2  # cells of both sides: a ragged edge is no news
 @dataclass(frozen=True)
 class UsableArea:
     """The largest rectangle without faults. south, west, north, east: degrees, inside it; size_m:
-    east and north; is_whole: it is the rectangle about the map, but for a rim of a cell.
+    east and north; is_whole: it covers the map except for a margin of one cell.
     """
 
     south: float
@@ -32,7 +32,7 @@ class UsableArea:
     is_whole: bool
 
     def line(self) -> str:
-        """Where it is, in words."""
+        """The area as text."""
         east_m, north_m = self.size_m
         return (
             f"latitude {self.south:.5f} to {self.north:.5f}, longitude {self.west:.5f} to "
@@ -43,7 +43,7 @@ class UsableArea:
 def usable_part(
     mosaic: Mosaic, faulty: NDArray[np.bool_], height_m: float, frame: LocalFrame
 ) -> UsableArea | None:
-    """The largest rectangle of cells that are good to nine tenths; None where no cell is.
+    """The largest rectangle of cells that are 90 % free of faults; None without any.
 
     faulty: (h, w) of the mosaic, where there is nothing to match. height_m: of the flight, by which
     the cells are as small as matters. frame: of the mosaic's metres.

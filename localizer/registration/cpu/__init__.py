@@ -1,1 +1,1 @@
-"""Registration on the CPU: the numba kernel, and the specification that it is held against."""
+"""Registration on the CPU: numba kernel and reference implementation."""

@@ -1,6 +1,6 @@
-"""The reference backend: the specification in plain float64 NumPy, slow and obviously right.
+"""Reference backend: the specification in plain float64 NumPy, slow and simple.
 
-Every equation number is of registration.md. The other backends are tested against this one.
+Equation numbers are of registration.md. The other backends are tested against it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The registration on an NVIDIA GPU (gpu.md): kernels compiled at run time, no toolkit."""
+"""Registration on an NVIDIA GPU (gpu.md): kernels compiled at run time, without a CUDA toolkit."""
 
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.driver import Device

@@ -1,4 +1,4 @@
-"""The CUDA backend behind the optimizer's interface: one launch refines a level's hypotheses."""
+"""The CUDA backend of the optimizer: one launch refines a level's hypotheses."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class CudaBackend:
 
 
 def set_loss(arguments: NDArray[np.void], settings: LMSettings, iterations: int) -> None:
-    """Fill the LM and loss fields of the refine kernel's arguments."""
+    """Write LM and loss settings to the refine kernel's arguments."""
     arguments["damping"] = settings.damping
     arguments["damping_down"] = settings.damping_down
     arguments["damping_up"] = settings.damping_up
@@ -135,7 +135,7 @@ def set_loss(arguments: NDArray[np.void], settings: LMSettings, iterations: int)
 
 
 def packed_prior(problem: LevelProblem) -> NDArray[np.void]:
-    """The problem's prior as the kernels read it."""
+    """The problem's prior as the kernels' structure."""
     packed = np.zeros((), dtype=layout.PRIOR)
     if problem.prior is not None:
         packed["rotation"] = problem.prior.camera_from_local.rotation
@@ -146,7 +146,7 @@ def packed_prior(problem: LevelProblem) -> NDArray[np.void]:
 
 
 def stored(features: NDArray[np.floating], half: bool) -> NDArray[np.floating]:
-    """Features as the device stores them."""
+    """Features in the device's precision."""
     return np.ascontiguousarray(features, dtype=np.float16 if half else np.float32)
 
 

@@ -1,6 +1,7 @@
-"""Compiles the kernels at run time with NVRTC and keeps the images on disk.
+"""Compiles the kernels at run time with NVRTC and caches the images on disk.
 
-No nvcc, no toolkit headers: the packages `cuda-bindings` and NVRTC's own wheel (extra `gpu`).
+It needs no nvcc and no toolkit headers, only the packages `cuda-bindings` and NVRTC's own wheel
+(extra `gpu`).
 """
 
 from __future__ import annotations
@@ -33,14 +34,15 @@ class Image:
 
 
 def cache_directory() -> Path:
-    """Where images are kept: `PILOT_CACHE`, else the user's cache directory."""
+    """Folder of compiled images: `PILOT_CACHE`, else the user's cache directory."""
     return cache_folder("cuda")
 
 
 def compile_kernels(
     channels: int, half: bool, architecture: tuple[int, int], cache: Path | None = None
 ) -> Image:
-    """The kernels for one channel count and one compute capability, from the cache if it is there.
+    """Compile the kernels for one channel count and compute capability, or load them from the
+    cache.
 
     An unwritable cache costs the compilation at every start and is no error. Raises
     `CudaUnavailableError` without NVRTC, `CudaError` where it refuses the source.
@@ -56,7 +58,7 @@ def compile_sources(
     architecture: tuple[int, int],
     cache: Path | None = None,
 ) -> Image:
-    """As `compile_kernels`, for any sources by name, of which `main` includes the others."""
+    """As `compile_kernels` for any sources by name; `main` includes the others."""
     nvrtc = load_nvrtc()
     options = [f"--gpu-architecture=sm_{architecture[0]}{architecture[1]}", *_OPTIONS]
     options += [f"-D{name}={value}" for name, value in defined.items()]
@@ -89,8 +91,8 @@ def _store(path: Path, code: bytes) -> None:
 def compile_image(
     nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: list[str]
 ) -> Image:
-    """Compile `main` with the others as its headers, past the cache. `CudaError` with the
-    compiler's log if it fails.
+    """Compile `main` with the others as headers, without the cache. `CudaError` with the compiler's
+    log if it fails.
     """
     headers = {name: text for name, text in sources.items() if name != main}
     program = _checked(
@@ -132,7 +134,7 @@ def _checked(nvrtc: ModuleType, result: tuple[Any, ...]) -> Any:
 
 
 def load_nvrtc() -> ModuleType:
-    """NVIDIA's run-time compiler; CudaUnavailableError where there is none."""
+    """Load NVIDIA's run-time compiler; `CudaUnavailableError` if it is missing."""
     try:
         from cuda.bindings import nvrtc
 

@@ -1,4 +1,4 @@
-"""How sharp the cost is about the winner (equation 11a), scored on the device after its graph."""
+"""Curvature of the cost at the best pose (equation 11a), computed on the device."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def geometry(
 
 
 def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) -> Array:
-    """`CovarianceSums.motion` of a level's geometry."""
+    """`CovarianceSums.motion` of a level's geometry at a pose."""
     x, uv = project(problem, rotation, translation)
     visible = in_view(problem, x, uv)
     return mean_motion(projection_jacobian(problem, x[visible], translation))
@@ -46,8 +46,8 @@ def winner_curvature(
     hessian: Array,
     distance_px: float,
 ) -> float:
-    """Equation 11a about a pose camera_from_local (rotation, translation), with the frame that
-    `memory` holds. refining: the launch that scores `memory.probes`. Under the backend's lock.
+    """Curvature ratio (equation 11a) at a pose camera_from_local (rotation, translation). refining:
+    the launch that scores `memory.probes`. Call it under the backend's lock.
     """
     device, steps = backend.device, curvature_steps(motion, distance_px)
     rotations, translations = retractions(*pose, steps)
@@ -69,5 +69,5 @@ def winner_curvature(
 
 
 def last_settings(settings: LMSettings, scale: float) -> LMSettings:
-    """The loss of the winner's last steps; scale: 0 where it was not sharpened."""
+    """Loss of the final refinement steps; scale: 0 without sharpening."""
     return replace(settings, scale=scale, redescending=True) if scale > 0 else settings

@@ -1,8 +1,8 @@
-"""A thin layer over the CUDA driver: one device, its memory, launches, graphs and events.
+"""A thin layer over the CUDA driver: device, memory, launches, graphs and events.
 
-Only what the registration needs. Calls go through `cuda.bindings.driver`; every failed call raises
-`CudaError` with the driver's own name of the error. The device's primary context is used, so that
-memory of onnxruntime or PyTorch in the same process can be read in place.
+Calls go through `cuda.bindings.driver`; a failed call raises `CudaError` with the driver's error
+name. The device's primary context is used, so that memory of onnxruntime or PyTorch in the same
+process can be read in place.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
 
 
 class Device:
-    """One CUDA device. Every thread that calls it calls `activate` first."""
+    """One CUDA device. Each thread must call `activate` before other calls."""
 
     def __init__(self, index: int = 0) -> None:
         """Raises `CudaUnavailableError` where there is no such device, no driver, no bindings."""
@@ -46,7 +46,7 @@ class Device:
         self._call(self._api.cuCtxSetCurrent, self._context)
 
     def load(self, code: bytes) -> Kernels:
-        """Load machine code; `CudaError` where it is not of this device's architecture."""
+        """Load machine code; `CudaError` if it is of another architecture."""
         return Kernels(self, self._call(self._api.cuModuleLoadData, code))
 
     def allocate(self, size: int) -> int:
@@ -54,7 +54,7 @@ class Device:
         return int(self._call(self._api.cuMemAlloc, max(size, 1)))
 
     def free(self, address: int) -> None:
-        """Give back what `allocate` gave."""
+        """Free memory of `allocate`."""
         self._call(self._api.cuMemFree, address)
 
     def pinned(self, size: int) -> NDArray[np.uint8]:
@@ -83,11 +83,11 @@ class Device:
         self._call(self._api.cuMemcpyDtoDAsync, target, source, size, self.stream)
 
     def synchronize(self) -> None:
-        """Wait for everything queued; errors of kernels appear here."""
+        """Wait for all queued work; kernel errors are raised here."""
         self._call(self._api.cuStreamSynchronize, self.stream)
 
     def capture(self, enqueue: Callable[[], None]) -> Graph:
-        """What `enqueue` queues, as one graph instead of being run."""
+        """Capture the work that `enqueue` queues as a graph, without running it."""
         mode = self._api.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_THREAD_LOCAL
         self._call(self._api.cuStreamBeginCapture, self.stream, mode)
         try:
@@ -181,7 +181,7 @@ class Graph:
 
 
 class Arena:
-    """Named device buffers that grow and are kept, so that a frame allocates nothing."""
+    """Named device buffers that are reused, so that a frame allocates nothing."""
 
     def __init__(self, device: Device) -> None:
         self._device = device

@@ -6,7 +6,7 @@ from localizer.errors import BackendError
 
 
 class CudaError(BackendError):
-    """A call of the driver or the run-time compiler failed, or there is no usable GPU."""
+    """A call of the driver or run-time compiler failed, or there is no usable GPU."""
 
 
 class CudaUnavailableError(CudaError):

@@ -1,4 +1,4 @@
-"""The structures of layout.cuh as NumPy types: what the kernels are given and give back."""
+"""NumPy types of the structures in layout.cuh: the kernels' input and output."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ _NAMES = {
 
 
 def macros(channels: int, half: bool, in_flight: int = 2) -> dict[str, int]:
-    """The macros that the source needs, with the structures' sizes, which it checks.
+    """Macros for the source, with the structures' sizes, which it checks.
 
     in_flight: anchors per group of lanes whose features are loaded before the first is used.
     """

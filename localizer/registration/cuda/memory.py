@@ -1,4 +1,4 @@
-"""Where the data of one frame's registration lie on the device: one block, laid out once."""
+"""Device memory layout of one frame's registration: one block."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ PROBES = 13  # poses at which the curvature is measured: `curvature_steps`
 
 @dataclass(frozen=True)
 class FrameMemory:
-    """Addresses within the frame's block: levels, motion, first swarm | prior, state, last swarm;
-    the first part and the state are uploaded, the last part comes back. Then scratch.
+    """Addresses in the frame's block: levels, motion, first swarm | prior, state, last swarm |
+    scratch. The first part and the state are uploaded, the last swarm is downloaded.
     """
 
     base: int
@@ -46,8 +46,8 @@ class FrameMemory:
         survivors: int,
         anchors: int,
     ) -> FrameMemory:
-        """The layout for so many levels and hypotheses, of which `survivors` at most are left at
-        the end, and `anchors` at most in the sums. buffer: gives device memory by name and size.
+        """The layout for numbers of levels, hypotheses, survivors and anchors. buffer: returns
+        device memory by name and size.
         """
         sizes = [
             ("level", layout.LEVEL.itemsize * levels),
@@ -91,12 +91,12 @@ class FrameMemory:
         return self.levels + k * layout.LEVEL.itemsize
 
     def write(self, frame: NDArray[np.uint8], address: int, value: NDArray[Any]) -> None:
-        """Put a value into the host's copy of the block."""
+        """Write a value to the host's copy of the block."""
         start = address - self.base
         frame[start : start + value.nbytes] = value.reshape(-1).view(np.uint8)
 
     def winner(self, swarm: NDArray[np.void]) -> NDArray[np.void]:
-        """The swarm, with scores going elsewhere: sharpening does not change the ranking."""
+        """The swarm with its own score address: sharpening must not change the ranking."""
         out: NDArray[np.void] = swarm.copy()
         out["scores"], out["visible"] = self.trial
         return out

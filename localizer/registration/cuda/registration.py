@@ -1,4 +1,4 @@
-"""`JNGO.register` with everything but the first draw and the last 6x6 algebra on the device."""
+"""`JNGO.register` on the device, except the initial swarm and the final 6x6 algebra."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStat
 
 
 class CudaRegistration:
-    """A whole frame on a `CudaBackend`, which shares its device and memory."""
+    """Registers frames on a `CudaBackend`, with its device and memory."""
 
     def __init__(self, backend: CudaBackend) -> None:
         self._schedule = CudaSchedule(backend)

@@ -46,11 +46,11 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
 @dataclass(frozen=True)
 class DeviceSearchResult:
-    """What the device found. rotations (K, 3, 3), translations (K, 3): the survivors, camera from
-    local, best first, the first one sharpened; scores (K,) before that, and overlaps (K,); K is 0
-    without overlap. hessian to curvature: as in `CovarianceSums`;
-    finite: False where features, confidences or points are not. upload_ms, graph_ms: device time,
-    0 unless the schedule is timed.
+    """Results from the device. rotations (K, 3, 3), translations (K, 3): survivors,
+    camera_from_local, best first, the first one sharpened; scores (K,) before that, and overlaps
+    (K,); K is 0 without overlap. hessian to curvature: as in `CovarianceSums`; finite: False if
+    features, confidences or points are not finite. upload_ms, graph_ms: device time, 0 unless
+    timed.
     """
 
     rotations: Array
@@ -74,7 +74,7 @@ class DeviceSearchResult:
 
 
 class CudaSchedule:
-    """Runs `JNGO`'s schedule on a `CudaBackend`, whose device, kernels and lock it shares."""
+    """Runs the search of `JNGO` on a `CudaBackend`."""
 
     def __init__(self, backend: CudaBackend, *, timed: bool = False) -> None:
         self._backend, self._device = backend, backend.device

@@ -23,7 +23,7 @@ _FINITE_BLOCKS_PER_MULTIPROCESSOR = 4
 
 @dataclass(frozen=True)
 class GraphShape:
-    """What a captured graph depends on."""
+    """Parameters that a captured graph depends on."""
 
     config: JNGOConfig
     hypotheses: int
@@ -53,7 +53,7 @@ class KernelLaunch:
 def launches(
     shape: GraphShape, memory: FrameMemory, multiprocessors: int
 ) -> Iterator[KernelLaunch]:
-    """The launches, in order (docs/explanation/registration.md, section 7)."""
+    """Yield the kernel launches in order (docs/explanation/registration.md, section 7)."""
     c, searched = shape.config, len(shape.config.iterations)
     levels = len(shape.channels)
     for k in range(levels):

@@ -1,1 +1,1 @@
-"""What light, weather and a camera do to a rendered image."""
+"""Effects of light, weather and camera on a rendered image."""

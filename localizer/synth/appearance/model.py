@@ -1,7 +1,7 @@
-"""What light, weather and a camera do to a rendered image: applied after rendering, by depth.
+"""Applies light, weather and camera effects to a rendered image, by its depth.
 
-It changes colours, never geometry, so that pose and depth stay true. Sun direction, cast shadows
-and seasons of the ground belong to the world or scene that is rendered.
+Colours change, geometry does not, so pose and depth stay true. Sun direction, cast shadows and
+seasons belong to the rendered world.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SKY_DEPTH_M = 4000.0  # haze distance given to pixels without a surface
 
 @dataclass(frozen=True)
 class Appearance:
-    """One draw of light, weather and sensor. The defaults change nothing.
+    """Parameters of light, weather and sensor. The defaults change nothing.
 
     Colours are RGB factors about 1. Extinction is per metre (Koschmieder's law, visual range
     3.9 / extinction). Noise sigmas are in units of full scale, lengths in pixels.
@@ -49,7 +49,7 @@ class Appearance:
 
 
 def sample_appearance(rng: np.random.Generator, condition: str | None = None) -> Appearance:
-    """Draw an appearance; `condition` is one of `CONDITIONS`, None draws it too. ValueError for
+    """Draw random parameters; `condition` is one of `CONDITIONS`, None draws it too. ValueError for
     another condition.
     """
     if condition is None:
@@ -116,7 +116,7 @@ def sample_appearance(rng: np.random.Generator, condition: str | None = None) ->
 def apply_appearance(
     rgb: Image, depth: Float32, appearance: Appearance, rng: np.random.Generator
 ) -> Image:
-    """Degrade `rgb` (H, W, 3) with `depth` (H, W) in metres along the axis, 0 for sky."""
+    """Apply the effects to rgb (H, W, 3) uint8 with depth (H, W) m, 0 for sky."""
     a = appearance
     image: Float32 = rgb.astype(np.float32) / 255.0
     if a.snow_cover > 0.0:
@@ -175,7 +175,7 @@ def _snow_cover(image: Float32, depth: Float32, cover: float) -> Float32:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp's pool of light: centre and radius in pixels, RGB colour, power."""
+    """A street lamp's light in the image: centre and radius in pixels, RGB colour, power."""
 
     x: float
     y: float
@@ -185,7 +185,7 @@ class Lamp:
 
 
 def draw_lamps(count: int, width: int, height: int, rng: np.random.Generator) -> Iterator[Lamp]:
-    """The lamps of one image."""
+    """Draw random lamps for one image."""
     for _ in range(count):
         radius = float(rng.uniform(0.01, 0.06)) * width
         x, y = float(rng.uniform(0, width)), float(rng.uniform(0, height))
@@ -219,7 +219,7 @@ def _streaks(
 def streak_cover(
     size: tuple[int, ...], count: int, alpha: float, length: float, rng: np.random.Generator
 ) -> Float32:
-    """Falling drops or flakes (H, W): short bright segments of a common direction."""
+    """Opacity (H, W) of falling drops or flakes: short segments of one direction."""
     h, w = size
     layer: NDArray[np.uint8] = np.zeros((h, w), np.uint8)
     tilt = rng.normal(0.0, 0.3)
@@ -248,7 +248,7 @@ def _optics(image: Float32, a: Appearance) -> Float32:
 
 
 def motion_kernel(length: float, angle_deg: float) -> Float32:
-    """Line of `length` pixels through the kernel's centre, summing to one."""
+    """Blur kernel of a straight motion of `length` pixels, with sum 1."""
     half = int(np.ceil(length / 2))
     size = 2 * half + 1
     t = np.linspace(-0.5, 0.5, 33) * length

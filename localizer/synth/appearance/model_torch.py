@@ -1,7 +1,6 @@
-"""`appearance.apply_appearance` on any torch device.
+"""`appearance.apply_appearance` on any torch device, with the same model in the same order.
 
-The same physics in the same order. What is drawn is drawn alike, except that the sensor's noise
-comes from torch's generator; JPEG is its quantisation, without the entropy coding.
+Sensor noise comes from torch's generator; JPEG is its quantisation without entropy coding.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ def apply_appearance(
     rng: np.random.Generator,
     generator: torch.Generator,
 ) -> Tensor:
-    """Degrade `rgb` (H, W, 3) uint8 with `depth` (H, W) in metres along the axis, 0 for sky.
+    """Apply the effects to rgb (H, W, 3) uint8 with depth (H, W) m, 0 for sky.
 
     rng draws lamps and drops, as on the CPU; generator, of the tensors' device, the noise.
     """
@@ -76,7 +75,7 @@ def apply_appearance(
 
 
 def jpeg(image: Tensor, quality: int) -> Tensor:
-    """What the usual baseline JPEG (4:2:0) leaves of an image (3, H, W) in whole steps 0..255."""
+    """Simulate baseline JPEG (4:2:0) compression of an image (3, H, W) with values 0..255."""
     height, width = image.shape[1:]
     padded = F.pad(image[None], [0, -width % 16, 0, -height % 16], mode="replicate")
     matrix = image.new_tensor(_YCBCR)

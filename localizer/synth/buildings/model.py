@@ -1,4 +1,4 @@
-"""Buildings as footprints of a kind, and as the planar surfaces that are painted and meshed."""
+"""Buildings: footprint with a kind, and planar surfaces to paint and mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The surfaces of one building, put together in its own frame: walls, roofs, boxes."""
+"""Builds the surfaces of one building in its own frame: walls, roofs, boxes."""
 
 from __future__ import annotations
 

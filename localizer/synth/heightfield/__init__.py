@@ -1,1 +1,1 @@
-"""Fast scenes for training: lit height fields, ray-marched."""
+"""Fast scenes for training: lit height fields, rendered by ray marching."""

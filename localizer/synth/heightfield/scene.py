@@ -79,7 +79,7 @@ class LitScene:
 
 
 def compose(land: Land, prisms: Sequence[Prism]) -> Scene:
-    """Draw the objects into the land."""
+    """Add the objects to the land."""
     height, albedo = land.height.copy(), land.albedo.copy()
     index = np.zeros(height.shape, np.int32)
     facades = np.zeros((len(prisms) + 1, 4), np.float32)
@@ -95,7 +95,7 @@ def light_scene(
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
 ) -> LitScene:
-    """Shade the scene with sun, sky and cast shadows, and build what the ray marcher needs.
+    """Shade the scene with sun, sky and cast shadows, and prepare it for ray marching.
 
     texel_cells: size of a sample of the baked texture; above one it is coarser than the cells.
     """
@@ -112,7 +112,7 @@ def light_scene(
 
 
 def openness(height: Float32) -> Float32:
-    """(n, n): how much sky is seen; concave places see less."""
+    """(n, n): visible share of the sky; less in concave places."""
     seen: Float32 = np.clip(
         1.0 + (height - cv2.GaussianBlur(height, (0, 0), 4.0)) * 0.06, 0.55, 1.15
     )
@@ -126,7 +126,7 @@ def textured(
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
 ) -> LitScene:
-    """The scene with what its surfaces show, (n, n, 3), ready for the ray marcher."""
+    """The scene with a given texture (n, n, 3), prepared for ray marching."""
     height, cell = scene.height, scene.cell_m
     block_max = cv2.dilate(height, np.ones((3, 3), np.uint8))
     n = height.shape[0]
@@ -144,12 +144,12 @@ def textured(
 
 
 def without(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
-    """The objects with a random share of them gone."""
+    """The objects without a random share of them."""
     return [p for p in prisms if rng.random() >= share]
 
 
 def height_at(scene: LitScene, x_m: float, y_m: float) -> float:
-    """Surface height at a place of the first (unmirrored) square, metres."""
+    """Surface height (m) at a position in the first (unmirrored) square."""
     n = scene.height.shape[0]
     col = int(np.clip(x_m / scene.cell_m, 0, n - 1))
     row = int(np.clip(y_m / scene.cell_m, 0, n - 1))

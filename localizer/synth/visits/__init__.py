@@ -1,1 +1,1 @@
-"""What differs between a place as surveyed and as flown over later."""
+"""Differences between a place as surveyed and as flown over later."""

@@ -1,4 +1,4 @@
-"""What was built, taken down, felled, and grown since the survey."""
+"""Changes since the survey: buildings and trees that were added or removed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ _GROWTH = (1.0, 1.2)  # of a crown's radius and height, in a few years
 
 @dataclass(frozen=True)
 class Changes:
-    """Shares of what stood at the survey. gone, rebuilt, new: of the buildings; felled: of the
-    trees, of which the others grew. `regrown` also gives soft ground another fine texture. seed:
-    which ones.
+    """Shares of changed objects. gone, rebuilt, new: of the buildings; felled: of the trees; the
+    others grew. regrown: soft ground has another fine texture. seed: which objects.
     """
 
     gone: float = 0.03
@@ -31,7 +30,7 @@ class Changes:
 
 
 def changed(plan: WorldPlan, changes: Changes) -> WorldPlan:
-    """The plan as it stands after the changes; its ground and streets stay."""
+    """The plan after the changes; ground and streets stay."""
     rng = plan.config.rng(61, changes.seed)
     draw = rng.random(len(plan.buildings))
     buildings = []

@@ -1,6 +1,6 @@
-"""What a photogrammetric survey makes of a place: bumps, holes, blurred walls, coarse texels.
+"""Errors of a photogrammetric survey: bumps, holes, blurred walls, coarse texels.
 
-Its edges stay sharp and its triangles those of the place: the README says so.
+Edges stay sharp, and the triangles are those of the place.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class SurveyErrors:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> SurveyErrors:
-        """One survey: a good one to a poor one."""
+        """Draw the errors of a good to poor survey."""
         return cls(
             bumps_m=float(np.exp(rng.uniform(*np.log((0.03, 0.12))))),
             holes_per_km2=float(rng.uniform(20.0, 80.0)),
@@ -46,7 +46,7 @@ class SurveyErrors:
         )
 
     def displaced(self, positions: Array) -> Array:
-        """The surface's points (V, 3) ENU where the survey has them: smooth, so nothing tears."""
+        """Surface points (V, 3) ENU, displaced smoothly by the survey's errors."""
         if self.bumps_m <= 0:
             return positions
         rng = np.random.default_rng([self.seed, 1])
@@ -61,9 +61,7 @@ class SurveyErrors:
         return np.asarray(positions + np.stack(moved, axis=1))
 
     def without_holes(self, positions: Array, faces: NDArray[np.int64], side_m: float) -> Array:
-        """Which faces (F,) bool the survey has, in a world of a side: holes are where pictures did
-        not match.
-        """
+        """Mask (F,) of the faces outside the survey's holes, in a world of `side_m`."""
         rng = np.random.default_rng([self.seed, 2])
         count = rng.poisson(self.holes_per_km2 * (side_m / 1000.0) ** 2)
         centres = rng.uniform(-side_m / 2, side_m / 2, (count, 2))
@@ -77,7 +75,7 @@ class SurveyErrors:
         return kept
 
     def photographed(self, chart: Image, gsd_m: float, normal_up: float = 1.0) -> Image:
-        """A surface's image as the survey has it; normal_up: z of the surface's unit normal."""
+        """A surface's image, blurred as by the survey; normal_up: its normal's z."""
         if abs(normal_up) < _WALL and self.wall_blur_m > 0:
             sigma = self.wall_blur_m / gsd_m
             chart = np.asarray(cv2.GaussianBlur(chart, (0, 0), sigma), np.uint8)

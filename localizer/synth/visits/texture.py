@@ -1,9 +1,8 @@
-"""The fine texture that two visits to a place do not share.
+"""Changes the fine texture between two visits to a place.
 
-A map's texture was taken once, at the survey's resolution. Until the flight, grass, crops, leaf
-litter, bare soil and water have taken another fine texture: what lasts is their layout, and hard
-surfaces. Each function stands for one of these (model-card.md); training places and the
-worlds that are flown use the same ones.
+The map's texture was taken once. Until the flight, grass, crops, litter, bare soil and water get
+another fine texture; their layout and hard surfaces stay. Each function models one of these
+(model-card.md), for training places and for flown worlds.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ _KEPT = 0.35  # largest share of that fine texture which is still the map's own
 
 
 def hard_surfaces(texture: Image) -> Float32:
-    """Where a photo shows grey, blue or strongly red ground: pavement and roofs, not vegetation or
-    soil, which are green to yellow-brown.
+    """Mask of pavement and roofs in a photo: grey, blue or strongly red, unlike vegetation or soil,
+    which are green to yellow-brown.
     """
     smooth = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 1.5)
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
@@ -36,7 +35,7 @@ def regrown(
     rng: np.random.Generator,
     painted_anew: Float32 | None = None,
 ) -> Float32:
-    """The albedo (n, n, 3) with new fine texture of the same strength where nothing lasts.
+    """The albedo (n, n, 3) with new fine texture of the same strength on soft ground.
 
     lasting: (n, n) in 0..1, one on roads, roofs and pavement. painted_anew: the same ground with
     another fine texture, where there is one; else texture of elsewhere in the place, or noise.
@@ -75,7 +74,7 @@ def wetted(
     rng: np.random.Generator,
     patches: Float32 | None = None,
 ) -> Float32:
-    """Hard surfaces darker or paler than in the map, in patches: wet, dry, worn, dusty.
+    """The albedo with patches of hard surface darker or paler: wet, dry, worn, dusty.
 
     patches: noise (n, n) that says where, drawn when it is not given.
     """
@@ -88,7 +87,7 @@ def wetted(
 
 
 def coarser(image: Image, texel_px: float) -> Image:
-    """An image whose texture has one sample every `texel_px` pixels."""
+    """The image with one texture sample per `texel_px` pixels."""
     if texel_px <= 1.0:
         return image
     height, width = image.shape[:2]
@@ -99,5 +98,5 @@ def coarser(image: Image, texel_px: float) -> Image:
 
 
 def draw_texel(rng: np.random.Generator) -> float:
-    """Ground size of a map texel over that of a query pixel, 1 to 4."""
+    """Random ratio of map texel to query pixel on the ground, 1 to 4."""
     return float(np.exp(rng.uniform(0.0, np.log(4.0))))

@@ -1,4 +1,4 @@
-"""A visit to a place: the day it is seen on, what changed since the survey, how it was surveyed."""
+"""A visit to a place: its look, changes since the survey, and errors of the survey."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _BUILT = 0.04  # largest share of buildings gone, rebuilt, and new, each
 
 @dataclass(frozen=True)
 class Visit:
-    """name: of the variant. changes: since the survey, None for none. survey: the errors of the
-    map that is made at this visit, None where the place is seen as it is.
+    """name: of the variant. changes: since the survey, None for none. survey: errors of the map
+    made at this visit, None for the true place.
     """
 
     name: str
@@ -26,7 +26,7 @@ class Visit:
 
 
 def draw_look(rng: np.random.Generator) -> VisitLook:
-    """A visit on a random day: sun, season, traffic, a few buildings gone."""
+    """Draw the look of a random day: sun, season, traffic, missing buildings."""
     strength = rng.uniform(0.0, 1.0)
     warm = rng.uniform(0.8, 1.05)
     sky = 0.75 - 0.42 * strength
@@ -44,9 +44,9 @@ def draw_look(rng: np.random.Generator) -> VisitLook:
     )
 
 
-def surveyed_and_lived(config: WorldConfig) -> tuple[Visit, Visit]:
-    """The survey that a map is made from, and a day on which the place is flown over, drawn from
-    the world's seed.
+def survey_and_flight_visits(config: WorldConfig) -> tuple[Visit, Visit]:
+    """The visit from which the map is made, and the one that is flown over, both drawn from the
+    world's seed.
     """
     rng = config.rng(62)
     survey = Visit("survey", SURVEY, survey=SurveyErrors.draw(rng))

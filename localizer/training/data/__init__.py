@@ -1,1 +1,1 @@
-"""Training pairs: made, kept in shards, batched."""
+"""Training pairs: generation, shards, batches."""

@@ -1,4 +1,4 @@
-"""Batches of augmented crops from shards: what a step sees depends on seed, rank and step alone."""
+"""Batches of augmented crops from shards, deterministic by seed, rank and step."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it n
 
 @dataclass(frozen=True)
 class LoaderConfig:
-    """pairs and anchors of a batch, crop size in pixels, whether queries get weather and sensor."""
+    """Batch size, anchors and crop size (px); appearance: degrade the queries."""
 
     batch: int
     anchors: int
@@ -37,8 +37,8 @@ class LoaderConfig:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Which shards a step draws from. paths: in order of generation, of which the first `initial`
-    plus `growth` a step are in use; world_paths: mesh worlds, with their share of the samples from
+    """Shards that a step draws from. paths: in order of generation; the first `initial` plus
+    `growth` per step are used; world_paths: of mesh worlds, with their share of the samples from
     `world_first` on.
     """
 
@@ -50,7 +50,7 @@ class Schedule:
     world_first: int = 0
 
     def draw(self, step: int, rng: np.random.Generator) -> Path:
-        """The shard of one sample."""
+        """Draw the shard of one sample."""
         if self.world_paths and step >= self.world_first and rng.random() < self.world_share:
             return self.world_paths[int(rng.integers(len(self.world_paths)))]
         count = min(len(self.paths), int(self.initial + step * self.growth))
@@ -58,7 +58,7 @@ class Schedule:
 
 
 class ShardStream:
-    """Deals batches of the shards that a schedule names.
+    """Makes batches of the shards that a schedule selects.
 
     A step waits for the shards it may draw from, so that training can begin while later shards are
     still being generated and yet see the same data every time.
@@ -153,7 +153,7 @@ class TrainingSample:
 
 
 def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> TrainingSample | None:
-    """Weather on the query, windows that see the same ground, anchors; None without overlap."""
+    """Degrade the query, and crop windows of the same ground; None without overlap."""
     query, reference = pair.query, pair.reference
     if config.appearance:
         look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
@@ -167,7 +167,7 @@ def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Tra
 def window_pair(
     pair: Pair, config: LoaderConfig, rng: np.random.Generator
 ) -> TrainingSample | None:
-    """Windows of a degraded pair that see the same ground, with anchors; None without overlap."""
+    """Crop windows of the same ground from a degraded pair, with anchors; None without overlap."""
     width, height = config.crop
     camera, reference, query = pair.camera, pair.reference, pair.query
     T = relative_pose(pair)
@@ -216,7 +216,7 @@ def survey_appearance(rng: np.random.Generator) -> Appearance | None:
 
 
 def mirrored(sample: TrainingSample) -> TrainingSample:
-    """The same pair seen in a mirror: images flipped, x negated in both camera frames."""
+    """The mirrored pair: images flipped, x negated in both camera frames."""
     width = sample.query.shape[1]
     M = np.diag([-1.0, 1.0, 1.0, 1.0])
     flip = np.array([-1.0, 1.0], np.float32)
@@ -259,7 +259,7 @@ def collate(samples: list[TrainingSample]) -> Batch:
 
 
 def tamed(appearance: Appearance, depth: Float32) -> Appearance:
-    """The appearance with haze no denser than leaves something to see at these distances."""
+    """The appearance with less haze if nothing would be visible at these distances."""
     surface = depth[depth > 0]
     if not surface.size:
         return appearance

@@ -14,7 +14,7 @@ from localizer.training.data.pairs import (
     SceneConfig,
     draw_place,
     draw_visit,
-    lived_scene,
+    flight_day_scene,
     survey_scene,
 )
 from localizer.training.data.shards import PhotoSource
@@ -22,7 +22,7 @@ from localizer.training.data.shards import PhotoSource
 
 @dataclass(frozen=True)
 class PlaceVisits:
-    """A place as it was surveyed, and on the days of several flights."""
+    """A place as surveyed, and on several flight days."""
 
     survey: LitScene
     days: tuple[tuple[LitScene, FlightDay, bool], ...]
@@ -40,11 +40,11 @@ def make_place(
     for _ in range(flight_days):
         visit = draw_visit(rng)
         fixed = None if scenes.light_variety else survey.light
-        days.append((visit, *lived_scene(rng, place, visit, fixed)))
+        days.append((visit, *flight_day_scene(rng, place, visit, fixed)))
     return PlaceVisits(survey, tuple((lit, visit, season) for visit, lit, season in days), source)
 
 
-def be_modest() -> None:
-    """How a process that makes places begins: it yields to the training, and uses one core."""
+def be_nice() -> None:
+    """Initialise a worker process: low priority, one core."""
     os.nice(5)
     cv2.setNumThreads(1)

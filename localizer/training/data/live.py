@@ -30,7 +30,7 @@ from localizer.training.data.batches import (
     tamed,
     window_pair,
 )
-from localizer.training.data.lit_places import PlaceVisits, be_modest, make_place
+from localizer.training.data.lit_places import PlaceVisits, be_nice, make_place
 from localizer.training.data.pairs import Pair, SceneConfig, draw_views
 from localizer.training.data.shards import PhotoSource
 from localizer.training.losses import Batch
@@ -40,9 +40,8 @@ _SPARE = 1.25  # candidates for each sample: some see too little in common
 
 @dataclass(frozen=True)
 class LivePlan:
-    """Which places a step draws from: `active` of them, of which the oldest is replaced by a new
-    one every `steps_per_place` steps. places: how many there are before they repeat; flight_days:
-    on which each is seen.
+    """Places that a step draws from: `active` of them; every `steps_per_place` steps the oldest is
+    replaced. places: number before they repeat; flight_days: per place.
     """
 
     first_seed: int
@@ -62,7 +61,7 @@ class LivePlan:
 
 
 class LiveStream:
-    """Deals batches like `training.data.batches.ShardStream`, of pairs that it makes itself."""
+    """Makes batches like `training.data.batches.ShardStream`, from pairs rendered on demand."""
 
     def __init__(
         self,
@@ -81,7 +80,7 @@ class LiveStream:
         self._loader, self._seed, self._rank, self._count = loader, seed, rank, count
         self._ahead = workers
         # Forked processes would inherit a GPU's context, which does not work in them.
-        self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=be_modest)
+        self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=be_nice)
         self._views = plan.flight_days + 1  # slots of a place: its survey and its days
         self._pool = ScenePool(plan.active * self._views, scenes.cells, device)
         self._coming: dict[int, Future[PlaceVisits]] = {}

@@ -85,8 +85,8 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class FlightDay:
-    """The day of a flight: weather or light (of `CONDITIONS`), buildings gone and new, vegetation
-    of another season (None: drawn).
+    """Conditions of a flight: weather or light (of `CONDITIONS`), changed buildings, another season
+    (None: drawn).
     """
 
     weather: str
@@ -95,7 +95,7 @@ class FlightDay:
 
 
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
-    """All pairs of the place that belongs to `seed`."""
+    """Yield all training pairs of the place of `seed`."""
     rng = np.random.default_rng(seed)
     place, source = draw_place(rng, config, library)
     survey = survey_scene(rng, place, config)
@@ -108,7 +108,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             else:
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
-            lived, season = lived_scene(rng, place, visit, fixed)
+            lived, season = flight_day_scene(rng, place, visit, fixed)
         pair = draw_views(rng, survey, lived, config)
         if pair is None:
             continue
@@ -124,7 +124,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
 def draw_place(
     rng: np.random.Generator, config: SceneConfig, library: PhotoLibrary | None
 ) -> tuple[TrainingPlace, str]:
-    """A place, and where its ground is from: "photo" or "generated"."""
+    """Draw a place; also returns the source of its ground: "photo" or "generated"."""
     n = config.cells
     cell = float(np.exp(rng.uniform(*np.log(config.cell_m))))
     if library is not None and rng.random() < config.photo_share:
@@ -133,7 +133,7 @@ def draw_place(
 
 
 def draw_visit(rng: np.random.Generator) -> FlightDay:
-    """The day of a training flight."""
+    """Draw the conditions of a training flight."""
     return FlightDay(draw_condition(rng), bool(rng.random() < 0.4), None)
 
 
@@ -158,7 +158,7 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
 
 
 def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneConfig) -> LitScene:
-    """The map: the place on the day of the survey, as a baked texture on a coarse mesh."""
+    """The map: the place on the survey day, as a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
     if rng.random() < _PLAIN_WALLS:
         prisms = plain_walls(prisms)
@@ -167,14 +167,14 @@ def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneCo
     return coarse_mesh(lit, rng) if rng.random() < _COARSE_MESH else lit
 
 
-def lived_scene(
+def flight_day_scene(
     rng: np.random.Generator,
     place: TrainingPlace,
     visit: FlightDay,
     light: SkyLight | None,
 ) -> tuple[LitScene, bool]:
-    """The place on the day of the flight, and whether that is another season than the map's; a
-    given light also keeps the season.
+    """The place on the flight day, and whether its season differs from the map's; a given light
+    also keeps the season.
     """
     land, prisms, season = place.land, list(place.prisms), False
     condition, outdated = visit.weather, visit.outdated
@@ -223,8 +223,8 @@ def draw_condition(rng: np.random.Generator) -> str:
 
 
 def visit_of(rng: np.random.Generator, condition: str) -> FlightDay:
-    """The visit of a test condition: a weather alone, `SEASON` or `OUTDATED` on a day, or any
-    weather together with both (`COMBINED`).
+    """Conditions of a named test: a weather, `SEASON`, `OUTDATED`, or any weather with both
+    (`COMBINED`).
     """
     if condition == COMBINED:
         return FlightDay(str(rng.choice(CONDITIONS)), True, True)
@@ -236,7 +236,7 @@ def visit_of(rng: np.random.Generator, condition: str) -> FlightDay:
 def draw_views(
     rng: np.random.Generator, survey: LitScene, lived: LitScene, config: SceneConfig
 ) -> tuple[Pose, Pose, Camera] | None:
-    """Poses of a pair with enough common view; None when chance offers none in a few tries."""
+    """Draw the poses of a pair with enough common view; None after a few failed tries."""
     for _ in range(12):
         fov = rng.uniform(30, 90)
         camera = Camera.from_fov(config.width, config.height, fov)
@@ -273,7 +273,7 @@ def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Gen
 def moved(
     rng: np.random.Generator, pose: Pose, distance: float, exact: tuple[float, float] | None
 ) -> Pose:
-    """The query pose: up to 15 m and 15 deg away, or a few frames of video further."""
+    """Draw the query pose: up to 15 m and 15 deg away, or a few video frames further."""
     if rng.random() < 0.3:
         metres, degrees = rng.uniform(0, 3), rng.uniform(0, 3)
     else:

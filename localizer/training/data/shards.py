@@ -73,12 +73,12 @@ def write_world_shards(out: Path, seeds: range, scenes: SceneConfig) -> Iterator
 
 
 def world_shard_paths(out: Path, seed: int) -> list[Path]:
-    """Where the shards of one world lie."""
+    """Paths of the shards of one world."""
     return [out / f"world-{seed:06d}-{k}.npz" for k in range(WORLD_SHARDS)]
 
 
 def shard_path(folder: Path, seed: int) -> Path:
-    """Where the shard of a seed lies."""
+    """Path of the shard of a seed."""
     return folder / f"{seed:08d}.npz"
 
 

@@ -1,4 +1,4 @@
-"""Where a run's batches come from: shards on disk, or pairs rendered while it trains."""
+"""Opens the source of a run's batches: shards on disk, or pairs rendered on demand."""
 
 from __future__ import annotations
 

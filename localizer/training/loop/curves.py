@@ -1,4 +1,4 @@
-"""A run's metrics as a picture."""
+"""Plots a run's metrics."""
 
 from __future__ import annotations
 

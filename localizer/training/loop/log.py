@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def append(log: Path, row: Mapping[str, float]) -> None:
-    """Write a row of a run's CSV, with its header where it is the first."""
+    """Append a row to a run's CSV; writes the header first if the file is new."""
     new = not log.exists()
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", newline="") as file:

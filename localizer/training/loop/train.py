@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class Trainer:
-    """A run that stops and continues at any step with the same result.
+    """A training run that can be stopped and resumed at any step with the same result.
 
     Under torchrun every process takes batches of its own and all take the mean step; the first one
     writes. Batch statistics stay each process's own, the first one's are kept.
@@ -208,7 +208,7 @@ def alignment_ramp(step: int, o: OptimizerSection) -> float:
 
 
 def perturbed(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:
-    """True poses moved so that anchors are off by about `error_px` image pixels."""
+    """The true poses, displaced so that anchors move by about `error_px` image pixels."""
     depth = batch.points[..., 2].median(dim=1).values
     xi = torch.randn(len(depth), 6, generator=generator).to(depth.device) * 0.6
     angle = error_px / batch.K_query[:, 0]

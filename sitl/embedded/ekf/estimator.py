@@ -17,6 +17,7 @@ import numpy as np
 
 from sitl.embedded.ekf import navigation as nav
 from sitl.embedded.ekf.aided_filter import GPS, AidedFilter, Aiding
+from sitl.embedded.ekf.ekf2_filter import Ekf2Filter
 from sitl.embedded.ekf.measurements import ExternalPosition, ExternalVelocity, GpsData, Measurement
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import Array
@@ -53,7 +54,8 @@ class Estimator:
 
     def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
         self._parameters = parameters
-        self.sources = AidedFilter(parameters, notify)
+        chosen = Ekf2Filter if parameters.is_px4 else AidedFilter
+        self.sources: AidedFilter = chosen(parameters, notify)
         self._gated = self.sources.gated
         self.output: Array = self._gated.state.copy()
         self._delay_ticks = self._longest_delay_ms() // _TICK_MS  # EKF3 sizes its buffers at boot
@@ -206,6 +208,8 @@ class Estimator:
         nav.replay(self._gated.state, self._ring, self._start, self._filled, self.output)
 
     def _longest_delay_ms(self) -> int:
+        if self._parameters.is_px4:
+            return min(int(self._parameters["EKF2_DELAY_MAX"]), _MAX_HORIZON_MS)
         delay = _BASE_HORIZON_MS
         if self._parameters["VISO_TYPE"] > 0:
             delay = max(delay, int(self._parameters["VISO_DELAY_MS"]))

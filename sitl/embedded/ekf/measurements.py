@@ -33,13 +33,17 @@ class GpsData:
 
 @dataclass(frozen=True)
 class ExternalPosition:
-    """A position from the companion: NED metres about the EKF origin, sigma in metres."""
+    """A position from the companion: NED metres about the EKF origin, sigma in metres.
+
+    is_global: it came as latitude and longitude (PX4's auxiliary global position).
+    """
 
     position: tuple[float, float, float]
     sigma: float
     yaw_rad: float | None
     yaw_sigma: float
     reset: bool
+    is_global: bool = False
 
 
 @dataclass(frozen=True)

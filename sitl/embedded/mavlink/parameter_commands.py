@@ -9,7 +9,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.mavlink.handling import Handler
 from sitl.embedded.mavlink.server import SerialPort
-from sitl.embedded.parameters import type_of
 
 
 class ParameterCommands:
@@ -26,7 +25,7 @@ class ParameterCommands:
     def _param_value(self, name: str, index: int) -> Any:
         p = self._vehicle.parameters
         return mavlink.MAVLink_param_value_message(
-            name.encode(), p[name], type_of(name), len(p), index
+            name.encode(), p.sent(name), p.type_of(name), len(p), index
         )
 
     def _param_list(self, link: SerialPort, _message: Any) -> None:
@@ -43,7 +42,8 @@ class ParameterCommands:
     def _param_set(self, _link: SerialPort, message: Any) -> None:
         v = self._vehicle
         name = _text(message.param_id)
-        if v.parameters.set(name, message.param_value):
+        p = v.parameters
+        if name in p and p.set(name, p.received(name, message.param_value)):
             # ArduPilot tells every link of a change, with an index of 65535.
             v.server.broadcast(self._param_value(name, 65535))
 

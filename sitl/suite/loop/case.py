@@ -29,11 +29,12 @@ class VideoFault(StrictModel):
     kind: PictureFaultKind
     for_s: float = Field(gt=0, le=300)
     late_s: float = Field(0.0, ge=0, le=2, description="of stamped_late and late")
+    halves_s: float = Field(4.0, gt=0, le=60, description="of darkens")
 
     @property
     def fault(self) -> PictureFault:
         """The fault for the world camera."""
-        return PictureFault(self.kind, self.late_s)
+        return PictureFault(self.kind, self.halves_s if self.kind == "darkens" else self.late_s)
 
 
 class Zoom(StrictModel):
@@ -112,7 +113,8 @@ class Expectation(StrictModel):
     be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
     injects: and some are injected. back_within_s: of a kill or a hang, injected again.
     repeats: how often the companion may say the same, figures aside. ends_tracking: the last health
-    is ok. reports: alerts that must come from the companion.
+    is ok. reports: alerts that must come from the companion; warns_first: and this one before the
+    first text that localization is degraded or lost.
     silent: no warning text, no finding of the monitor, and a health that is ok throughout.
     """
 
@@ -125,6 +127,7 @@ class Expectation(StrictModel):
     back_within_s: float | None = Field(None, gt=0)
     ends_tracking: bool = False
     reports: tuple[AlertId, ...] = ()
+    warns_first: AlertId | None = None
     silent: bool = False
     repeats: int | None = Field(None, ge=1)
 

@@ -26,7 +26,7 @@ while time.monotonic() < end:
 """
 
 
-class GnssDrag:
+class GnssSpoofing:
     """Moves the simulated receiver's position away step by step (spoofing)."""
 
     def __init__(self, drag: Drag, link: GroundLink, home: Location, began_s: float) -> None:
@@ -46,7 +46,7 @@ class GnssDrag:
             self._link.set_parameter("SIM_GPS1_GLTCH_Y", east / (_METRES_PER_DEGREE * self._cos))
 
 
-class OtherWork:
+class CpuLoad:
     """CPU load: confines the companion and busy processes to one processor."""
 
     def __init__(self, load: Load, companion: LoopCompanion) -> None:

@@ -32,7 +32,7 @@ from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.companion import Health, LoopCompanion
-from sitl.suite.loop.disturbances import GnssDrag, OtherWork
+from sitl.suite.loop.disturbances import CpuLoad, GnssSpoofing
 from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText, RestartTimes
 from sitl.suite.loop.terrain_file import terrain_file
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
@@ -108,7 +108,7 @@ class _LoopFlight:
         self._samples: list[LoopSample] = []
         self._waiting = list(case.timeline)
         self._due: list[tuple[float, Callable[[], None]]] = []
-        self._drag: GnssDrag | None = None
+        self._drag: GnssSpoofing | None = None
         self._reporting: ReportingCamera | None = None
         self._zooming = Zooming(1.0, 1.0, 0, 0)
         self._ticks: list[tuple[float, float]] = []
@@ -268,10 +268,10 @@ class _LoopFlight:
         if event.zoom is not None:
             self._zoom_to(event.zoom)
         if event.drag is not None:
-            self._drag = GnssDrag(event.drag, self._pilot.link, self._home, self._now_s)
+            self._drag = GnssSpoofing(event.drag, self._pilot.link, self._home, self._now_s)
             self._drag_on()
         if event.load is not None:
-            work = OtherWork(event.load, self._companion)
+            work = CpuLoad(event.load, self._companion)
             self._stack.callback(work.end)
             self._later(event.load.for_s, work.end)
         if event.hint is not None:

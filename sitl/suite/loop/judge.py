@@ -209,6 +209,8 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
         held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
     held += [_reported(record.texts, of) for of in expect.reports]
+    if expect.warns_first is not None:
+        held.append(_warned(record.texts, expect.warns_first))
     if expect.repeats is not None:
         held.append(_repeated(record.texts, expect.repeats))
     if expect.silent:
@@ -228,3 +230,11 @@ def _reported(texts: Sequence[LoopText], of: AlertId) -> Held:
     found = [t for t in texts if t.alert is of]
     at = f"at {found[0].at_s:.1f} s" if found else "never"
     return Held(f"reports {of.words}", bool(found), at)
+
+
+def _warned(texts: Sequence[LoopText], of: AlertId) -> Held:
+    told = [t.at_s for t in texts if t.alert is of]
+    worse = [t.at_s for t in texts if t.alert in (AlertId.DEGRADED, AlertId.BRIDGING, AlertId.LOST)]
+    warned, ended = min(told, default=math.inf), min(worse, default=math.inf)
+    seen = f"at {warned:.1f} s, worse at {ended:.1f} s"
+    return Held(f"reports {of.words} before localization is worse", warned < ended, seen)

@@ -12,7 +12,7 @@ import yaml
 from companion.calibrate import unknowns as u
 from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
 from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
-from companion.calibrate.flight import Calibrated
+from companion.calibrate.flight import CalibrationResult
 from companion.calibrate.pictures import Parts
 from companion.calibrate.proposal import (
     SettingChange,
@@ -74,20 +74,20 @@ def frames(rich: bool, count: int = 40, seed: int = 1) -> list[CalibrationFrame]
     return made
 
 
-def found_of(sighted: list[CalibrationFrame]) -> Calibrated:
+def found_of(sighted: list[CalibrationFrame]) -> CalibrationResult:
     solution = solve(CalibrationProblem(sighted, TOLD, np.eye(3), np.zeros(3)))
-    return Calibrated(
+    return CalibrationResult(
         TOLD, np.eye(3), np.zeros(3), solution, solution.covariance, 1.0, solution.pixel_sigma,
         len(sighted), 1, 0.5, (),
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def rich() -> Calibrated:
+def rich() -> CalibrationResult:
     return found_of(frames(rich=True))
 
 
-def test_drawn_errors_come_back_within_their_sigmas(rich: Calibrated):
+def test_drawn_errors_come_back_within_their_sigmas(rich: CalibrationResult):
     off = rich.shared - ERRORS
     assert abs(off[u.FOCAL]) < 0.003
     assert np.abs(off[u.MOUNT]).max() < np.radians(0.2)
@@ -96,7 +96,7 @@ def test_drawn_errors_come_back_within_their_sigmas(rich: Calibrated):
     assert np.abs(off / rich.sigmas).max() < 4.0
 
 
-def test_what_a_flight_straight_ahead_cannot_tell_is_said(rich: Calibrated):
+def test_what_a_flight_straight_ahead_cannot_tell_is_said(rich: CalibrationResult):
     flat = found_of(frames(rich=False))
     assert blind_spots(rich) == () or not any("focal" in line for line in blind_spots(rich))
     told = " ".join(blind_spots(flat))
@@ -131,7 +131,7 @@ def deployment(folder: Path) -> Path:
     return path
 
 
-def test_the_deployment_is_changed_and_the_old_one_kept(rich: Calibrated, tmp_path: Path):
+def test_the_deployment_is_changed_and_the_old_one_kept(rich: CalibrationResult, tmp_path: Path):
     path = deployment(tmp_path)
     before = path.read_text()
     wanted = changes(load_config(path), rich)
@@ -167,7 +167,7 @@ def test_what_makes_no_deployment_is_not_written(tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["deployment.yaml"]
 
 
-def test_another_flights_deployment_is_not_written_over(rich: Calibrated, tmp_path: Path):
+def test_another_flights_deployment_is_not_written_over(rich: CalibrationResult, tmp_path: Path):
     path = deployment(tmp_path)
     wanted = changes(load_config(path), rich)
     require_flown_with(path, wanted)

@@ -2,6 +2,7 @@
 
 import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler
 from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.camera.messages import camera_fov_status
+from mavlink_bridge.config import CameraConfig
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
 CAMERA = Camera.from_fov(640, 480, 60)
@@ -47,6 +50,13 @@ def test_the_picture_s_centre_falls_on_the_ground():
     half = math.radians(-45.0) / 2.0
     q = np.array(view.quaternion_ned)
     assert abs(q @ [math.cos(half), 0.0, math.sin(half), 0.0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_field_of_view_is_that_of_the_zoom():
+    zoomed = replace(estimate(-45.0), camera=Camera.from_fov(640, 480, 20))
+    view = camera_view(zoomed, FRAME, flat)
+    sent = camera_fov_status(view, CameraConfig(horizontal_fov_deg=60.0), 0.0, 0)
+    assert (sent.hfov, sent.vfov) == pytest.approx((20.0, zoomed.camera.vertical_fov_deg))
 
 
 def test_a_look_into_the_sky_has_no_ground():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.real.darkened import darkened
 from companion.integrity_monitor.config import VideoCheckConfig
 from companion.integrity_monitor.video import detail, thumbnail
 from companion.recorded.sequence import load_sequence
@@ -13,6 +12,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.opening import open_localizer
 from localizer.types import Frame, PosePrior
+from sitl.camera.faults import darkened
 
 LIMIT = VideoCheckConfig().low_detail
 

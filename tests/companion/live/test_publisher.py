@@ -19,7 +19,7 @@ from companion.errors import CompanionError
 from companion.live.orders import OrderContext, OrderError, Orders
 from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
 from companion.live.publisher import Publisher
-from companion.live.shared import Arrivals
+from companion.live.shared import SharedMemoryReader
 from companion.live.shown import Instruments, Shown
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -70,7 +70,7 @@ class Console:
         self.socket = socket.socket(socket.AF_UNIX)
         self.socket.settimeout(30.0)
         self.socket.connect(str(path))
-        self.arrivals = Arrivals(self.socket)
+        self.arrivals = SharedMemoryReader(self.socket)
         self._decoder = MessageDecoder()
         self._messages = []
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from companion.config import parse_config
-from companion.preflight.coverage import check_origin, check_stand
-from companion.preflight.meanings import check_meanings, check_ports
+from companion.preflight.coverage import check_origin, check_vehicle_position
+from companion.preflight.meanings import check_plausibility, check_ports
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import VehicleState
@@ -23,7 +23,7 @@ MODEL = {"width": 1280, "height": 720, "fx": 1100, "fy": 1100, "cx": 640, "cy": 
 def meanings(camera: dict[str, Any] | None = None, **settings: Any) -> dict[str, str]:
     whole = {"source": "udp://x:1", "model": MODEL} | (camera or {})
     config = parse_config({"map": "map", "camera": whole} | settings, "test")
-    found = check_meanings(config)
+    found = check_plausibility(config)
     assert not any(f.ok or f.required for f in found)  # advice
     return {f.name: f.why for f in found}
 
@@ -92,13 +92,13 @@ def standing(cache: TileCache, east_m: float) -> VehicleState:
 
 def test_a_vehicle_beside_its_map_is_told(cache: TileCache) -> None:
     """Of a map of another place everything else was in order."""
-    assert check_stand(cache, VehicleState()) == []
-    assert check_stand(cache, standing(cache, -50.0)) == []
-    assert check_stand(cache, standing(cache, 250.0)) == []
-    assert check_stand(cache, replace(standing(cache, 9e3), gps_fix_type=1)) == []
-    (near,) = check_stand(cache, standing(cache, 9e3))
+    assert check_vehicle_position(cache, VehicleState()) == []
+    assert check_vehicle_position(cache, standing(cache, -50.0)) == []
+    assert check_vehicle_position(cache, standing(cache, 250.0)) == []
+    assert check_vehicle_position(cache, replace(standing(cache, 9e3), gps_fix_type=1)) == []
+    (near,) = check_vehicle_position(cache, standing(cache, 9e3))
     assert (near.ok, near.required) == (False, False)
-    (far,) = check_stand(cache, standing(cache, 2e5))
+    (far,) = check_vehicle_position(cache, standing(cache, 2e5))
     assert (far.ok, far.required) == (False, True)
     assert "another place?" in far.why
 
@@ -108,7 +108,7 @@ def test_swapped_coordinates_are_named(cache: TileCache) -> None:
     swapped = VehicleState(
         gps_fix_type=3, gps_latitude_deg=o.longitude_deg, gps_longitude_deg=o.latitude_deg
     )
-    (finding,) = check_stand(cache, swapped)
+    (finding,) = check_vehicle_position(cache, swapped)
     assert "latitude and longitude are swapped" in finding.why
     altitude = o.height_m - cache.manifest.geoid_separation_m
     right = OriginConfig(
@@ -128,6 +128,6 @@ def test_the_other_side_of_the_earth_is_far(cache: TileCache) -> None:
     state = VehicleState(
         gps_fix_type=3, gps_latitude_deg=-o.latitude_deg, gps_longitude_deg=o.longitude_deg - 180.0
     )
-    (finding,) = check_stand(cache, state)
+    (finding,) = check_vehicle_position(cache, state)
     assert finding.required
     assert float(finding.found.split()[0]) > 10_000

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from companion.config import RecordConfig
 from companion.errors import StreamDecodeError, StreamDepthError
 from companion.flight.recorder import RecordKeeper
-from companion.setup.asking import first_picture
+from companion.setup.asking import read_stream_size
 from companion.sources import SourceSettings, StreamState, av_source, open_source
 from companion.sources.folder_source import read_image
 from localizer.errors import GreyRangeError, SequenceError
@@ -76,7 +76,7 @@ def test_counts_in_files_need_their_range(tmp_path: Path, name: str) -> None:
     assert _is_grey(frame.image, np.where(COUNTS <= 8000, 0, 255))
     with pytest.raises(SequenceError, match=rf"{name}: 16-bit grey.*write it with 8 bits"):
         _sequence(tmp_path / name).frame(0)
-    assert first_picture(str(tmp_path)).width == 64  # `companion init` asks for the size alone
+    assert read_stream_size(str(tmp_path)).width == 64  # `companion init` asks for the size alone
 
 
 def _sequence(path: Path) -> Sequence:
@@ -116,7 +116,7 @@ def test_counts_in_a_video_need_their_range(tmp_path: Path) -> None:
     assert source.state is StreamState.FAILED
     for frame in open_source(path, CAMERA, SourceSettings(grey_range=RANGE)).frames():
         assert _is_grey(frame.image, GREY)
-    assert first_picture(str(path)).height == 48
+    assert read_stream_size(str(path)).height == 48
 
 
 def test_live_counts_need_their_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +134,7 @@ def test_live_counts_need_their_range(tmp_path: Path, monkeypatch: pytest.Monkey
     source = open_source("rtsp://127.0.0.1:1/", CAMERA, SourceSettings(grey_range=RANGE))
     assert _is_grey(next(source.frames()).image, GREY)
     source.close()
-    assert first_picture("rtsp://127.0.0.1:1/").height == 48  # 4:3, and 16:9 was guessed
+    assert read_stream_size("rtsp://127.0.0.1:1/").height == 48  # 4:3, and 16:9 was guessed
 
 
 @pytest.mark.parametrize("wrong", [(9000, 7000), (5, 5), (-1, 9), (0, 65536), (1,)])

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from companion.terminal.steps import shown_count, shown_work, tally
+from companion.terminal.steps import show_count, show_work, tally
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def log(monkeypatch):
 
 def test_after_two_seconds_it_says_what_it_is_at_then_now_and_then_and_at_the_end(log):
     state, console, file = log
-    with shown_count(console, "localizing", begins="compiles [kernels]") as show:
+    with show_count(console, "localizing", begins="compiles [kernels]") as show:
         (timer,) = state.timers
         assert timer.seconds == 2.0
         state.now = 2.0
@@ -51,7 +51,7 @@ def test_after_two_seconds_it_says_what_it_is_at_then_now_and_then_and_at_the_en
 
 def test_what_is_done_at_once_says_nothing(log):
     state, console, file = log
-    with shown_count(console, "localizing") as show:
+    with show_count(console, "localizing") as show:
         show(1, 2)
         state.now = 1.0
         show(2, 2)
@@ -61,7 +61,7 @@ def test_what_is_done_at_once_says_nothing(log):
 
 def test_what_counts_before_it_is_asked_is_told_by_its_count(log):
     state, console, file = log
-    with shown_count(console, "describing") as show:
+    with show_count(console, "describing") as show:
         state.now = 3.0
         show(5, None)
         state.timers[0].call()
@@ -70,7 +70,7 @@ def test_what_counts_before_it_is_asked_is_told_by_its_count(log):
 
 def test_work_that_cannot_be_counted_is_told_of_after_two_seconds_and_then_every_ten(log):
     state, console, file = log
-    with shown_work(console, "hashing [tiles]"):
+    with show_work(console, "hashing [tiles]"):
         assert file.getvalue() == ""
         for now, waited in ((2.0, 2.0), (12.0, 10.0)):
             timer = state.timers[-1]

@@ -9,7 +9,7 @@ from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.forecast.forecast import Forecaster, prior_of
 from localizer.forecast.risk import RISK_LIMIT, Figures, failure_risk
-from localizer.forecast.visit import FORECAST_CONDITIONS, another_visit
+from localizer.forecast.visit import FORECAST_CONDITIONS, simulate_visit
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.tile import TileMesh
@@ -90,7 +90,7 @@ def test_a_lattice_looks_like_itself_one_step_on_and_a_town_does_not(forecast):
 def test_every_condition_changes_the_picture_and_nothing_else(condition):
     view = rendered(town()).render(Pose(DOWN, np.array([0.0, 0.0, 100.0])), CAMERA)
     before = view.rgb.copy()
-    drawn = another_visit(view, condition, np.random.default_rng(1))
+    drawn = simulate_visit(view, condition, np.random.default_rng(1))
     assert drawn.shape == view.rgb.shape
     assert drawn.dtype == np.uint8
     assert np.array_equal(view.rgb, before)
@@ -100,7 +100,7 @@ def test_every_condition_changes_the_picture_and_nothing_else(condition):
 def test_an_unknown_condition_is_named():
     view = rendered(town()).render(Pose(DOWN, np.array([0.0, 0.0, 100.0])), CAMERA)
     with pytest.raises(ValueError, match="'hail' is not one of day"):
-        another_visit(view, "hail", np.random.default_rng(1))
+        simulate_visit(view, "hail", np.random.default_rng(1))
 
 
 def test_more_error_or_less_agreement_is_more_risk():

@@ -10,7 +10,7 @@ import pytest
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
 from localizer.registration import JNGO, select_anchors
 from localizer.registration.zoom import focal_gain
-from localizer.tracking.pipeline import only_seen
+from localizer.tracking.pipeline import mask_unseen_features
 from localizer.types import RegistrationStatus
 from tests.localizer.registration.conftest import SyntheticPlace, camera_pose, perturbed
 
@@ -125,7 +125,7 @@ def test_what_a_longer_lens_does_not_show_has_no_vote(jngo, scene_factory, prior
     black = replace(scene.query, levels=tuple(levels))
     begun = prior(scene.reference, 4.0, 5.0)
     raw = jngo.register(black, scene.camera, scene.anchors, begun)
-    found = jngo.register(only_seen(black, seen), scene.camera, scene.anchors, begun)
+    found = jngo.register(mask_unseen_features(black, seen), scene.camera, scene.anchors, begun)
     assert (raw.quality < 0.3, found.quality > 0.9) == (True, True)
     assert found.agreement.patches < raw.agreement.patches
     assert found.agreement.share > 0.9

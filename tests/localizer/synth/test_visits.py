@@ -8,7 +8,7 @@ from localizer.synth.plan.layout import plan_world
 from localizer.synth.plan.plan import WorldPlan
 from localizer.synth.visits.changes import Changes, changed
 from localizer.synth.visits.survey import SurveyErrors
-from localizer.synth.visits.visit import surveyed_and_lived
+from localizer.synth.visits.visit import survey_and_flight_visits
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_a_survey_moves_its_surface_smoothly_and_by_what_is_said() -> None:
 
 
 def test_every_place_is_surveyed_and_lived_in_its_own_way() -> None:
-    pairs = [surveyed_and_lived(WorldConfig(seed, 400.0)) for seed in range(6)]
+    pairs = [survey_and_flight_visits(WorldConfig(seed, 400.0)) for seed in range(6)]
     assert len({survey.survey for survey, _ in pairs}) == 6
     for survey, live in pairs:
         assert survey.changes is None

@@ -12,7 +12,7 @@ from localizer.config import LocalizerConfig
 from localizer.errors import MapLoadingError, OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
-from localizer.tracking.engine_health import HealthBook
+from localizer.tracking.engine_health import HealthCounters
 from localizer.tracking.pipeline import Localizer
 from localizer.types import PosePrior
 
@@ -37,7 +37,7 @@ def test_a_map_that_is_being_loaded_is_told_as_that() -> None:
 
 
 def test_an_engine_says_that_the_map_is_loading():
-    book = HealthBook("", "")
+    book = HealthCounters("", "")
     book.report(MapLoadingError("the map is being loaded"))
     assert book.read(0, "").map_loading
     book.report(OutsideMapError("the view does not meet the map"))

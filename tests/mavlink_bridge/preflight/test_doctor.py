@@ -370,6 +370,7 @@ PX4_GOOD = {
     "COM_POS_FS_EPH": 5.0,
     "GF_MAX_VER_DIST": 120.0,
     "COM_POSCTL_NAVL": 0.0,
+    "EKF2_GPS_CTRL": 6.0,
 }
 
 
@@ -384,6 +385,7 @@ PX4_GOOD = {
         ("EKF2_NOAID_TOUT", 1e7, {"EKF2_NOAID_TOUT"}),
         ("COM_POS_FS_EPH", -1.0, {"COM_POS_FS_EPH"}),
         ("COM_POS_FS_EPH", 50.0, {"COM_POS_FS_EPH"}),
+        ("EKF2_GPS_CTRL", 3.0, {"EKF2_GPS_CTRL"}),
     ],
 )
 def test_what_px4_does_when_vision_ends_is_told_likewise(name, value, told):
@@ -393,6 +395,12 @@ def test_what_px4_does_when_vision_ends_is_told_likewise(name, value, told):
     assert not any(f.required or f.fix is not None for f in findings)
     ends = next(f for f in findings if f.name == "when vision ends")
     assert {1.0: "LAND", 7.0: "7"}.get(value, "altitude mode") in ends.found
+
+
+def test_gnss_beside_the_auxiliary_position_is_not_told() -> None:
+    sensor = config(message="global_position_sensor")
+    findings = check_failsafes(sensor, {**PX4_GOOD, "EKF2_GPS_CTRL": 7.0}.get, px4=True)
+    assert "EKF2_GPS_CTRL" not in {f.name for f in findings}
 
 
 def test_px4_is_asked_for_its_own_failsafes(autopilot, monkeypatch):

@@ -16,6 +16,7 @@ from sitl.embedded.ekf.timesync import JitterCorrection
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import euler
+from sitl.embedded.px4_parameters import Px4Parameters
 from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 
@@ -76,8 +77,8 @@ class Listened(MavlinkServer):
 
 
 class Bench:
-    def __init__(self, parameters: dict[str, float], seed: int = 1) -> None:
-        table = Parameters()
+    def __init__(self, parameters: dict[str, float], seed: int = 1, px4: bool = False) -> None:
+        table = Px4Parameters() if px4 else Parameters()
         for name, value in parameters.items():
             assert table.set(name, value), name
         self.texts: list[tuple[float, str]] = []

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TypeVar
 
 import pytest
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.exceptions import MavsdkError
+from mavsdk.plugins.action import Action
 from mavsdk.plugins.info import Info
 from mavsdk.plugins.mission_raw import MissionItem, MissionRaw
 from mavsdk.plugins.param import Param
-from mavsdk.plugins.telemetry import Telemetry
+from mavsdk.plugins.telemetry import FlightMode, Telemetry
 
 from sitl.geodesy import Location
 from sitl.vehicles.launch import EmbeddedSitl, vision_only_parameters
@@ -22,15 +24,21 @@ HOME = Location(47.397742, 8.545594, 488.0)
 T = TypeVar("T")
 
 
-@pytest.fixture
-def system():
-    with EmbeddedSitl(HOME, 40.0, vision_only_parameters()) as vehicle:
+@contextmanager
+def seen_by_mavsdk(vehicle: EmbeddedSitl) -> Iterator[Any]:
+    with vehicle:
         sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
         sdk.add_any_connection(vehicle.gcs_endpoint.replace("tcp:", "tcpout://"))
         try:
             yield sdk.first_autopilot(60.0)
         finally:
             sdk.destroy()
+
+
+@pytest.fixture
+def system():
+    with seen_by_mavsdk(EmbeddedSitl(HOME, 40.0, vision_only_parameters())) as found:
+        yield found
 
 
 def answer(ask: Callable[[], T]) -> T:
@@ -74,3 +82,23 @@ def test_mavsdk_reads_version_parameters_missions_and_telemetry(system):
         time.sleep(0.1)
     assert telemetry.attitude_euler().yaw_deg == pytest.approx(40.0, abs=5.0)
     assert not telemetry.armed()
+
+
+def test_mavsdk_takes_the_px4_interface_for_px4():
+    """Its modes by PX4's numbers, and integers that travel as bytes; it arms on GNSS in Hold."""
+    with seen_by_mavsdk(EmbeddedSitl(HOME, speedup=10.0, px4=True)) as system:
+        version = answer(Info(system).get_version)
+        assert (version.flight_sw_major, version.flight_sw_minor) == (1, 17)
+        parameters = Param(system)
+        answer(lambda: parameters.set_param_int("EKF2_AGP0_CTRL", 1))
+        assert answer(lambda: parameters.get_param_int("EKF2_AGP0_CTRL")) == 1
+        assert answer(lambda: parameters.get_param_float("EKF2_AGP0_GATE")) == 3.0
+        action, telemetry = Action(system), Telemetry(system)
+        answer(action.hold)
+        deadline = time.monotonic() + 60.0
+        while not telemetry.armed() and time.monotonic() < deadline:
+            with suppress(MavsdkError):
+                action.arm()
+            time.sleep(0.2)
+        assert telemetry.armed()
+        assert telemetry.flight_mode() == FlightMode.HOLD

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
-from localizer.map.fetch.polite import PoliteClient, RequestLimits
+from localizer.map.fetch.polite import HttpClient, RequestLimits
 from localizer.map.fetch.terms import require_allowed
 from tests.localizer.map.fetch.loopback import serving
 
@@ -22,8 +22,8 @@ class Time:
         self.waits.append(seconds)
         self.now += seconds
 
-    def client(self, **manners: float) -> PoliteClient:
-        return PoliteClient(RequestLimits(**manners), self.sleep, lambda: self.now)
+    def client(self, **manners: float) -> HttpClient:
+        return HttpClient(RequestLimits(**manners), self.sleep, lambda: self.now)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.tile import facing_fault, vector_area
+from localizer.map.cache.tile import orientation_fault, vector_area
 from localizer.map.importers.georeference import Georeference
 from localizer.map.importers.gltf import read_gltf
 from localizer.map.importers.height_crs import geo_keys, stated_heights
@@ -204,8 +204,8 @@ def test_a_dense_town_of_towers_is_upright(make):
                 start + np.array([f for a, b, c, d in sides for f in ((a, b, c), (a, c, d))])
             )
     town, triangles = np.concatenate(walls), np.concatenate(ids)
-    assert facing_fault(vector_area(town, triangles)) is None
-    assert facing_fault(vector_area(town[:, [0, 2, 1]] * (1, -1, 1), triangles)) is not None
+    assert orientation_fault(vector_area(town, triangles)) is None
+    assert orientation_fault(vector_area(town[:, [0, 2, 1]] * (1, -1, 1), triangles)) is not None
 
 
 def test_content_beside_its_volume_is_refused_and_what_reaches_out_is_told(tmp_path, content):

@@ -1,6 +1,7 @@
 """A map is examined before it is flown over: each fault is found, and a sound map has none."""
 
 import json
+import math
 import re
 import shutil
 
@@ -196,3 +197,18 @@ def test_a_map_of_colours_has_no_picture(tmp_path, make):
     made = built_from(tmp_path / "b", make, image=plain)
     assert made["without picture"].grade is Grade.BAD
     assert built_from(tmp_path / "c", make)["without picture"].grade is Grade.GOOD
+
+
+def test_a_working_pixel_finer_than_the_detail_is_named_with_the_width_that_is_not(cache):
+    """What benchmarks.real shows of fengyuan at 640 px and NEON at 320: frames are refused."""
+    resolved = cache.manifest.kind.effective_resolution_m
+    half_deg, width = 32.5, 320
+
+    def detail(pixels):
+        pixel_rad = 2 * math.tan(math.radians(half_deg)) / width
+        use = MapUse(resolved / pixels / pixel_rad, pixel_rad, half_deg)
+        return next(f for f in check_map(cache, use).findings if f.name == "imagery detail")
+
+    assert detail(0.9).grade is Grade.GOOD
+    assert detail(1.5).grade is Grade.ADVICE
+    assert "localizer.width to 208," in detail(1.5).words
