@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from localizer.types import Frame, PosePrior, RegistrationStatus
 _PASSES = 3  # the view from a prior that is metres off shows another place
 _STEP_NS = 10_000_000_000  # between frames: no motion model carries from one photo to the next
 _REGION_SIGMAS, _LEAST_REGION_M = 3.0, 30.0
+_HEIGHT_BANDS = 4  # of an unknown height, 15 to 150 m: a middle errs by 1.4 times at most
 _FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
 
 
@@ -116,12 +118,28 @@ class FrameLocalizer:
             None if heading is None else math.radians(heading), prior.height_m,
             prior.height_sigma_m, region,
         )  # fmt: skip
-        found = self._relocalizer().find(query)
+        bands = [(prior.height_m, prior.height_sigma_m)]
+        if not prior.height_known and self._height_m is None:
+            bands = height_bands(prior)
+        tried = (
+            self._relocalizer().find(replace(query, height_m=height_m, height_sigma_m=sigma_m))
+            for height_m, sigma_m in bands
+        )
+        found = max((one for one in tried if one), key=lambda one: one.quality, default=None)
         if found is None:
             return Localized(name, None, searched=True, problem="no place was confirmed")
         if not prior.height_known:
             self._height_m = float(found.world_from_camera.translation[2])
         return Localized(name, found.world_from_camera, found.covariance, found.quality, True, True)
+
+
+def height_bands(prior: FramePrior) -> list[tuple[float, float]]:
+    """Of an unknown height, each with half its range: a search registers its candidates from the
+    middle, and from twice or half the true height that fails.
+    """
+    ground, half = prior.height_m - prior.clearance_m, prior.height_sigma_m
+    edges = np.geomspace(prior.clearance_m - half, prior.clearance_m + half, _HEIGHT_BANDS + 1)
+    return [(ground + (a + b) / 2, (b - a) / 2) for a, b in pairwise(map(float, edges))]
 
 
 def horizontal_m(a: Pose, b: Pose) -> float:

@@ -15,7 +15,7 @@ from companion.errors import ReportError
 from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
-from companion.trial.localize import FrameLocalizer
+from companion.trial.localize import FrameLocalizer, height_bands
 from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
 from companion.trial.run import sampled
@@ -154,6 +154,21 @@ def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(small_assets,
     assert len(priors.priors) == len(names)
     assert sum("24 of them" in note for note in priors.notes) == 1
     assert sampled(kept, priors)[0] is kept
+
+
+def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_assets, tmp_path):
+    """From 82 m, the middle of the whole range, no photo that was taken at 49 m was found."""
+    cache = TileCache.open(small_assets.map_cache)
+    middle = cache.frame.position(np.zeros(3))
+    write_photo(tmp_path / "a.jpg", place=(middle.latitude_deg, middle.longitude_deg, 0.0))
+    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
+    (prior,) = priors_of(flight, cache).priors
+    assert not prior.height_known
+    ground = prior.height_m - prior.clearance_m
+    bands = [(z - ground, sigma) for z, sigma in height_bands(prior)]
+    for true in (15.5, 30.0, 49.0, 100.0, 149.0):
+        ((height, _),) = [(h, s) for h, s in bands if abs(h - true) <= s]
+        assert 2 / 3 < height / true < 3 / 2
 
 
 @pytest.mark.parametrize(("factor", "told"), [(1.0, 0), (0.3048, 1), (0.6, 0)])
