@@ -185,7 +185,7 @@ def test_the_shipped_flights_hold_together() -> None:
     cases = {case.name: case for case in load_loop_cases()}
     assert {"normal-60s", "frozen-hover", "covered-30s", "killed", "other-map"} <= set(cases)
     flown_always = {name for name, case in cases.items() if case.ci}
-    assert flown_always == {"killed-gated", "other-map"}
+    assert flown_always == {"frozen-hover", "killed-gated", "other-map"}
     normal = load_loop_cases(["normal"])
     assert len(normal) >= 6
     assert all(case.name.startswith("normal") for case in normal)
