@@ -200,8 +200,8 @@ def _estimates(trial: Trial) -> ReportTable:
     if bad:
         note += (
             f" Red: by more than {_TILT_DEG:.0f} deg ({3 * _TILT_DEG:.0f} about the axis), "
-            f"{_FOCAL_PERCENT:.0f} % or {_SHIFT_M:.0f} m. deployment.yaml holds the angles and "
-            "the focal length that were found."
+            f"{_FOCAL_PERCENT:.0f} % or {_SHIFT_M:.0f} m. deployment.yaml holds the "
+            "angles that were found."
         )
     return ReportTable(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)
 
