@@ -76,7 +76,7 @@ def longer(camera: Camera, factor: float) -> Camera:
 
 class FocalCorrection:
     """Estimates the zoom table's error from images: the logarithm of true over table focal length.
-    Its sigma is the bound at first, and again after the zoom changes.
+    Its sigma is half the bound at first, and again after the zoom changes.
     """
 
     def __init__(self, bound: float) -> None:

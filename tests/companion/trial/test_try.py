@@ -176,8 +176,10 @@ def test_a_map_with_heights_in_feet_is_named(small_assets, tmp_path, factor, tol
     """By the photos' two heights, whose difference is the ground's below the take-off."""
     cache = TileCache.open(small_assets.map_cache)
     middle = cache.frame.position(np.zeros(3))
+    height_m = Ground(cache).height(0.0, 0.0)
+    assert height_m is not None
     assert cache.manifest.geoid_separation_m is not None
-    ground_m = Ground(cache).height(0.0, 0.0) + middle.height_m - cache.manifest.geoid_separation_m
+    ground_m = height_m + middle.height_m - cache.manifest.geoid_separation_m
     assert ground_m > 250.0  # otherwise feet and metres differ by less than these heights err
     for k in range(4):
         xmp = dji(GpsLatitude=middle.latitude_deg, GpsLongitude=middle.longitude_deg + 1e-5 * k,
