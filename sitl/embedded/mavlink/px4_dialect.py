@@ -17,9 +17,7 @@ from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import TelemetryBuilder
 
 FIRMWARE_VERSION = (1, 17, 0, 255)  # major, minor, patch, FIRMWARE_VERSION_TYPE_OFFICIAL
-_TYPE_QUADROTOR, _AUTOPILOT_PX4 = 2, 12
-_MODE_CUSTOM, _MODE_ARMED = 1, 128
-_STATE_STANDBY, _STATE_ACTIVE = 3, 4
+_AUTOPILOT_PX4 = 12
 _SENSOR_VISION = 1 << 7
 _FLAGS_SHARED = 0x3FF  # ESTIMATOR_STATUS_FLAGS that mean what EKF_STATUS_FLAGS do
 _BYTEWISE, _MAVLINK2 = 16, 8192
@@ -29,6 +27,8 @@ _CAPABILITIES = 4 | 8 | 128 | 256 | _BYTEWISE | _MAVLINK2
 class Px4Telemetry(TelemetryBuilder):
     """HEARTBEAT, ESTIMATOR_STATUS and HIGHRES_IMU instead of ArduPilot's."""
 
+    _autopilot = _AUTOPILOT_PX4
+
     def __init__(self, vehicle: Aircraft) -> None:
         super().__init__(vehicle)
         m = mavlink
@@ -37,16 +37,8 @@ class Px4Telemetry(TelemetryBuilder):
         self._builders[m.MAVLINK_MSG_ID_ESTIMATOR_STATUS] = self._estimator_status
         self._builders[m.MAVLINK_MSG_ID_HIGHRES_IMU] = self._highres_imu
 
-    def _heartbeat(self) -> Any:
-        modes = self._vehicle.modes
-        return mavlink.MAVLink_heartbeat_message(
-            _TYPE_QUADROTOR,
-            _AUTOPILOT_PX4,
-            _MODE_CUSTOM | (_MODE_ARMED if modes.armed else 0),
-            custom_mode(modes.mode),
-            _STATE_ACTIVE if modes.armed else _STATE_STANDBY,
-            3,
-        )
+    def _mode_number(self) -> int:
+        return custom_mode(self._vehicle.modes.mode)
 
     def _sys_status(self) -> Any:
         """PX4 never sets the bit of vision."""

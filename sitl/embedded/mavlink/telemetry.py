@@ -32,6 +32,8 @@ class TelemetryBuilder:
     Above 200 lines: one short method for each of its messages, and their table.
     """
 
+    _autopilot = _AUTOPILOT_ARDUPILOT
+
     def __init__(self, vehicle: Aircraft) -> None:
         self._vehicle = vehicle
         m = mavlink
@@ -90,12 +92,16 @@ class TelemetryBuilder:
         modes = self._vehicle.modes
         return mavlink.MAVLink_heartbeat_message(
             _TYPE_QUADROTOR,
-            _AUTOPILOT_ARDUPILOT,
+            self._autopilot,
             _MODE_CUSTOM | (_MODE_ARMED if modes.armed else 0),
-            int(modes.mode),
+            self._mode_number(),
             _STATE_ACTIVE if modes.armed else _STATE_STANDBY,
             3,
         )
+
+    def _mode_number(self) -> int:
+        """HEARTBEAT's custom_mode."""
+        return int(self._vehicle.modes.mode)
 
     def _sys_status(self) -> Any:
         v = self._vehicle
