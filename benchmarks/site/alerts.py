@@ -24,7 +24,8 @@ identifier. *Fix*: a position from vision; it is sent in mode inject, and in mod
 is enabled. *Still sent* refers to these modes. *Output held*: no position is sent. *Exclude and
 reset*: as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the
 switch to vision do not start; injection that is running continues. The pilot (mode rc) and
-`bridge.injection.force` override it. *Event*: it has no end.
+`bridge.injection.force` override *inhibit* and *not ready*. *Event*: it has no end. PX4 sends
+ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 
 A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
 the shadow check, which compares fixes with the EKF's position on GNSS over two minutes. It becomes

@@ -12,7 +12,7 @@ _BY_HAND = "without GNSS fly in STABILIZE or ALT_HOLD"
 _WAIT = "wait; " + _BY_HAND
 _PARAMETERS = "check the parameters with `companion doctor`"
 _LANDMARKS = "compare the position with landmarks"
-_UNVERIFIED = "fixes are sent although map and calibration were not verified against GNSS"
+_UNVERIFIED = "fixes are sent although map and calibration are not verified against GNSS"
 _MAP = "do not fly on vision: check map, calibration and datum"
 _NONE = "nothing"
 _SENT = "fixes are still sent"
@@ -35,10 +35,12 @@ INJECTION: tuple[AlertSpec, ...] = (
               lead=_NOT_SENT),
     condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
               "mode inject, message external_position_estimate: no fix is sent for 2 s, because "
-              "the autopilot did not accept the command while its EKF used GNSS",
+              "the autopilot has not accepted the command; it is tested while the EKF uses GNSS",
               "the autopilot accepts the command",
-              "this firmware cannot use the command; the EKF receives no position",
-              "set another bridge.injection.message; " + _BY_HAND, lead=_NOT_SENT),
+              "the EKF receives no position; *not asked*: not tested yet; any other answer: this "
+              "firmware cannot use the command",
+              "*not asked*: wait for GNSS; else set another bridge.injection.message; "
+              + _BY_HAND, lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {},
               "a fix is due, the message is relative to the EKF origin, and no GPS_GLOBAL_ORIGIN "
               "was received", "GPS_GLOBAL_ORIGIN is received", "the EKF receives no position",
@@ -56,14 +58,17 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the horizontal sigma of a fix is above 10 m", "it is 10 m or less",
               "the position is too uncertain; the EKF receives none", _WAIT, lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
-              {"degrees": "deg"}, "modes shadow and inject: three of five fixes fail the yaw check",
-              "five fixes in a row pass, within 70 % of the limit",
+              {"degrees": "deg"},
+              "three of five fixes fail the yaw guard: vision's yaw is 3.5 deg off the "
+              "autopilot's, or off the gyros since earlier fixes",
+              "five fixes in a row are within 70 % of the limit",
               "compass, camera mounting or map is rotated; the EKF receives no position",
               "check compass and camera mounting; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.INHIBITED, WARNING, "{alert}", {"alert": A},
               "mode inject: injection has not started, fixes come, and for 10 s an alert that "
               "inhibits is active", "no such alert is active",
-              "injection does not start; the pilot (mode rc) and `force` override this",
+              "injection does not start; the text names the alert; the pilot (mode rc) and "
+              "`force` override it",
               "act on that alert; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.SHADOW_NOT_COMPARED, WARNING, "no fix compared with GNSS", {},
               "no fix of the last two minutes could be compared with GNSS", "a fix is compared",
@@ -95,8 +100,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "geoid, vertical datum or barometer is wrong; nothing is sent", _MAP,
               lead=_NOT_READY),
     condition(A.SHADOW_YAW, WARNING, "yaw differs by {degrees:+.1f} deg", {"degrees": "deg"},
-              "the yaw check blocks (`yaw_mismatch`); only in the shadow check and health.json",
-              "the yaw check no longer blocks",
+              "the yaw guard blocks (`yaw_mismatch`); only in the shadow check and health.json",
+              "the yaw guard no longer blocks",
               "compass or camera mounting is wrong; nothing is sent",
               "check compass and camera mounting", lead=_NOT_READY),
     condition(A.SHADOW_RESTORED, WARNING, "failed before the restart", {},
@@ -104,8 +109,10 @@ INJECTION: tuple[AlertSpec, ...] = (
               "check had failed, at most 10 min ago", "the shadow check passes",
               "the failure is still valid; nothing is sent", _MAP, lead=_NOT_READY),
     event(A.INJECTION_FORCED, WARNING, "injection forced, no shadow check", {},
-          "mode inject: injection starts with bridge.injection.force set, and the shadow check "
-          "has not passed", _UNVERIFIED, "use it in tests only"),
+          "modes inject and rc: injection starts because bridge.injection.force is set; the "
+          "shadow check has not passed in the last 10 min, or an alert inhibits", _UNVERIFIED,
+          f"land if this flight is no test of `force`; else {_LANDMARKS}; remove `force` "
+          "afterwards"),
     event(A.INJECTION_NOT_READY, WARNING, "injecting although not ready", {},
           "mode rc: the pilot enables injection, but the shadow check has not passed in the last "
           "10 min, or an alert inhibits", _UNVERIFIED, _LANDMARKS),
@@ -158,13 +165,15 @@ INJECTION: tuple[AlertSpec, ...] = (
               "act as for `ekf_rejects_vision`; later check VISO_POS_M_NSE and the delay"),
     condition(A.FIXES_LATE, WARNING, "fixes {age_ms:.0f} ms old, delay_ms {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
-              "each of the last 50 fixes (PX4: their median) is over 10 ms older than delay_ms",
+              "each of the last 50 fixes (PX4, unknown firmware: their median) arrived over 10 ms "
+              "older than delay_ms",
               "that age is below 90 % of delay_ms + 10 ms for 15 s",
               f"{_SENT}; the EKF assumes that they are newer than they are",
               "raise delay_ms and the autopilot's delay parameter"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
-              "the median age of the last 50 fixes is above what the firmware can use",
+              "the median age of the last 50 fixes is above what the firmware can use (ArduPilot "
+              "250 ms, PX4 300 ms)",
               "it is below 90 % of the limit for 15 s",
               "fixes are extrapolated by at most 0.5 s and sent; what is older is not sent",
               "use a faster computer or a smaller localizer.width"),
