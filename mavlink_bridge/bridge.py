@@ -87,12 +87,12 @@ class Bridge:
         self._started = self._stopped = False
         self._utc = SteadyUtc()
         self._status = OperatorStatus(self._send_text, on_alert, clock)
-        teller = StatusNotifier(self.report_alert)
+        notifier = StatusNotifier(self.report_alert)
         self._recorder = None
         if config.tlog is not None:
 
             def incomplete(why: str) -> None:
-                teller.report(alert(AlertId.TLOG_INCOMPLETE, why=Name(why)))
+                notifier.report(alert(AlertId.TLOG_INCOMPLETE, why=Name(why)))
 
             self._recorder = TlogRecorder(config.tlog, incomplete)
         self._tracker = VehicleTracker(
@@ -101,7 +101,7 @@ class Bridge:
             config.camera.mount == "fixed",
             (config.camera.gimbal_component, config.camera.gimbal_device),
         )
-        enable = _enable(config, teller)
+        enable = _enable(config, notifier)
         self._shared = shared = Shared(
             config,
             geoid_separation_m,
@@ -423,12 +423,12 @@ class _LinkMaker:
         return Link(Endpoint.parse(connection), handler, options)
 
 
-def _enable(config: BridgeConfig, teller: StatusNotifier) -> InjectionEnable | None:
+def _enable(config: BridgeConfig, notifier: StatusNotifier) -> InjectionEnable | None:
     if config.mode != "rc":
         return None
     file = config.state_file
     memory = None if file is None else InjectionEnableMemory(RestartMemory(file))
-    return InjectionEnable(config.rc, teller.report, memory)
+    return InjectionEnable(config.rc, notifier.report, memory)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

@@ -95,7 +95,7 @@ class GnssReturnCheck:
         if state.gps_time_ns - last_ns > _GAP_NS:
             self._reports.clear()
         self._add(state, vision)
-        self._judge()
+        self._decide()
 
     def _add(self, state: VehicleState, vision: PropagatedFix) -> None:
         latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
@@ -121,7 +121,7 @@ class GnssReturnCheck:
         while state.gps_time_ns - self._reports[0].time_ns > _WINDOW_NS:
             self._reports.popleft()
 
-    def _judge(self) -> None:
+    def _decide(self) -> None:
         span_ns = self._reports[-1].time_ns - self._reports[0].time_ns
         if len(self._reports) < _REPORTS or span_ns < _REFUSED_NS:
             return

@@ -73,7 +73,7 @@ class RelocalizationHypothesis:
     found: Relocalization
     reach: SearchRegion | None = None
 
-    def followed(
+    def predicted_query(
         self, query: PlaceQuery, velocity: Array | None, reach: SearchRegion | None
     ) -> PlaceQuery | None:
         """A later frame's query, limited to where the camera can be; None after too long.
@@ -223,18 +223,18 @@ class PlaceSearch:
             return None
         seen, self._sighting = self._sighting, None
         velocity, about = self._autopilot.velocity, self._reach(frame.exposure_time_ns)
-        followed = seen.followed(query, velocity, about) if seen is not None else None
+        predicted = seen.predicted_query(query, velocity, about) if seen is not None else None
         began = self._clock()
-        found = self._open.relocalizer.find(followed or _on_plane(query), should_stop)
+        found = self._open.relocalizer.find(predicted or _on_plane(query), should_stop)
         if found is None:
             return None
         seconds = self._clock() - began
-        if followed is None and seconds * _speed_sigma(velocity) > _STALE_M:
+        if predicted is None and seconds * _speed_sigma(velocity) > _STALE_M:
             self._sighting = RelocalizationHypothesis(query, found, about)
             self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
             return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")
-        if velocity is None and followed is not None and seen is not None:
+        if velocity is None and predicted is not None and seen is not None:
             velocity = seen.velocity_to(found)
         least = np.repeat([_PLACE_SIGMA_M, _PLACE_SIGMA_RAD], 3) ** 2
         return PosePrior(

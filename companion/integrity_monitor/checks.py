@@ -155,7 +155,7 @@ class IntegrityChecks:
 
     # --- evidence -----------------------------------------------------------------------------
 
-    def see(self, time_ns: int, image: Image) -> None:
+    def add_frame(self, time_ns: int, image: Image) -> None:
         """Add a frame (H, W, 3) uint8 at its exposure time."""
         if self._picture is not None and time_ns <= self._picture[0]:
             self._backwards += 1
@@ -219,7 +219,7 @@ class IntegrityChecks:
         """Run all checks, a few times a second; returns the alerts to report."""
         state = vehicle.state()
         self._track.follow(vehicle)
-        self._jumps.hear(state)
+        self._jumps.add_state(state)
         self._follow(now_ns, state)
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)

@@ -129,7 +129,7 @@ class JumpCheck:
         again from here on.
         """
 
-    def hear(self, state: VehicleState) -> None:
+    def add_state(self, state: VehicleState) -> None:
         """Update with the vehicle's state, a few times a second, with or without fixes."""
         self._reckoning.add(state)
 

@@ -51,7 +51,9 @@ _LEFT, _LEAVES_MPS = 0.5, 5.0  # the chance that it left then, and how fast, axi
 _GROUND_EVERY = 3  # so many of the kept pictures show the ground well enough
 _LOST_S = 4.0
 _SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
-_SAID_NS = 10_000_000_000  # one of all targets in so long: a flood of texts hides the others
+_REPORT_AGAIN_NS = (
+    10_000_000_000  # one of all targets in so long: a flood of texts hides the others
+)
 _LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
 _BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
 _BACK_GAP_S = 0.5
@@ -99,7 +101,7 @@ class TargetEstimate:
 @dataclass
 class _TargetState:
     track: TargetTrack
-    told_ns: int
+    reported_ns: int
     is_clicked: bool
     seen_ns: int
     """When it was last in the picture."""
@@ -118,7 +120,7 @@ class _TargetState:
     """Since when a standing one has not looked as it did, though nothing hides it; 0: it does."""
     changed_ns: int = 0
     """Since when it may have left, as the operator was told; 0: it has not."""
-    is_slide_said: bool = False
+    is_slide_reported: bool = False
     leaving: tuple[tuple[int, Array], ...] = ()
     """When and where (3,) it seemed to have left its place, the newest few."""
 
@@ -172,7 +174,7 @@ class TargetManager:
         self._pictures = RecentPictures[tuple[PoseEstimate, Gray]](
             _PICTURES, lambda picture: picture[1].nbytes
         )
-        self._silence_said_ns = -_SAID_NS
+        self._silence_reported_ns = -_REPORT_AGAIN_NS
         self.missed = 0
         self.doubted = 0
         self.refused = 0
@@ -220,9 +222,9 @@ class TargetManager:
             self._lives[name] = life
         life.seen_ns = time_ns
         if fix is None:
-            self._doubt(name, life, time_ns)
+            self._count_refusal(name, life, time_ns)
             return
-        life.told_ns, life.refused_ns = time_ns, 0
+        life.reported_ns, life.refused_ns = time_ns, 0
         self._report(life, fix, estimate)
 
     def look(self, estimate: PoseEstimate, gray: Gray) -> None:
@@ -240,9 +242,9 @@ class TargetManager:
             fix = life.track.hold(estimate)
             if fix is None:
                 continue
-            life.told_ns = time_ns
+            life.reported_ns = time_ns
             if life.changed_ns:
-                fix = self._doubted(life, fix, self._config.max_sigma_m)
+                fix = self._with_departure(life, fix, self._config.max_sigma_m)
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
@@ -307,7 +309,7 @@ class TargetManager:
         elif since_s > _MISSED_S and self._is_gone(name, life, follower, estimate, gray):
             return
         if fix is not None and self._is_due(life, time_ns):
-            life.told_ns = time_ns
+            life.reported_ns = time_ns
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
             self._report_alert(
@@ -375,9 +377,9 @@ class TargetManager:
         if follower.is_changed and not life.changed_ns:
             life.changed_ns = life.found_ns
             self._report_alert(alert(AlertId.TARGET_MAY_HAVE_LEFT, number=number))
-        elif not life.is_slide_said and not life.changed_ns:
+        elif not life.is_slide_reported and not life.changed_ns:
             # The view of what is not flat changes by and by: its place is as good as before.
-            life.is_slide_said = True
+            life.is_slide_reported = True
             self._report_alert(alert(AlertId.TARGET_HELD, number=number))
         return False
 
@@ -409,7 +411,7 @@ class TargetManager:
             self._report_alert(alert(AlertId.TARGET_BACK, number=_number(name)))
 
     @staticmethod
-    def _doubted(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
+    def _with_departure(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
         """A held place whose target may have left it: nothing of it is seen, and it may be as far
         away as it has driven since.
         """
@@ -523,15 +525,15 @@ class TargetManager:
         self._tell(TargetEstimate(fix, estimate))
 
     def _is_due(self, life: _TargetState, time_ns: int) -> bool:
-        return time_ns - life.told_ns >= self._period_ns(life)
+        return time_ns - life.reported_ns >= self._period_ns(life)
 
     def _period_ns(self, life: _TargetState) -> float:
         """Between two reports; at most 0.2 s until the first one is confirmed."""
         # 0.9: frames do not fall on the period exactly.
         wanted = 0.9e9 / self._config.rate_hz
-        return wanted if life.told_ns else min(wanted, _CONFIRMS_NS)
+        return wanted if life.reported_ns else min(wanted, _CONFIRMS_NS)
 
-    def _doubt(self, name: str, life: _TargetState, time_ns: int) -> None:
+    def _count_refusal(self, name: str, life: _TargetState, time_ns: int) -> None:
         """Count what is not told, and why; the operator hears of one that he was told before."""
         reason = _reason(life.track)
         if reason is RefusalReason.NO_MAP:
@@ -543,9 +545,9 @@ class TargetManager:
         if life.refusals == 1:
             _log.warning("target %s is not reported: %s", name, life.track.refusal)
         life.refused_ns = life.refused_ns or time_ns
-        is_silent = life.told_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
-        if is_silent and time_ns - self._silence_said_ns >= _SAID_NS:
-            self._silence_said_ns = time_ns
+        is_silent = life.reported_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
+        if is_silent and time_ns - self._silence_reported_ns >= _REPORT_AGAIN_NS:
+            self._silence_reported_ns = time_ns
             self._report_alert(
                 alert(AlertId.TARGET_SILENT, name=Name(name), why=Name(str(life.track.refusal)))
             )

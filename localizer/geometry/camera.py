@@ -230,7 +230,7 @@ def lens_fault(camera: Camera) -> str:
     return lens.fault(size, camera.rays, camera.project) if camera.is_distorted else ""
 
 
-def followed(pinhole: Camera, camera: Camera) -> Camera:
+def with_field_of_view(pinhole: Camera, camera: Camera) -> Camera:
     """The pinhole with the field of view of a (distorted, possibly zoomed) camera, at the pinhole's
     size; unchanged if the camera is the one it was made for.
     """

@@ -26,14 +26,14 @@ def carried(covariance: Array, lever: Array) -> Array:
     return moved
 
 
-def walked(model: GrowthModel, way_m: float) -> Array:
+def distance_covariance(model: GrowthModel, way_m: float) -> Array:
     """Covariance (6, 6) that `way_m` metres of flight add beyond the registrations'."""
     rates = np.array([model.horizontal, model.horizontal, model.vertical,
                       model.tilt, model.tilt, model.heading])  # fmt: skip
     return np.diag(rates**2 * max(way_m, 0.0))
 
 
-def stretched(known: Array, scale: float, displacement: Array) -> Array:
+def add_scale_error(known: Array, scale: float, displacement: Array) -> Array:
     """Covariance (3, 3) of position from scale errors, after another displacement (3,).
 
     scale: relative sigma. The correlation between two stretches of ground is unknown, so the sum is
@@ -49,7 +49,7 @@ def stretched(known: Array, scale: float, displacement: Array) -> Array:
     return total
 
 
-def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
+def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
     """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis.
 
     The sensor's error is constant over frames and does not average out. So a variance P larger than
@@ -75,7 +75,7 @@ def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> t
     return Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]), covariance
 
 
-def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
+def kalman_update(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
     """The pose after an independent measurement of single axes: a Kalman update.
 
     Correlated axes are corrected, too: a better rotation also corrects the position. covariance:

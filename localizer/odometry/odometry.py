@@ -28,9 +28,9 @@ from localizer.odometry.track import (
     OdometryTrack,
     aided_rotation,
     fault,
-    followed,
     growth_of,
     seconds,
+    track_after,
 )
 from localizer.registration.anchors import swept
 from localizer.registration.jngo import JNGO
@@ -167,7 +167,7 @@ class VisualOdometry:
         if reason := fault(self.config, result, prior):
             return self._failed(OdometryStatus.NOT_REGISTERED, reason, frame, prior, keyframe)
         sensed = (constraint, beginning.corrected(constraint))
-        after = followed(self.config, track, keyframe, result, frame.time_ns, sensed)
+        after = track_after(self.config, track, keyframe, result, frame.time_ns, sensed)
         if clearance_m is not None:
             self._sounded.add(frame.time_ns, float(after.pose.translation[2]) - clearance_m)
         spent = self._is_spent(keyframe, result, after)
@@ -208,7 +208,9 @@ class VisualOdometry:
         source = below if source is DepthSource.GROUND else source
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None
-        before = np.zeros((3, 3)) if self._keyframe is None else self._keyframe.stretched_to(pose)
+        before = (
+            np.zeros((3, 3)) if self._keyframe is None else self._keyframe.scale_covariance_at(pose)
+        )
         place = covariance[:3, :3] + before
         scale = self._scale_sigma(source, anchors.points_world, pose.translation, place)
         return Keyframe(
@@ -312,7 +314,7 @@ class VisualOdometry:
         assert self._beginning is not None
         begun = self._beginning
         covariance = track.covariance + np.diag([track.unmatched_m2] * 2 + [0.0] * 4)
-        covariance[:3, :3] += keyframe.stretched_to(pose)
+        covariance[:3, :3] += keyframe.scale_covariance_at(pose)
         known = carried(begun.covariance, pose.translation - begun.pose.translation)
         added = np.linalg.eigvalsh((covariance - known)[:2, :2])[-1]
         return OdometryEstimate(

@@ -31,7 +31,7 @@ def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
         return NumbaBackend(threads)
     try:
         backend = CudaBackend(Device())
-        trial(backend, _TRIAL_CHANNELS)
+        warm_up(backend, _TRIAL_CHANNELS)
     except CudaUnavailableError as error:
         return _on_the_cpu(error, logging.INFO if device == "auto" else logging.WARNING, threads)
     except BackendError as error:
@@ -45,7 +45,7 @@ def _on_the_cpu(error: BackendError, level: int, threads: int) -> Backend:
     return NumbaBackend(threads)
 
 
-def trial(backend: Backend, channels: int) -> None:
+def warm_up(backend: Backend, channels: int) -> None:
     """Run one step on a small random problem, to compile or load the kernels."""
     rng = np.random.default_rng(0)
     problem = LevelProblem(

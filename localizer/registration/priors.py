@@ -107,13 +107,13 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
     return rows, rows @ difference
 
 
-def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
+def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
     """The pose after a constraint of another sensor was applied.
 
     covariance: (6, 6). The sensor's error (mounting, gimbal, air pressure) is constant over frames
     and does not average out. So along each principal direction a variance P larger than the
     sensor's R becomes R, by an update with the noise ``R P / (P - R)``; a smaller one is unchanged.
-    `odometry.growth.fused` follows the same rule.
+    `odometry.growth.fuse` follows the same rule.
     """
     rows, values = constraint_rows(constraint, pose)
     known = rows @ covariance @ rows.T

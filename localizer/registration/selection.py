@@ -31,7 +31,7 @@ def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> A
     return probabilities
 
 
-def thinned(problem: LevelProblem, count: int) -> LevelProblem:
+def subsample_anchors(problem: LevelProblem, count: int) -> LevelProblem:
     """The problem with about `count` of its anchors, evenly spread (every k-th in Morton order)."""
     step = problem.points.shape[1] // max(count, 1)
     if step < 2:
@@ -44,7 +44,7 @@ def thinned(problem: LevelProblem, count: int) -> LevelProblem:
     )
 
 
-def distinct(
+def suppress_duplicates(
     problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
 ) -> NDArray[np.int64]:
     """Indices of finite hypotheses, best first, without near copies of better ones.

@@ -20,7 +20,7 @@ from localizer.targets.foreground import (
     AppearanceCoverage,
     TargetAppearance,
     covered,
-    is_distinct,
+    is_detectable,
     is_ground,
 )
 from localizer.targets.standing import StaticAppearance
@@ -170,7 +170,7 @@ class ImageFollower:
                 look = self._look(template, -angle)
                 if (best is not None and best.share >= _SURE) or look is None:
                     break
-                can_tell = can_tell or is_distinct(ground, look)
+                can_tell = can_tell or is_detectable(ground, look)
                 one = covered(chart, ground, look, _ASIDE if was_hidden else 0.0)
                 if one is not None and _is_better(one, best):
                     best, turn = one, angle

@@ -69,7 +69,7 @@ class AppearanceCoverage:
     evidence: float
 
 
-def is_distinct(ground: Grey, look: TargetAppearance) -> bool:
+def is_detectable(ground: Grey, look: TargetAppearance) -> bool:
     """Whether the target differs enough from the ground (both square) to be detected."""
     side, size = len(look.grey), len(ground)
     k = (size - side) // 2
@@ -81,7 +81,7 @@ def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
     """Whether a chart shows the ground and nothing of the target, although the two differ. All are
     of one size.
     """
-    if not is_distinct(ground, look):
+    if not is_detectable(ground, look):
         return False
     level = np.float32(np.median(chart - ground))
     share, _, whole = _evidence(chart, ground + level, look.grey, look.inside)

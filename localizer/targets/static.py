@@ -173,7 +173,7 @@ class StaticTarget:
                 return
         self._views.append(view)
         if len(self._views) > _MOST_VIEWS:
-            self._views = thinned(self._views)
+            self._views = every_second(self._views)
 
     def _meet(self, surfaces: tuple[TargetSurface, ...]) -> None:
         """Each surface on which a hypothesis lies is its plane from now on, or begins another.
@@ -220,7 +220,7 @@ class StaticTarget:
         self._hypotheses = kept
 
 
-def thinned(views: Sequence[_Item]) -> list[_Item]:
+def every_second(views: Sequence[_Item]) -> list[_Item]:
     """Every second item, always with the newest and the first."""
     return [views[0], *views[:0:-2][::-1]]
 

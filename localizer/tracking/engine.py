@@ -91,7 +91,7 @@ class DualThreadEngine:
         self._reference_ms: dict[str, float] = {}
         self._book = HealthCounters(localizer.renderer_name, localizer.features_name)
         self._stop = threading.Event()
-        self._turns: dict[str, int] = {}
+        self._last_ticks: dict[str, int] = {}
         self._threads = [
             self._thread("render", self._render_once),
             self._thread("extract", self._extract_once),
@@ -136,7 +136,7 @@ class DualThreadEngine:
 
     def last_ticks_ns(self) -> dict[str, int]:
         """Start of each thread's newest cycle, CLOCK_MONOTONIC ns, by name."""
-        return {n: self._turns[n] for n in _FIX_THREADS if n in self._turns}
+        return {n: self._last_ticks[n] for n in _FIX_THREADS if n in self._last_ticks}
 
     def _thread(self, name: str, once: Callable[[], None]) -> threading.Thread:
         # A daemon: one that hangs must not keep the process from ending. All, the search too, are
@@ -148,7 +148,7 @@ class DualThreadEngine:
     def _run(self, once: Callable[[], None]) -> None:
         name = threading.current_thread().name
         while not self._stop.is_set():
-            self._turns[name] = time.monotonic_ns()
+            self._last_ticks[name] = time.monotonic_ns()
             try:
                 once()
             except LocalizerError as error:

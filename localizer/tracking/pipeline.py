@@ -24,7 +24,7 @@ from localizer.errors import (
     OutsideMapError,
 )
 from localizer.features.extractor import FeatureExtractor
-from localizer.geometry.camera import Camera, followed
+from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import LocalFrame
 from localizer.map.kind import MapKind
 from localizer.odometry import GroundUncertainty, TerrainModel
@@ -304,7 +304,7 @@ class Localizer:
         """
         stage_ms: dict[str, float] = {}
         features: FeaturePyramid | None = None
-        self.camera = followed(self._pinhole, frame.camera)
+        self.camera = with_field_of_view(self._pinhole, frame.camera)
         for remaining in range(passes - 1, -1, -1):
             prior = self.predict(frame.exposure_time_ns)
             if prior is None:
@@ -378,7 +378,7 @@ class Localizer:
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
         """Features of the frame. They do not need the reference, so this may run in parallel."""
-        undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
+        undistorter, camera = self._undistorter, with_field_of_view(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
@@ -397,7 +397,7 @@ class Localizer:
         if ahead is None:
             raise OutsideMapError(_NO_PRIOR)
         stage_ms: dict[str, float] = {}
-        camera = followed(self._pinhole, frame.camera)
+        camera = with_field_of_view(self._pinhole, frame.camera)
         result, image, sweep = None, None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
@@ -414,7 +414,7 @@ class Localizer:
                 if seen.track_status.tentative and not seen.track_status.independent:
                     image = self._optimizer.focal_tested(query, camera, seen_anchors, image)
                 result = self._fusion.fuse(image, frame.exposure_time_ns)
-        estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
+        estimate = self._tracker.update(seen, ahead, frame, query, anchors, result)
         if anchors is not None and image is not None and estimate.status is RegistrationStatus.OK:
             # Added to what is reported, not to what is filtered: the next frame has the same error.
             moving = (ahead.velocity, ahead.rate)

@@ -20,7 +20,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.integrity.height_error import MapHeightError, height_likelihood
 from localizer.integrity.patch_covariance import patch_covariance
 from localizer.map.kind import MapKind
-from localizer.registration.priors import PoseConstraint, combine, fused, height_constraint
+from localizer.registration.priors import PoseConstraint, combine, fuse, height_constraint
 from localizer.registration.result import Registration
 from localizer.tracking.attitude_bias import (
     AttitudeBiasEstimator,
@@ -71,7 +71,7 @@ def fused_registration(
         return FusedRegistration(result)
     pose, covariance, contradicted = result.world_from_camera, result.covariance, False
     for known in constraints:
-        found = fused(pose, covariance, known)
+        found = fuse(pose, covariance, known)
         if found.innovation_squared > CONTRADICTS**2:
             contradicted = True
             continue

@@ -25,7 +25,7 @@ _SEES = (TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.BRIDGING)
 
 @dataclass(frozen=True)
 class TrackStatus:
-    """State of the machine: immutable, `judge` returns the next one.
+    """State of the machine: immutable, `next_status` returns the next one.
 
     tentative: the position was proposed, and counts only once it is confirmed. tentative_track: the
     acceptances there. independent: of the newest proposal, see `TentativeTrack`. last_fix_ns:
@@ -82,7 +82,7 @@ class RegistrationOutcome:
 _NO_EVIDENCE = IndependentEvidence()
 
 
-def judge(
+def next_status(
     track_status: TrackStatus,
     config: IntegrityConfig,
     outcome: RegistrationOutcome,

@@ -16,7 +16,7 @@ from localizer.tracking.dead_reckoning import DeadReckoning, PropagatedPose, Pro
 from localizer.tracking.motion import AuxiliarySensors, MeasuredMotion, MotionState
 from localizer.tracking.rejoining import Rejoining
 from localizer.tracking.sensor_fusion import FusedRegistration
-from localizer.tracking.states import RegistrationOutcome, TrackStatus, judge
+from localizer.tracking.states import RegistrationOutcome, TrackStatus, next_status
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -99,7 +99,7 @@ class Tracker:
         """The camera's motion while the frame is read out. ahead: the motion at its exposure."""
         return self._motion.sweep(ahead, frame.camera.readout_ms)
 
-    def judge(
+    def update(
         self,
         seen: TrackerState,
         ahead: MotionState,
@@ -130,7 +130,7 @@ class Tracker:
             result is not None or carried.status is not PropagationResult.NONE,
         )  # fmt: skip
         evidence = self._evidence(seen.track_status, outcome)
-        track_status = judge(seen.track_status, self._config.integrity, outcome, evidence)
+        track_status = next_status(seen.track_status, self._config.integrity, outcome, evidence)
         bridges = track_status.state is TrackingState.BRIDGING
         lost = track_status.state is TrackingState.LOST
         moved = self._next_motion(ahead, result, acceptable and not bridges, carried, lost)

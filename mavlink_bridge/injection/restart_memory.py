@@ -74,7 +74,7 @@ class RestartMemory:
             return None
         return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
 
-    def keep(self, told: dict[str, Any]) -> None:
+    def store(self, told: dict[str, Any]) -> None:
         """Store this state from now on."""
         self._in_use = True
         self._told = told
@@ -150,7 +150,7 @@ class InjectionEnableMemory:
 
     def opened(self, *, by_channel: bool) -> None:
         """Injection is enabled from now on."""
-        self._memory.keep({"open": True, "by_channel": by_channel})
+        self._memory.store({"open": True, "by_channel": by_channel})
 
     def closed(self) -> None:
         """Injection is disabled from now on."""
@@ -183,7 +183,7 @@ class ShadowFailureMemory:
             return
         self._kept = against
         if against:
-            self._memory.keep({"against": True})
+            self._memory.store({"against": True})
         else:
             self._memory.drop()
 
