@@ -66,7 +66,7 @@ def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
 class FlightControllerEnd:
     """Runs in the flight-controller link's thread; only `sender.put` is called from others.
 
-    Above 200 lines: it hands each message and each turn of the clock to one of a dozen parts.
+    Above 200 lines: it passes each message and each clock tick to one of a dozen components.
     """
 
     def __init__(self, shared: Shared) -> None:

@@ -58,8 +58,9 @@ class _Report:
 class GnssReturnCheck:
     """Compares the receiver with vision and with the inertial motion over some seconds.
 
-    It is accepted after 5 s in which it is near vision, keeps still against vision and the EKF's
-    velocity, scatters no more than it claims and claims enough. One thread.
+    The receiver is accepted after 5 s in which four conditions hold: it is near vision, it does not
+    drift against vision and the EKF's velocity, it scatters no more than its stated accuracy, and
+    this accuracy is 5 m or better. One thread.
     """
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ class Hysteresis:
     """Decides when a problem is over: after some time without it, and later after each relapse.
 
     On an overloaded computer problems come and go every second. A relapse soon after the end
-    doubles the wait. What recurs during the wait is the same problem, which was reported.
+    doubles the wait. A problem that recurs during the wait is not reported again.
     """
 
     def __init__(self, wait_s: float = 1.5, longest_s: float = 60.0) -> None:

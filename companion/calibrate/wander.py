@@ -68,7 +68,9 @@ class GaussMarkovProcess:
         return cls(sigmas, memories)
 
     def over_long_steps(self, left: Array, times_s: Array) -> GaussMarkovProcess:
-        """The same correlation times, with sigmas not smaller than steps over `_LONG_STEP_S` show.
+        """The same correlation times, with sigmas that are at least those of steps over
+        `_LONG_STEP_S`.
+
         An EKF smooths its receiver's errors from frame to frame, so short steps underestimate its
         drift. left: residuals (K, 3).
         """

@@ -78,8 +78,8 @@ class MapOffset:
 def estimate(blocks: Array, bias_m: float) -> MapOffset:
     """Estimate the offset from blocks (N, 2) of median differences, north and east, metres.
 
-    Blocks beyond three robust sigmas of the median are left out. bias_m: sigma of GNSS's own
-    error, per axis, which no averaging takes away.
+    Blocks more than three robust sigmas from the median are left out. bias_m: sigma of GNSS's own
+    error, per axis; averaging does not reduce it.
     """
     middle = np.median(blocks, axis=0)
     spread = 1.4826 * np.median(np.abs(blocks - middle), axis=0)

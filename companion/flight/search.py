@@ -78,7 +78,8 @@ class RelocalizationHypothesis:
     ) -> PlaceQuery | None:
         """A later frame's query, limited to where the camera can be; None after too long.
 
-        velocity: (3,) m/s in the map's axes by the EKF, None where it knows none; reach: as then.
+        velocity: (3,) m/s in the map's axes, of the EKF, None if unknown; reach: the reachable
+        region at the time of the later frame.
         """
         elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
         if not 0.0 < elapsed_s <= _LONGEST_S:

@@ -23,7 +23,7 @@ def ready(
 ) -> Companion | None:
     """Return the flight process: at once, or when the standby is released; None if it never is.
 
-    pulse, restart, lost_settings: see `Companion`; a standby always is a restart.
+    pulse, restart, lost_settings: see `Companion`. For a standby, restart is always true.
     """
     companion = Companion(
         config, pulse=pulse, restart=restart or standby, lost_settings=lost_settings

@@ -102,10 +102,10 @@ class UdpAddress:
 class SenderLock:
     """Accepts the datagrams of one sender: the configured one or the first one.
 
-    A sender that is followed is kept for good once a picture of it was decoded. It may come back
-    from another port (a camera that restarts takes a new one) after `quiet_ns` of silence, and
-    never from another address. Before its first picture, a first sender that gives none makes room
-    after 6 s: a stray packet must not lock the camera out.
+    Once a frame of the sender was decoded, its address stays locked. The sender may change its port
+    after `quiet_ns` of silence, as a camera does that restarts. If no frame of the first sender is
+    decoded within 6 s, another sender may replace it, so that a stray packet does not lock the
+    camera out.
 
     only: HOST or HOST:PORT, a numeric address; None: the first.
     """

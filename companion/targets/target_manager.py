@@ -67,9 +67,9 @@ def _off(a: Array, b: Array) -> float:
 
 @dataclass(frozen=True)
 class Click:
-    """A click of the operator. estimate: of the frame that he saw; pixel: in it; around: the
-    estimates one sigma of his delay before and after, if known; extent: width and height of his
-    rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
+    """A click of the operator. estimate: pose of the frame that was clicked; pixel: the clicked
+    point; around: poses one sigma of the operator's delay before and after the frame, if known;
+    extent: width and height of the rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
     """
 
     number: int
@@ -385,8 +385,9 @@ class TargetManager:
 
     @staticmethod
     def _drives(life: _TargetState, left: FollowedPosition, place: Array, time_ns: int) -> bool:
-        """Whether what seems to have left its place (3,) does so at one speed, in one frame after
-        the other. Some look of a roof's corner or of a pitch's lines is elsewhere in single frames.
+        """Whether successive matches away from the target's place (3,) move at a constant speed.
+
+        A match in a single frame may be a similar corner of a roof or line of a sports field.
         """
         kept = [seen for seen in life.leaving if time_ns - seen[0] <= _DEPARTS_S * 1e9]
         life.leaving = (*kept[1 - _LEAVES_IN :], (time_ns, left.position))

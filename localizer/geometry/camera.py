@@ -72,7 +72,7 @@ class Camera:
         """Camera of width, height, fx, fy, cx, cy and optional ``distortion``, ``distortion_model``
         and ``readout_ms``, or of other programs' keys (`localizer.geometry.camera_file`).
 
-        `CameraError` for a lens that is not read, and for one that cannot be.
+        `CameraError` for a distortion model that is not supported, and for impossible values.
         """
         try:
             camera = cls(**camera_numbers(data))

@@ -24,9 +24,10 @@ _LEAST_ABOVE_M = 1.0
 class GroundUncertainty:
     """Uncertainty of the ground height that odometry assumes, 1 sigma.
 
-    grade: m for each metre from where the ground was last known (`localizer.map.relief`); of hills,
-    where nothing is known. missing_m: mean height of what the map lacks. model_m: a terrain model's
-    own error: Copernicus states 2 m between neighbouring places in 90 % of cases.
+    grade: growth of the height error, m per metre of distance from known ground
+    (`localizer.map.relief`); the default is that of hills. missing_m: mean height of objects that
+    the map lacks. model_m: a terrain model's own error: Copernicus states 2 m between neighbouring
+    places in 90 % of cases.
     """
 
     grade: float = 0.1

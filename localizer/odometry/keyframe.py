@@ -76,10 +76,9 @@ def keyframe_anchors(
 ) -> tuple[Anchors, DepthSource]:
     """Anchors of an earlier frame, at most about `count`.
 
-    surface: points (N, 3) on the map's surfaces, off their edges, as seen from about here: the
-    anchors of the map view that was rendered for this frame. Nothing is rendered again, and their
-    picture plays no part. ground: gives points where the map has none. Without either there are
-    no anchors. sweep: of the picture, see `OdometryFrame`.
+    surface: points (N, 3) on the map's surfaces, away from edges: the anchors of the map view that
+    was rendered for this frame. ground: gives points where the map has none. Without both there
+    are no anchors. sweep: the camera's motion during the exposure, see `OdometryFrame`.
     """
     _require_host(features)
     rng = np.random.default_rng(seed)

@@ -331,8 +331,7 @@ class VisualOdometry:
 def odometry_optimizer(optimizer: JNGO, threads: int = 2) -> JNGO:
     """The map registration's optimizer, set up for odometry; it shares the backend.
 
-    Two pictures of one flight see the same things, so the map's own error is no part of the
-    covariance.
+    Two frames of one flight show the same objects, so the covariance contains no error of the map.
     """
     config = replace(optimizer.config, map_error_m2=0.0)
     return JNGO(config, optimizer.backend, threads)

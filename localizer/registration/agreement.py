@@ -39,10 +39,10 @@ _RAYLEIGH = 1.1774  # median length of a vector of two independent errors, in th
 class PatchDisplacements:
     """Shifts under which the P patches of an image match best at a registered pose.
 
-    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) level px by a pose
-    difference (position and left rotation vector, world axes, as `PosePrior`). rise: (P, 2) level
-    px by a metre that the patch's ground is higher than the map says. ground: (P, 2) east and north
-    of the patch, m.
+    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) derivative of the shift
+    by the pose (position and left rotation vector, world axes, as `PosePrior`), level px. rise: (P,
+    2) derivative of the shift by the height of the patch's ground above the map, level px per
+    metre. ground: (P, 2) east and north of the patch, m.
     """
 
     shift: Array

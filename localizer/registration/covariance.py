@@ -180,9 +180,9 @@ def sandwich_covariance(
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
-    The sandwich of equation 11 takes the residuals' variance, and their correlation between
-    channels and within a cell of the image, from the data. A prior of weight `prior_weight` adds
-    its own noise.
+    It is the sandwich estimator of equation 11. Variance and correlation of the residuals, between
+    channels and within an image cell, come from the data. A prior adds noise of its own, by its
+    weight `prior_weight`.
     """
     inverse = _inverse(sums.curvature * sums.hessian + sums.prior_hessian)
     if inverse is None or sums.cells <= 6:

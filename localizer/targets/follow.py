@@ -151,10 +151,11 @@ class ImageFollower:
         *,
         was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:
-        """Returns (whether these images can decide, the target). As `find`, for an isolated target,
-        compared with `pictures` of the same ground without it, so that road markings and shadows
-        are not mistaken for it. They cannot decide if it looks like the ground or is in all of
-        them.
+        """As `find`, for an isolated target: compares it with `pictures` of the same ground without
+        it, so that road markings and shadows are not mistaken for it.
+
+        Returns whether the images can decide, and the target. They cannot decide if the target
+        looks like the ground, or is in all images.
         """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)

@@ -117,10 +117,10 @@ class LastPlace:
 
 
 def is_near_map_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
-    """Whether a ray passes through or near a hole of the map or its edge, so that it hits ground
+    """Whether a ray passes through or near a hole or the edge of the map, so that it hits ground
     behind. eye, direction: (3,); distance: metres to its hit.
 
-    A hole shows as nothing at all, or as a place much farther away than all that is about it.
+    A ray in a hole hits nothing, or hits at a much larger distance than its neighbours.
     """
     sideways = np.linalg.svd(direction[None, :])[2][1:]
     rings = np.concatenate([_NEAR_M * _RING, _ABOUT_M * _RING])

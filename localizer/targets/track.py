@@ -280,8 +280,8 @@ def _aim(
 def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
     """Pixel of a world point (3,) in a frame; None outside the image.
 
-    The lens model folds what is far beside the picture back into it: what does not come back to
-    itself as a ray is not in view.
+    A lens model may project a point far outside the view into the image. So the pixel counts only
+    if its ray leads back to the point.
     """
     at = estimate.world_from_camera.inverse.apply(point)
     pixel, inside = estimate.camera.project(at)

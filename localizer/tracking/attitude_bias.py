@@ -57,9 +57,10 @@ class AttitudePrior:
 class AttitudeBias:
     """Estimated bias of the other sensors' roll and pitch.
 
-    mean: (2,) rad about the two axes: true = turned by it from reported; covariance: (2, 2);
-    spread: variance of what is no constant (rad²), a mean over `count` measurements; place: (2,)
-    east and north (m) of the last one, at `time_ns`; refused: measurements in a row.
+    mean: (2,) rad about the two axes; the reported attitude rotated by it is the true one.
+    covariance: (2, 2) of the mean. spread: variance (rad²) of the varying part, averaged over
+    `count` measurements. place: (2,) east and north (m) of the last measurement, made at
+    `time_ns`. refused: number of measurements refused in a row.
     """
 
     covariance: Array

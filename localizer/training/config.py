@@ -62,8 +62,8 @@ class DataSection(_PlacesSection):
 
 class LiveSection(_PlacesSection):
     """Pairs rendered while training (`training.data.live`). image: width, height of a view;
-    cells: side of a place; active: places that a step draws from, of which one is replaced every
-    `steps_per_scene` steps; flight_days: that each place is seen on.
+    cells: side of a place; active: number of places that a step draws from; one of them is replaced
+    every `steps_per_scene` steps; flight_days: number of days on which each place is seen.
     """
 
     live: Literal[True]

@@ -74,8 +74,9 @@ class MissionPlace:
 
 @dataclass(frozen=True)
 class NotJudged:
-    """An item whose effect is unknown before the flight. text: its MAVLink name, number and reason;
-    gimbal_only: it affects a gimbal camera only; flies: it moves the vehicle.
+    """An item whose effect is unknown before the flight. text: its MAVLink name and number, and why
+    the effect is unknown; gimbal_only: whether it affects only a gimbal camera; flies: whether it
+    moves the vehicle.
     """
 
     text: str
@@ -87,10 +88,10 @@ class NotJudged:
 class PlannedMission:
     """A mission as it will be flown.
 
-    home: (latitude, longitude) degrees, if known; path: the places in the order in which they are
-    flown to, from home or the take-off on, returns to home among them; takeoff_height_m: above
-    home, if said; speed_m_s: the last that is said; no_effect: names of commands that change
-    neither the way nor the view; notes: what else one should know, as sentences.
+    home: (latitude, longitude) degrees, if known. path: the positions in flight order, from home or
+    the take-off on, including returns to home. takeoff_height_m: above home, if stated. speed_m_s:
+    the last stated one. no_effect: names of commands that change neither path nor view. notes:
+    further remarks, as sentences.
     """
 
     home: tuple[float, float] | None

@@ -48,8 +48,8 @@ class GimbalSample:
     """One gimbal message: attitude to the horizontal frame that points north (earth_frame) or to
     the nose.
 
-    earth_frame: yaw is from true north, else from the vehicle's heading. device: component and
-    gimbal_device_id that it is of.
+    earth_frame: whether yaw counts from true north; otherwise it counts from the vehicle's heading.
+    device: component and gimbal_device_id of the sender.
     """
 
     time_ns: int

@@ -34,9 +34,10 @@ _CLOSE_S = 10.0  # for a tile to be read to its end
 class StreamCounters:
     """Counters since the streamer was made.
 
-    hits, misses: wanted nodes that were in memory or not; complete: selections at the wanted detail
-    throughout; stalls: selections with a hole; failures: attempts at nodes that could not be read;
-    unreadable: nodes whose last attempt failed, now; loaded, evicted: nodes; resident_bytes: now.
+    hits, misses: needed nodes that were in memory, or were not; complete: selections with the
+    needed detail everywhere; stalls: selections with a hole; failures: failed attempts to read a node;
+    unreadable: nodes whose last attempt failed; loaded, evicted: numbers of nodes; resident_bytes:
+    memory in use now.
     """
 
     selections: int = 0
