@@ -48,9 +48,9 @@ class GaussMarkovProcess:
 
     @classmethod
     def of(cls, left: Array, times_s: Array, least: float) -> GaussMarkovProcess:
-        """Estimate from residuals (K, 3) without their mean, by restricted likelihood (Patterson
-        and Thompson 1971); of equally likely correlation times the longest. Otherwise correlation
-        time and sigmas would be too small.
+        """Estimate from residuals (K, 3) minus their mean, by restricted likelihood (Patterson
+        and Thompson 1971); of equally likely correlation times it takes the longest. A shorter one
+        would make the sigmas too small.
         """
         sigmas, memories = np.zeros(3), np.zeros(3)
         gaps, free_of_mean = np.diff(times_s), len(times_s) - 1

@@ -96,9 +96,9 @@ class MapOffsetEstimator:
     """Estimates the map offset. As a check of fixes (`FixInjection.add_check`) it returns them
     unchanged or shifted.
 
-    It comes before the other judges, so that they compare with GNSS what is injected. It keeps its
-    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the vehicle's receiver
-    is our own GPS_INPUT, which shows nothing.
+    It runs before the other checks, so that they compare the corrected fix with GNSS. It keeps its
+    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: whether the vehicle's
+    GNSS is our own GPS_INPUT, which is no evidence.
     """
 
     def __init__(

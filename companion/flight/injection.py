@@ -19,13 +19,13 @@ from mavlink_bridge.messages import VisionFix
 _log = logging.getLogger(__name__)
 
 FixCheck = Callable[[PoseEstimate, VisionFix], VisionFix | None]
-"""Has a word before injection: the fix, or one with another covariance; None withholds it. Called
-on the localization thread: it looks up what its own thread found and returns at once. One that
-raises withholds the fix, and the operator is told.
+"""Checks a fix before injection. Returns the fix, perhaps with another covariance; None holds it. It
+is called on the localization thread and returns at once. If it raises an exception, the fix is held
+and an alert is raised.
 """
 
 Observer = Callable[[PoseEstimate, ReferenceBundle, VisionFix], None]
-"""Sees each fix as it was made, whether it is injected or not. It returns at once, likewise."""
+"""Takes each fix before the checks change it, whether it is injected or not. It returns at once."""
 
 _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 

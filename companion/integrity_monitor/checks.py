@@ -63,7 +63,7 @@ class IntegrityLimits:
 class IntegrityChecks:
     """Call every method under one lock, or from one thread.
 
-    Above 200 lines: each check has a few lines here that hand it its evidence and take its finding.
+    Above 200 lines: a few lines for each check pass its evidence to it and take its result.
     """
 
     def __init__(

@@ -145,10 +145,11 @@ class TargetManager:
     """The active targets, by name. Not thread-safe.
 
     tell: takes each fix. gone: takes the name of each target that ended. report_alert: tells the
-    operator. missed counts detections that show no map: beside the picture, or in the
-    sky; doubted those whose place may not be told; refused those of targets beyond the 32nd.
+    operator. missed: number of detections without map under them: outside the frame, or in the sky;
+    doubted: of detections whose position is too uncertain to be reported; refused: of detections of
+    a 33rd target.
 
-    Above 200 lines: what is done to one target touches the others, so all live under one owner.
+    Above 200 lines: a change of one target affects the others, so one class owns all.
     """
 
     def __init__(

@@ -35,8 +35,8 @@ def most_similar_rival(
     """The other position that matches the view best: poses on rings about the true one are refined,
     and the best optimum away from it is taken.
 
-    levels: of the query, coarse to fine, the network's; origin: (3,) of their local frame;
-    width_m: of the ground in view.
+    levels: the query's levels, coarse to fine; origin: (3,) origin of their local frame; width_m:
+    width of the ground in view.
     """
     angles = np.arange(_BEARINGS) * 2 * np.pi / _BEARINGS
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(_BEARINGS)], axis=1)

@@ -107,8 +107,8 @@ def height_above_ground(
 ) -> tuple[float, float]:
     """Mean and sigma (m) of a camera's height at `place` (3,) above ground points (N, 3).
 
-    covariance: (3, 3) of the place. Beside its mean place the ground is taken to go on
-    with the slope that it has in view.
+    covariance: (3, 3) of the place. Around it the ground is assumed to continue with the slope of
+    the visible ground.
     """
     centred = points_world - points_world.mean(axis=0)
     slope = np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)[0]

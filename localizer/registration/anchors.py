@@ -124,8 +124,9 @@ def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
 def swept(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> Anchors:
     """The anchors, displaced as a rolling shutter shows them.
 
-    pose: where the camera is thought to be (in the middle of the readout); some degrees beside it
-    change the rows, and so the places, by centimetres. None: all rows at once, nothing moves.
+    pose: the camera's approximate pose in the middle of the readout. An error of some degrees
+    changes the anchors by centimetres only. sweep None: all rows are exposed at once, so no anchor
+    is displaced.
     """
     if sweep is None or len(anchors.points_world) == 0:
         return anchors

@@ -255,8 +255,8 @@ def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:
 
 
 def apart_px(differences: Array, rotation: Array, translation: Array, motion: Array) -> Array:
-    """(M,) rms distances, in px of the level of `motion`, at which the image lies for poses that
-    differ by `differences` (M, 6) from the pose camera_from_local, to first order.
+    """RMS image displacements (M,), in px of the level of `motion`, of poses that differ by
+    `differences` (M, 6) from the pose camera_from_local, to first order.
     """
     steps = np.linalg.solve(pose_tangent_map(rotation, translation), differences.T)
     distances: Array = np.sqrt(np.einsum("im,ij,jm->m", steps, motion, steps))

@@ -32,8 +32,8 @@ def _text(value: str, length: int) -> list[int]:
 def camera_information(config: CameraConfig, uptime_ms: int) -> Any:
     """CAMERA_INFORMATION (259) with the tracking flags; focal length and sensor size unknown.
 
-    A video stream is announced only where there is one: QGroundControl would leave the video that
-    was set by hand for a stream without an address.
+    A video stream is announced only if it has an address. Otherwise QGroundControl would replace
+    the video that the user has set by a stream that does not exist.
     """
     flags = _CAMERA_FLAGS
     if config.stream_uri:

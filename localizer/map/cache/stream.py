@@ -35,9 +35,9 @@ class StreamCounters:
     """Counters since the streamer was made.
 
     hits, misses: needed nodes that were in memory, or were not; complete: selections with the
-    needed detail everywhere; stalls: selections with a hole; failures: failed attempts to read a node;
-    unreadable: nodes whose last attempt failed; loaded, evicted: numbers of nodes; resident_bytes:
-    memory in use now.
+    needed detail everywhere; stalls: selections with a hole; failures: failed attempts to read a
+    node; unreadable: nodes whose last attempt failed; loaded, evicted: numbers of nodes;
+    resident_bytes: memory in use now.
     """
 
     selections: int = 0
