@@ -19,13 +19,13 @@ from mavlink_bridge.messages import VisionFix
 _log = logging.getLogger(__name__)
 
 FixCheck = Callable[[PoseEstimate, VisionFix], VisionFix | None]
-"""Checks a fix before injection. Returns the fix, perhaps with another covariance; None holds it. It
-is called on the localization thread and returns at once. If it raises an exception, the fix is held
-and an alert is raised.
+"""Checks a fix before injection. Returns the fix, perhaps with another covariance; None holds it.
+It is called on the localization thread and returns at once. If it raises an exception, the fix is
+held and an alert is raised.
 """
 
 Observer = Callable[[PoseEstimate, ReferenceBundle, VisionFix], None]
-"""Takes each fix before the checks change it, whether it is injected or not. It returns at once."""
+"""Takes each fix before the checks change it, injected or not. It returns at once."""
 
 _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 

@@ -87,9 +87,9 @@ class Damage:
     def is_damaged(self, arrival_ns: int, *, marked: bool, clean: bool) -> bool:
         """Whether this frame is damaged or predicted from a damaged one.
 
-        marked: whether the decoder marked the frame as damaged. clean: whether the frame is predicted
-        from no other. After 5 s the stream counts as undamaged, because an encoder without key
-        frames has refreshed all parts of the image by then.
+        marked: whether the decoder marked the frame as damaged. clean: whether the frame is
+        predicted from no other. After 5 s the stream counts as undamaged, because an encoder
+        without key frames has refreshed all parts of the image by then.
         """
         self._has_begun = True
         waited = self._since_ns is not None and arrival_ns - self._since_ns > _LONGEST_NS

@@ -34,7 +34,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the EKF receives no position", "check cable and baud rate; " + _BY_HAND,
               lead=_NOT_SENT),
     condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
-              "mode inject, message external_position_estimate: no fix is sent for 2 s, because "
+              "mode inject, bridge.injection.message external_position_estimate: no fix is sent "
+              "for 2 s, because "
               "the autopilot has not accepted the command; it is tested while the EKF uses GNSS",
               "the autopilot accepts the command",
               "the EKF receives no position; *not asked*: not tested yet; any other answer: this "
@@ -51,7 +52,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the origin or the map is wrong; the EKF receives no position",
               "check the map and the EKF's origin", lead=_NOT_SENT),
     condition(A.NO_ATTITUDE, WARNING, "no attitude for ODOMETRY", {},
-              "message odometry: no ATTITUDE for the time of a fix", "ATTITUDE is received",
+              "bridge.injection.message odometry: no ATTITUDE for the time of a fix", "ATTITUDE "
+              "is received",
               "ODOMETRY needs the attitude; the EKF receives no position",
               "check the rate of ATTITUDE; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
@@ -140,27 +142,28 @@ INJECTION: tuple[AlertSpec, ...] = (
           "the EKF uses vision", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
-              "fixes are sent for 3 s, and the rate over 3 s is below the shown minimum",
+              "after at least 3 s of sent fixes: the rate over 3 s is below the shown minimum",
               "the rate is above it", f"{_SENT}; the EKF may stop using them",
               "check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
-              "fixes are sent for 3 s, and EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED",
+              "after at least 3 s of sent fixes: EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED",
               "the flag is cleared", f"{_SENT}; the EKF uses none yet", "wait"),
     condition(A.EKF_NO_SOURCE, WARNING, "the EKF has no position source", {},
-              "fixes are sent for 3 s, and EKF_STATUS_REPORT has the flag EKF_CONST_POS_MODE",
+              "after at least 3 s of sent fixes: EKF_STATUS_REPORT has the flag EKF_CONST_POS_MODE",
               "the flag is cleared", f"{_SENT}; the EKF uses none",
               f"{_PARAMETERS}; {_BY_HAND}"),
     condition(A.EKF_NO_POSITION, WARNING, "the EKF reports no local position", {},
-              "fixes are sent for 3 s, and no LOCAL_POSITION_NED is received for them",
+              "after at least 3 s of sent fixes: no LOCAL_POSITION_NED is received for them",
               "LOCAL_POSITION_NED is received",
               f"{_SENT}; whether the EKF uses them is unknown", _PARAMETERS),
     condition(A.EKF_OFF_FIXES, WARNING, "the EKF is {metres:.1f} m from what is sent",
               {"metres": "m"},
-              "fixes are sent for 3 s, and the median of the EKF's differences from them over 3 s "
+              "after at least 3 s of sent fixes: the median of the EKF's differences from them "
+              "over 3 s "
               "is above 2 m + 5 sigma", "the difference is smaller",
               f"{_SENT}; source set, EKF origin or yaw is wrong", f"{_PARAMETERS}; {_BY_HAND}"),
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
-              "fixes are sent for 3 s, and the horizontal test ratio in EKF_STATUS_REPORT is "
+              "after at least 3 s of sent fixes: the horizontal test ratio in EKF_STATUS_REPORT is "
               "above 1", "it is 1 or less", f"{_SENT}; the EKF does not use them",
               "act as for `ekf_rejects_vision`; later check VISO_POS_M_NSE and the delay"),
     condition(A.FIXES_LATE, WARNING, "fixes {age_ms:.0f} ms old, delay_ms {limit_ms:.0f}",
@@ -186,7 +189,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "check the rates of ATTITUDE and the gimbal messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
-              "message gps_input: the companion's clock is before 2023", "the clock is set",
+              "bridge.injection.message gps_input: the companion's clock is before 2023", "the "
+              "clock is set",
               f"{_SENT}, without a time", "set the companion's clock, for example by NTP"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": "name"},
           "the .tlog cannot be written", f"{_SENT}; MAVLink messages are not recorded",

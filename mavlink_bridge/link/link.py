@@ -77,8 +77,8 @@ class LinkOptions:
     signing_key: 32 bytes, None without signing; window: the newest timestamps of signed messages,
     which survive a restart. timeout_s: silence after which a stream (TCP, serial) is reopened.
 
-    sender: of UDP, the only host that is accepted. follow_hosts_after_s: of UDP, silence after which
-    another host is accepted. stop: ends the owner thread when it is set.
+    sender: of UDP, the only host that is accepted. follow_hosts_after_s: of UDP, silence after
+    which another host is accepted. stop: ends the owner thread when it is set.
     """
 
     name: str = "link"

@@ -233,9 +233,9 @@ class InertialBuffer:
 class GimbalBuffer:
     """History of one gimbal's attitude, from the best source available.
 
-    It uses the first gimbal that sends, as long as it sends, because mixed angles of two gimbals are
-    wrong. device: the (component, gimbal_device_id) to use, 0 for any. others: the other gimbals
-    that have sent, eight at most.
+    It uses the first gimbal that sends, as long as it sends, because mixed angles of two gimbals
+    are wrong. device: the (component, gimbal_device_id) to use, 0 for any. others: the other
+    gimbals that have sent, eight at most.
     """
 
     def __init__(self, device: tuple[int, int] = (0, 0)) -> None:
