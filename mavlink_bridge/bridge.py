@@ -62,15 +62,15 @@ _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one
 class Bridge:
     """The localizer's MAVLink interface. Every public method may be called from any thread.
 
-    Above 200 lines and 15 public methods: it is the package's whole surface, and each method hands
-    one thing to, or asks one thing of, the part that does the work.
+    Above 200 lines and 15 public methods: it is the package's whole interface, and each method
+    passes one call to the component that does the work.
 
-    on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
-    on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
-    on_alert: called likewise with every alert for the operator.
-    clock: CLOCK_MONOTONIC, ns; for a recorded flight, which `play` and `tick` go through instead of
-    `start`, the time in the record.
-    Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
+    on_track: called in a link's thread when the operator asks for tracking; it must return at once.
+    on_hint: called likewise when the operator gives the vehicle's position; returns whether it can
+    be used. on_alert: called likewise with every alert for the operator. clock: CLOCK_MONOTONIC,
+    ns; for a recorded flight, which uses `play` and `tick` in place of `start`, the time in the
+    record. Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be
+    used.
     """
 
     def __init__(

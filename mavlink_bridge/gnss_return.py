@@ -41,10 +41,11 @@ class GnssRefusal:
 
 @dataclass(frozen=True)
 class _Report:
-    """One report; differences are north and east, metres. off_m: from vision at its time.
+    """One report; differences are north and east, metres. off_m: difference from vision at its
+    time.
 
-    slipped_m: from the integral of the EKF's velocity, with an arbitrary zero. claimed_m: None
-    where the receiver does not say.
+    slipped_m: difference from the integral of the EKF's velocity, with an arbitrary zero.
+    claimed_m: the accuracy that the receiver states, None without one.
     """
 
     time_ns: int

@@ -37,9 +37,10 @@ _AIDING = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_GPS_GLITCHING
 class PositionCommand:
     """Tracks whether the autopilot accepts MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
 
-    It says so by accepting the command while GNSS aids its EKF. ArduPilot 4.7 refuses it then and
-    accepts it after the loss of GNSS, as a reset: streamed so, the vehicle landed after 8 s all the
-    same. Who refused is not asked again until a reboot.
+    An autopilot that fuses such positions accepts the command while its EKF uses GNSS. ArduPilot
+    4.7 refuses it then. After the loss of GNSS it accepts the command, but only to reset the
+    position: in a test the vehicle landed after 8 s although each fix was sent. An autopilot that
+    has refused is not asked again until a reboot.
     """
 
     def __init__(self) -> None:

@@ -25,10 +25,11 @@ _GO_NS = 600_000_000_000
 
 
 class ShadowInterlock:
-    """Decides at each step of the injection; one thread.
+    """Decides at each step whether fixes may be injected; one thread.
 
-    force: `bridge.injection.force`. score: the shadow's verdict now. compared_ns: when a fix was
-    last compared with GNSS, 0 never. memory: of what spoke against the map, over a restart.
+    force: `bridge.injection.force`. score: the current result of the shadow check. compared_ns:
+    when a fix was last compared with GNSS, 0 if never. memory: keeps a failed shadow check over a
+    restart.
     """
 
     def __init__(

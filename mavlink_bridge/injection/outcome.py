@@ -22,11 +22,12 @@ _RECEIVER_LATE_NS = 200_000_000  # from what it measured to the arrival of its r
 
 
 class InjectionOutcome:
-    """Keeps recent positions, computed and sent, for both checks; one thread.
+    """Keeps recent computed and sent positions, for the shadow check and the check of the EKF; one
+    thread.
 
-    verdict: the last one; None while nothing is sent or it is too early. ekf_ok_inhibited_by:
-    alerts for which "the EKF follows" is not reported. compared_ns: exposure of the last fix that
-    was compared with GNSS, 0 for none.
+    verdict: the last result of the check of the EKF; None while nothing is sent or it is too early.
+    ekf_ok_inhibited_by: alerts for which "the EKF follows" is not reported. compared_ns: exposure
+    of the last fix that was compared with GNSS, 0 for none.
     """
 
     def __init__(

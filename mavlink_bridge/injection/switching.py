@@ -130,10 +130,11 @@ def gnss_fault(
 
 
 class SourceSwitch:
-    """Decides; the caller sends and reports the acknowledgement. One thread.
+    """Decides about the source set; the caller sends the command and reports the acknowledgement.
+    One thread.
 
-    refusal: why GNSS that is bad is not left for vision; None when that is not so. current: the
-    set in use; None where it is not known. returning: what is found of GNSS while it is not used.
+    refusal: why the vision set is not selected although GNSS is bad; else None. current: the set in
+    use, None if unknown. returning: the check of GNSS while it is not used.
     """
 
     def __init__(self, config: SourceSwitchConfig) -> None:
@@ -159,9 +160,9 @@ class SourceSwitch:
         self.current = None
 
     def chosen(self, source_set: int) -> None:
-        """The autopilot reports the set that it uses. If it is not our order, it is the pilot's
-        choice and stays: a vision set always, a GNSS set as long as the fault at which it was
-        chosen.
+        """Process the autopilot's report of the set in use. A set that we did not order is the
+        pilot's choice. A chosen vision set stays; a chosen GNSS set stays until the present fault
+        of GNSS ends.
         """
         if source_set in (self.current, self._ordered):
             return

@@ -50,7 +50,7 @@ class LinkHandler(Protocol):
     def on_tick(self, link: Link, now_ns: int) -> int:
         """Do what is due; return when to be called next (CLOCK_MONOTONIC ns).
 
-        It is called while the transport is closed, too: what is sent then is dropped and counted.
+        It is called also while the transport is closed. Messages sent then are dropped and counted.
         """
 
 
@@ -97,8 +97,8 @@ class LinkOptions:
 class Link:
     """A MAVLink 2 link that reconnects by itself.
 
-    Above 200 lines: one thread owns transport, parser, packers and what is unsent, and the order in
-    which its loop serves them keeps positions first on a slow port.
+    Above 200 lines: one thread owns transport, parser, packers and send queue. The order in which
+    its loop serves them gives positions priority on a slow port.
     """
 
     def __init__(

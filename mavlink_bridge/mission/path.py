@@ -45,8 +45,9 @@ _ENDS = (*LANDINGS, mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
 @dataclass(frozen=True)
 class MissionPlace:
     """A position on the flight path. name: number among the waypoints, "home" or "take-off"; item:
-    number in the mission; gimbal, speed_m_s: on the leg to it (None: not commanded); after_gap: the
-    path to it is unknown; curved: by a spline; circle: flown about it on arrival.
+    number in the mission; gimbal, speed_m_s: on the leg to it (None: not commanded); after_gap:
+    whether the path to it is unknown; curved: whether the path to it is a spline; circle: circle
+    that is flown about it on arrival.
     """
 
     name: str
@@ -126,7 +127,7 @@ def fly(
 ) -> PlannedMission:
     """Compute the flight path of a mission's items (without home). speed_m_s: default speed.
 
-    MissionError for a place that is none on Earth, or in a frame without global coordinates.
+    MissionError for an impossible position, or one in a frame without global coordinates.
     """
     flight = _Flight(items, home, vehicle, speed_m_s)
     flight.run()
