@@ -39,8 +39,8 @@ class Companion:
     """The flight process of one deployment.
 
     `run` blocks until `stop` is called or the feed ends. pulse: descriptor of the supervisor's
-    pipe, see `Pulse`; None without a supervisor. restart: an earlier process of this flight died.
-    lost_settings: why `config` is not from the deployment's file; else empty.
+    pipe, see `Pulse`; None without a supervisor. restart: whether an earlier process of this flight
+    died. lost_settings: why `config` is not that of the deployment file; empty if it is.
     """
 
     def __init__(

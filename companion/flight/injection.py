@@ -39,8 +39,8 @@ class JumpCounter:
     """Counts the jumps of the estimate (`VisionFix.reset_count`), so that the EKF resets to the new
     position.
 
-    A jump is each start after LOST, also the first, and a registration after BRIDGING, because it
-    corrects the drift. DEGRADED is none.
+    A jump is each start after LOST, also the first. A registration after BRIDGING is a jump, too,
+    because it corrects the drift. DEGRADED causes no jump.
     """
 
     def __init__(self) -> None:
@@ -58,9 +58,9 @@ class JumpCounter:
 class FixInjection:
     """Passes a fix to the bridge for every accepted estimate while tracking.
 
-    Runs on the localization thread, and converts there: 0.12 ms in the median (two geodetic
-    conversions and two rotations, no look at the map), no more than waking another thread would
-    take, and a fix's age counts.
+    It runs on the localization thread and converts there. The conversion takes 0.12 ms in the
+    median (two geodetic conversions and two rotations, no access to the map). To wake another
+    thread would take as long and make the fix older.
     """
 
     def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:

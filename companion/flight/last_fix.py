@@ -124,8 +124,8 @@ def _is_place(fix: LastFix) -> bool:
 class FixMemory:
     """Writes the newest confirmed position in flight, and reads that of the previous process.
 
-    trusted: whether no check holds the output now; state: the vehicle's telemetry. Thread-safe; the
-    file is written by its own thread.
+    trusted: whether no check holds the output now; state: the vehicle's telemetry. Thread-safe; its
+    own thread writes the file.
     """
 
     def __init__(

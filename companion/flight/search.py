@@ -153,9 +153,9 @@ def place_on_map(
 class PlaceSearch:
     """Searches the position with a frame and the autopilot's data.
 
-    The map's overview is opened (or, the first time, computed) on a thread of its own, so that
-    neither the start nor a search waits for it. reach: where the camera can be at a time since the
-    map last said where it was, asked where the autopilot knows no position.
+    A thread of its own opens the map's overview, or computes it at the first start, so that neither
+    the start nor a search waits for it. reach: region that the camera can have reached at a time
+    since the last position on the map; used if the autopilot knows no position.
     """
 
     def __init__(

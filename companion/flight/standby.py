@@ -34,7 +34,8 @@ def ready(
 def _stand_by(companion: Companion) -> Companion | None:
     """Prepare what takes long, then wait for a line on standard input.
 
-    None where it ends without one: the supervisor is gone. Neither link nor feed is opened before.
+    None if the input ends without a line, because the supervisor is gone. Neither link nor feed is
+    opened before.
     """
     try:
         companion.prepare()

@@ -180,8 +180,8 @@ class IntegrityChecks:
         None holds it. A fix of the odometry that only its protection level holds is marked
         `position_withheld`; its velocity gets the scale error that the IMU has shown.
 
-        attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
-        reason against it.
+        attitude: the autopilot's at the fix's time, None if unknown; held: whether another check
+        holds the fix.
         """
         self._tilt.add(fix, attitude)
         verdict = self._verdict
@@ -349,7 +349,7 @@ class IntegrityChecks:
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
         """Whether the EKF moved by metres during a frozen frame; unknown in a hover.
 
-        The EKF keeps its speed at first: it follows a frozen position after a second or two.
+        The EKF keeps its speed at first. Only after a second or two it follows the frozen position.
         """
         if state.local_velocity_ned is None or verdict.still_s < _MOVED_LEAST_S:
             return False

@@ -33,7 +33,7 @@ class CheckResult:
 class AlertDebouncer:
     """Raises an alert after raise_s of bad evidence and clears it after clear_s of good evidence.
 
-    Time without evidence counts for neither, and nothing is repeated in it.
+    Time without evidence counts for neither, and no alert is repeated during it.
     """
 
     def __init__(self, spec: AlertSpec) -> None:

@@ -18,8 +18,9 @@ _HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
 
 
 class TiltCheck:
-    """Takes every fix. A constant bias of the gimbal is not estimated here: a wrong tilt that came
-    slowly and with the first fix (1.5 degrees in 2 s, `begins-denied`) would become part of it.
+    """Takes every fix. It does not estimate a constant bias of the gimbal. A wrong tilt that grows
+    slowly from the first fix on (1.5 degrees in 2 s, `begins-denied`) would become part of such a
+    bias.
     """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:

@@ -41,8 +41,8 @@ class FlownLeg:
 def flown_legs(
     verdicts: Sequence[LegVerdict], places: Array, accepted: np.ndarray
 ) -> tuple[FlownLeg, ...]:
-    """Each leg's places against the flight's frames within half a step, horizontally. places:
-    (F, 3) of all frames; accepted: (F,), whether each was localized.
+    """Compares each leg's samples with the frames of the flight within half a step horizontally.
+    places: (F, 3) of all frames; accepted: (F,), whether each was localized.
     """
     legs = []
     for verdict in verdicts:

@@ -44,8 +44,8 @@ class Question:
 @dataclass(frozen=True)
 class MissionForecast:
     """The result. length_m: of all legs; verdicts: of each leg once, however often it is flown;
-    not_judged: commands of the mission that are not in it, by MAVLink name; notes: limits of the
-    forecast for this mission, as sentences.
+    not_judged: MAVLink names of the mission's commands that the forecast cannot include; notes:
+    limits of the forecast for this mission, as sentences.
     """
 
     question: Question

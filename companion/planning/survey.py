@@ -26,10 +26,10 @@ _MOST_THREADS = 8
 
 
 class Surveyor:
-    """Judges path samples in threads; create it by `surveyor`.
+    """Forecasts path samples in threads; create it by `surveyor`.
 
-    Each thread takes a forecaster for itself: renderers, networks and optimizers are used by one
-    thread at a time.
+    Each thread uses its own forecaster, because a renderer, network or optimizer serves one thread
+    at a time.
     """
 
     def __init__(

@@ -65,7 +65,7 @@ def self_test(
 ) -> SelfTestReport:
     """Build a map in `folder`, track frames over it and find one without a prior.
 
-    Raises SelfTestError where a result is off by more than 0.5 m or none is accepted.
+    Raises SelfTestError if a result is off by more than 0.5 m, or if none is accepted.
     """
     config = config or LocalizerConfig()
     say("building a map")

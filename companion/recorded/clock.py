@@ -115,9 +115,10 @@ def _outside(scores: Array, best: int) -> np.ndarray:
 
 
 def _chance(residuals: Array, outside: np.ndarray, best: float) -> float:
-    """Of a median of so many pairs as low as the best: each pair's residual is so low at some share
-    of the other offsets, and as many valleys as wide as the best one's were looked at. Half of the
-    pairs count, because neighbours share an image.
+    """Probability that another log gives a median residual as low as the best, from this many
+    pairs. Each pair's residual is so low at some share of the other offsets. As many valleys were
+    tried as fit into the range of offsets. Half of the pairs count, because neighbours share an
+    image.
     """
     elsewhere = residuals[outside]
     known = np.isfinite(elsewhere)

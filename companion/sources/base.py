@@ -39,8 +39,8 @@ _SHAPE_TOLERANCE = 0.005
 class StreamState(Enum):
     """State of a feed; `SourceSettings` says when a live one is stalled.
 
-    SCALED: its pictures have another size than the calibration but the same shape, and are used.
-    MISFIT: they have another shape, and are not.
+    SCALED: the frames have another size than the calibration but the same aspect ratio, and are
+    used. MISFIT: they have another aspect ratio, and are not used.
     """
 
     IDLE = "not started"
@@ -212,7 +212,8 @@ class FrameSource(Protocol):
     def frames(self) -> Iterator[Frame]:
         """Frames in order of exposure, until a file ends or the source is closed.
 
-        A live stream that stops does not end it: it reports its state and connects again.
+        If a live stream stops, the iteration continues: the source reports its state and connects
+        again.
         """
         ...
 
@@ -234,7 +235,7 @@ class FrameSource(Protocol):
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
     """Camera model of a frame of this size: the calibrated one, scaled if necessary.
 
-    Raises `StreamSizeError` when the picture's shape shows that it was cropped or padded.
+    Raises `StreamSizeError` if the aspect ratio shows that the frame was cropped or padded.
     """
     if (width, height) == (camera.width, camera.height):
         return camera

@@ -261,8 +261,8 @@ class TargetManager:
                 self._gone(name)
 
     def _follow(self, name: str, life: _TargetState, click: Click, fix: TargetFix) -> None:
-        """Begin to follow it in the image from the click's own picture, where that is kept, and
-        through those that came since: the operator's delay is made up for.
+        """Begin to track a clicked target in the image, from the clicked frame if it is kept,
+        through the newer frames. So the operator's delay causes no error.
         """
         time_ns = click.estimate.exposure_time_ns
         kept = [p for p in self._pictures if abs(p[0].exposure_time_ns - time_ns) <= _PICTURE_NS]
@@ -360,9 +360,9 @@ class TargetManager:
         estimate: PoseEstimate,
         gray: Gray,
     ) -> bool:
-        """Whether a target that was never measured to move ends, for the ground is seen again where
-        it was. Of another that does not look as it did, the operator is told: if that came at once,
-        it may have left.
+        """Whether a target that was never measured to move ends, because the ground in its place is
+        visible. If the target only looks different, the operator is told: after a sudden change the
+        target may have left.
         """
         number = _number(name)
         if life.moved_at_once and follower.shows_ground(gray, estimate):
@@ -503,8 +503,9 @@ class TargetManager:
         gray: Gray,
         position: Array,
     ) -> FollowedPosition | None:
-        """A target that moves, though nobody has measured how: the ground that it left tells its
-        shape. A car that passes over a place takes nothing of it along.
+        """A clicked target that moves, before its motion was measured. The ground that it has left
+        shows its shape. A car that only passes over a clicked place does not take the place's
+        appearance along, so no match is found.
         """
         if (estimate.exposure_time_ns - life.found_ns) * 1e-9 > _DEPARTS_S:
             return None
