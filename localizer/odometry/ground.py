@@ -81,8 +81,8 @@ class RaisedGround:
 class RangefinderGround:
     """Ground height by a rangefinder: a plane at the height of the lowest recent surface.
 
-    One beam meets roofs and crowns, too, and a picture's depth from a roof would be short by it; so
-    of the last readings those count that are as low as what counts as ground elsewhere.
+    The beam also hits roofs and crowns, and with a roof's height the depth of the image would be
+    too short. So only the lowest of the recent readings are used.
     """
 
     def __init__(self) -> None:

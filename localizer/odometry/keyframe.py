@@ -37,11 +37,11 @@ class Keyframe:
     """A frame that later frames are registered against.
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
-    pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
-    sensors said of its pose. features, camera, surface: what it was made of. scale: sigma of the
-    height above its points as a share of it. scale_covariance: (3, 3) covariance of the position
-    from all scale errors so far. unmatched_m2: variance from frames that did not match so far
-    (`GrowthModel.unmatched`).
+    pose, as `PosePrior`'s. source: source of its depth. way_m: distance flown up to it. constraint:
+    other sensors' measurement of its pose. features, camera, surface: the inputs of its anchors.
+    scale: relative sigma of the height above its points. scale_covariance: (3, 3) covariance of the
+    position from all scale errors so far. unmatched_m2: variance from frames that did not match so
+    far (`GrowthModel.unmatched`).
     """
 
     anchors: Anchors

@@ -46,7 +46,7 @@ class OdometryStart:
 @dataclass(frozen=True)
 class OdometryTrack:
     """The last usable estimate. covariance: without the error of scale. constraint: the other
-    sensors' measurements less their constant error. relative: (6, 6) the covariance beyond the
+    sensors' measurements minus their constant error. relative: (6, 6) the covariance beyond the
     keyframe's own. best: quality of the keyframe's first registration. unmatched_m2: variance of
     east and north beyond the covariance, which no measurement reduces.
     """

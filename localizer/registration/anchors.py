@@ -25,10 +25,10 @@ def select_anchors(
 ) -> Anchors:
     """At most `count` anchors: spread evenly over the image, off depth edges and holes.
 
-    They are drawn at random within equal cells, so that every part of the view is represented, and
-    come in Morton order, so that neighbours in the list are neighbours in every feature map. The
+    They are drawn at random within equal cells, so that every part of the view is represented. They
+    are in Morton order, so that neighbours in the list are neighbours in every feature map. The
     same seed gives the same anchors. A view without usable depth gives fewer or none; `JNGO` then
-    says TOO_FEW_ANCHORS.
+    returns TOO_FEW_ANCHORS.
     """
     rng = np.random.default_rng(seed)
     rows, columns = _candidates(view.depth, rng)
@@ -68,9 +68,9 @@ def _candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of one pixel per block, where the surface is smooth and present.
 
-    Which pixel of a block is random: were it always the same, every anchor would lie at the same
-    fraction of a feature cell, and the phase error of bilinear interpolation, which is odd about
-    the cell's middle, would shift the pose (measured: 0.02 px of the finest level).
+    The pixel of a block is random. A fixed pixel would put every anchor at the same fraction of a
+    feature cell. The phase error of bilinear interpolation, which is odd about the cell's middle,
+    would then shift the pose (measured: 0.02 px of the finest level).
     """
     hole = ~(np.isfinite(depth) & (depth > 0))
     # 0 in holes, whatever stands there: no arithmetic touches it.

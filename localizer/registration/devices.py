@@ -23,9 +23,9 @@ _TRIAL_CHANNELS = 32  # the networks'
 def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
     """Open the backend for a choice of device; falls back to the CPU.
 
-    A GPU is tried: driver, run-time compiler, and a small problem. Where anything of that fails the
-    CPU takes over, and one log line says why: a warning if the GPU was asked for or is there but
-    does not work, else an information.
+    A GPU is tested: driver, run-time compiler, and a small problem. If a test fails, the CPU is
+    used, and one log line gives the reason. It is a warning if the GPU was asked for or is present
+    but does not work, otherwise an information.
     """
     if device == "cpu":
         return NumbaBackend(threads)

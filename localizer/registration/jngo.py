@@ -69,7 +69,7 @@ _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 class JNGO:
     """The optimizer. Keeps its worker threads and scratch memory between frames.
 
-    Above 200 lines: search, sharpening and evidence share the problems of one frame.
+    Above 200 lines: search, final refinement and evidence use the same problems of one frame.
     """
 
     def __init__(
@@ -327,8 +327,8 @@ def _beginning(
     prior: PosePrior,
     seed: int,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The swarm, camera_from_local, and after it the best of many draws of a wide prior, by the
-    coarsest level's cost where they are; which are drawn (registration.md, section 6).
+    """The swarm, camera_from_local. For a wide prior it is followed by the best of many draws, by
+    the coarsest level's cost. Also returns which hypotheses are draws (registration.md, section 6).
     """
     R, t = camera_from_local(*c.swarm(prior, seed), origin)
     variance = float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1])
@@ -356,9 +356,10 @@ def _survivors(
     distance_px: float,
     count: int,
 ) -> NDArray[np.int64]:
-    """Indices of the best distinct ones: `count` of the swarm, half as many of the draws.
+    """Indices of the best distinct hypotheses: `count` of the swarm, half as many of the draws.
 
-    Draws were chosen by their cost, so on a dark coarse level they would crowd out what is right.
+    The draws were selected by their cost, so on a dark coarse level they would displace the right
+    hypotheses of the swarm.
     """
     order = np.flatnonzero(~drawn)
     order = order[suppress_duplicates(problem, R[order], t[order], totals[order], distance_px)][

@@ -20,9 +20,9 @@ _PROBES = 12  # anchors whose projections tell hypotheses apart
 
 
 def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> Array:
-    """Posterior weight (M,) of each surviving mode, seen in so many image cells (equation 14).
+    """Posterior weight (M,) of each surviving mode (equation 14). cells: number of image cells.
 
-    other: (M,) which of them are other modes than the first, and not on the way to it.
+    other: (M,) whether it is another mode than the first, and not on the way to it.
     """
     excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], LEAST_SCORE)
     likelihood = np.exp(-0.5 * cells * excess) * other

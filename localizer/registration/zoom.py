@@ -56,8 +56,8 @@ class FocalTest:
         """Relative decrease of a registration's cost with a focal length `FOCAL_STEP` longer or
         shorter, with the pose refined; the larger of both.
 
-        Negative where the camera's own fits best; -inf where that cannot be tested (a registration
-        that failed, features on a GPU).
+        Negative if the camera's own focal length fits best; -inf if it cannot be tested (a
+        registration that failed, features on a GPU).
         """
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:

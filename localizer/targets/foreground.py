@@ -93,12 +93,12 @@ def covered(
     chart: Grey, ground: Grey, look: TargetAppearance, aside: float = 0.0
 ) -> AppearanceCoverage | None:
     """Position at which the target covers the ground; None without one, if it is half hidden, or if
-    a second position is as likely. chart, ground: squares of the same size. aside: by how much less
-    evidence counts at the end of the search range.
+    a second position is as likely. chart, ground: squares of the same size. aside: by how much
+    evidence at the end of the search range counts less.
 
-    Of Gaussian noise, the log-likelihood ratio of look against ground goes with ``sum (I - G)² -
-    (I - L)²``; a picture ``G + a (L - G)`` has ``(2 a - 1)`` of what the whole look would have,
-    ``sum (L - G)²``.
+    With Gaussian noise the log-likelihood ratio of target against ground is proportional to ``sum
+    (I - G)² - (I - L)²``. An image ``G + a (L - G)`` gives ``(2 a - 1)`` times the ratio of the
+    whole target, ``sum (L - G)²``.
     """
     reach = (len(chart) - len(look.grey)) // 2
     share, evidence, whole = _evidence(chart, ground, look.grey, look.inside)

@@ -76,8 +76,8 @@ class LastPlace:
     def objection(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
         """Why a position is rejected; None if it is accepted, which makes it the last position.
 
-        A detector may give its name to another object: then the new place is told once it has been
-        seen for as long as the old one was, 3 s at the most.
+        A detector may give the same name to another object. The new position is reported once it
+        was seen as long as the old one, at most 3 s.
         """
         last, time_ns = self.fix, fix.exposure_time_ns
         if last is None:

@@ -176,10 +176,11 @@ class StaticTarget:
             self._views = every_second(self._views)
 
     def _meet(self, surfaces: tuple[TargetSurface, ...]) -> None:
-        """Each surface on which a hypothesis lies is its plane from now on, or begins another.
+        """Assign each surface on which a hypothesis lies to it as its plane, or begin another
+        hypothesis.
 
-        A hypothesis never changes to a plane that it is not on: at a ridge or a wall's foot the
-        bundle's mean plane swings with the pixel, and would carry it about.
+        A hypothesis never changes to a plane that it is not on. At a ridge or the foot of a wall
+        the bundle's mean plane changes with the pixel and would move the hypothesis.
         """
         for surface in surfaces:
             sigma = float(np.hypot(self._map_sigma_m, surface.roughness_m))

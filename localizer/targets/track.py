@@ -233,11 +233,11 @@ class TargetTrack:
     def _objection(
         self, fix: TargetFix, ray: SightedRay, surfaces: tuple[TargetSurface, ...]
     ) -> TargetRefusal | None:
-        """Why this may not be reported; None if it may.
+        """Why this position may not be reported; None if it may.
 
-        A fix lies under the pixel that it was seen at, at a depth that its frame shows, on the map,
-        is known to some metres, and is no farther from the last one than both errors and a
-        vehicle's speed allow.
+        A position may be reported if it lies under the observed pixel, at a depth that its frame
+        shows, on the map, is known to some metres, and is no farther from the last one than both
+        errors and a vehicle's speed allow.
         """
         P, sigma = fix.covariance, float(np.sqrt(np.trace(fix.covariance)))
         if not np.isfinite(sigma) or sigma > self._settings.max_sigma_m:
@@ -267,9 +267,8 @@ def _aim(
     drift: tuple[float, float],
     surface: TargetSurface,
 ) -> Array:
-    """(3, 3) m²: by how much another place was meant than the one that is followed: the hand's, the
-    delay's and the pose's error in the frame that was clicked at. To follow that place takes
-    nothing away from it.
+    """(3, 3) m²: uncertainty of the clicked position itself, from the errors of hand, delay and
+    pose in the clicked frame. Tracking this position in later frames does not reduce it.
     """
     offset = surface.position - estimate.world_from_camera.translation
     spread = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)), drift)

@@ -184,8 +184,8 @@ def measured(
 class AttitudeBiasEstimator:
     """Estimates the attitude bias of one camera; use it on the localization thread.
 
-    config: None constrains nothing. rotation_at: (3, 3) world_from_camera as reported of a time in
-    ns, or None.
+    config: None constrains nothing. rotation_at: reported (3, 3) world_from_camera at a time in ns,
+    or None.
     """
 
     def __init__(self, config: AttitudePrior | None, rotation_at: RotationAt) -> None:

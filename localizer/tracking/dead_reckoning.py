@@ -79,8 +79,8 @@ _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 class DeadReckoning:
     """Odometry beside the map's registration; use it on the localization thread.
 
-    camera: the working pinhole, which follows a lens that zooms. sensors: other sensors' accounts
-    of the camera, terrain: the ground's shape, ground: what is not known of it, see `Localizer`.
+    camera: the working pinhole, adapted to a lens that zooms. sensors: other sensors' data of the
+    camera; terrain: the shape of the ground; ground: uncertainty of the ground, see `Localizer`.
     """
 
     def __init__(

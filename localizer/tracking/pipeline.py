@@ -154,12 +154,12 @@ class Localizer:
     Above 200 lines and 15 public methods: it is the library's whole interface for one camera.
     Motion, acceptance and dead reckoning are `Tracker`'s.
 
-    sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
-    rate of the motion model. Their roll, pitch and height are fused with each registration
+    sensors: attitude and motion of autopilot and gimbal. Their rotations replace the constant
+    angular rate of the motion model. Their roll, pitch and height are fused with each registration
     (`tracking.sensor_fusion`). With the displacement they confirm or refute a tentative track.
-    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: what is not
-    known of the ground, hills where nobody says. on_close: releases what was opened for this
-    localizer. is_loading: whether requested tiles are still loading.
+    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: uncertainty of
+    the ground, that of hills by default. on_close: releases what was opened for this localizer.
+    is_loading: whether requested tiles are still loading.
     """
 
     def __init__(
@@ -353,8 +353,8 @@ class Localizer:
     ) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2).
 
-        at: where the camera will be soon, if the view is to be rendered from there.
-        `OutsideMapError` if the view shows no map, `MapLoadingError` while tiles are being read.
+        at: a later pose of the camera, if the view is to be rendered there. `OutsideMapError` if
+        the view shows no map, `MapLoadingError` while tiles are being read.
         """
         pose = (at or prior).world_from_camera
         view = self._renderer.render(pose, self.camera, wait=wait)
@@ -389,7 +389,7 @@ class Localizer:
     ) -> PoseEstimate:
         """Register the frame against the anchors, test the result and update the filter.
 
-        anchors: None where no reference can be had: the odometry answers, if it can.
+        anchors: None without a reference; the odometry then estimates the pose, if it can.
         `OutsideMapError` before there is a prior.
         """
         seen = self.tracker

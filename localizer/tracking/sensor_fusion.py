@@ -83,8 +83,8 @@ def fused_registration(
 class SensorFusion:
     """Fuses registrations with attitude and height; use it on the localization thread.
 
-    attitude, height_sigma_m: how well roll and pitch, and the height, are known; None: not used.
-    map_kind: None where it is not known.
+    attitude, height_sigma_m: accuracy of roll and pitch, and of the height; None: not used.
+    map_kind: None if unknown.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class SensorFusion:
     ) -> None:
         """Update attitude bias and height error with an accepted frame, if it shows new ground.
 
-        result: its registration before `fuse`; place: the pose that was accepted; unknown: (6, 6)
-        covariance of what map and camera model err by; distance_m: of what is seen.
+        result: its registration before `fuse`; place: the accepted pose; unknown: (6, 6) covariance
+        of the errors of map and camera model; distance_m: to the ground in view.
         """
         if not self.attitude_bias.is_due(place.translation, distance_m):
             return

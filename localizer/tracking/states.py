@@ -27,9 +27,9 @@ _SEES = (TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.BRIDGING)
 class TrackStatus:
     """State of the machine: immutable, `next_status` returns the next one.
 
-    tentative: the position was proposed, and counts only once it is confirmed. tentative_track: the
-    acceptances there. independent: of the newest proposal, see `TentativeTrack`. last_fix_ns:
-    exposure of the newest fix that was given out, None before the first.
+    tentative: whether the position was proposed and is not confirmed yet. tentative_track: the
+    acceptances since the proposal. independent: of the newest proposal, see `TentativeTrack`.
+    last_fix_ns: exposure of the newest fix that was passed on, None before the first.
     """
 
     state: TrackingState = TrackingState.INITIALIZING

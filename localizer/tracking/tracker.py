@@ -50,8 +50,8 @@ class _Pose:
 class Tracker:
     """Tests registrations, filters the motion, and propagates the pose without the map.
 
-    `judge` belongs to the localization thread; the rest may be called from any. bridging: None
-    where features are not in host memory.
+    `update` belongs to the localization thread; other methods may be called from any thread.
+    bridging: None if features are not in host memory.
     """
 
     def __init__(
@@ -110,8 +110,8 @@ class Tracker:
     ) -> PoseEstimate:
         """Test a registration, and update motion and track status.
 
-        seen, ahead: the state and its motion at the frame that the registration began from.
-        anchors, fused: None where there is no reference view to register against.
+        seen, ahead: the state and its motion at the frame, from which the registration started.
+        anchors, fused: None without a reference view.
         """
         result = None if fused is None else fused.registration
         acceptable = result is not None and self._is_acceptable(result, ahead.prior)

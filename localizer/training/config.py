@@ -92,10 +92,10 @@ Data = Annotated[
 
 
 class OptimizerSection(_Frozen):
-    """Steps and step sizes. The rate warms up, stays, and falls to zero as a cosine over the last
-    `decay_steps`, so that a run can be made longer or shorter until its decay begins. Eq. 3 comes
-    in at `alignment_first_step`. Levels of at most `whole_map_cells` are searched whole by the
-    contrast.
+    """Steps and step sizes. The rate warms up, stays constant, and falls to zero as a cosine over
+    the last `decay_steps`, so that the length of a run can be changed until its decay begins. Eq. 3
+    is used from `alignment_first_step` on. The contrast searches levels of at most
+    `whole_map_cells` completely.
     """
 
     steps: int = Field(gt=0, le=_MOST_STEPS)

@@ -48,11 +48,11 @@ def contrast_loss(
     count: int,
     whole_map_cells: int,
 ) -> Tensor:
-    """Cross entropy of finding each anchor's true place (B, N, 2, level pixels) in the query.
+    """Cross entropy of finding each anchor's true position (B, N, 2, level pixels) in the query.
 
-    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched whole;
-    on finer ones the negatives are the neighbourhood, which decides the basin, for `count` of the
-    anchors.
+    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched
+    completely. On finer ones the negatives are the neighbourhood, which decides the basin of
+    convergence, for `count` of the anchors.
     """
     if query.shape[2] * query.shape[3] <= whole_map_cells:
         loss = _whole_map(reference, query, truth, scale)

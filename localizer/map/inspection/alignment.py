@@ -45,8 +45,7 @@ class ImageryOffset:
 def alignment_of(mosaic: Mosaic) -> ImageryOffset:
     """The offset at which the imagery's edges match the surface's steps best.
 
-    Good to about a metre: walls that lean in the picture draw it to one side. Without colours
-    nothing can be said.
+    Accurate to about a metre: walls that lean in the image bias it. Unknown without colours.
     """
     scale = mosaic.gsd_m / _CELL_M
     size = (round(mosaic.rgb.shape[1] * scale), round(mosaic.rgb.shape[0] * scale))
