@@ -40,8 +40,9 @@ _LEAST_FIXES = 3  # of a window
 
 @dataclass(frozen=True)
 class MotionVerdict:
-    """settled: whether there is evidence. share: the largest mean deviation divided by its limit;
-    deviation_m: that deviation. still_s: how long the position has not moved.
+    """Result of the motion check. settled: whether there is evidence. share: the largest mean
+    deviation divided by its limit; deviation_m: that deviation. still_s: how long the position has
+    not moved.
     """
 
     settled: bool

@@ -45,8 +45,9 @@ class SelfTestError(CompanionError):
 
 @dataclass(frozen=True)
 class SelfTestReport:
-    """error_m: of the tracked positions, worst frame; found_error_m: of the search without a prior;
-    frame_ms: processor time per frame, median; compiled_s: time to the first result.
+    """Result of the self-test. error_m: of the tracked positions, worst frame; found_error_m: of
+    the search without a prior; frame_ms: processor time per frame, median; compiled_s: time to the
+    first result.
     """
 
     error_m: float

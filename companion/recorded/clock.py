@@ -37,9 +37,10 @@ _TAG_NS = 600_000_000  # EXIF's times may be whole seconds
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """offset_s: to add to the images' times. residual_deg: of the features at this offset;
-    second_deg: at the next best offset, infinite without one; pairs: of images used; chance:
-    probability that another flight's log reaches so low a residual.
+    """Offset of an autopilot log's clock from the images'. offset_s: to add to the images' times.
+    residual_deg: of the features at this offset; second_deg: at the next best offset, infinite
+    without one; pairs: number of image pairs used; chance: probability that another flight's log
+    reaches so low a residual.
     """
 
     offset_s: float

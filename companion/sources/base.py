@@ -59,10 +59,11 @@ StateCallback = Callable[[StreamState, str], None]
 
 @dataclass(frozen=True)
 class SourceCounters:
-    """received: frames decoded; delivered: passed on by `frames`; dropped: replaced by a newer one
-    first; undecodable: packets without a complete frame, or with one predicted from a lost frame
-    (`companion.sources.references`); misfits: frames whose shape is not the calibration's;
-    reconnects: connections after the first; foreign: datagrams of other senders, which are ignored.
+    """Frame counters of a source. received: frames decoded; delivered: passed on by `frames`;
+    dropped: replaced by a newer one first; undecodable: packets without a complete frame, or with
+    one predicted from a lost frame (`companion.sources.references`); misfits: frames whose shape is
+    not the calibration's; reconnects: connections after the first; foreign: datagrams of other
+    senders, which are ignored.
     """
 
     received: int = 0

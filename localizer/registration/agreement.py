@@ -62,10 +62,10 @@ class PatchDisplacements:
 
 @dataclass(frozen=True)
 class PatchAgreement:
-    """parts: number of patches that can be compared; votes: number of those that match best at
-    their own position; peak: match of the whole image at its position against its matches at other
-    shifts, in their standard deviations. displacements: shifts of the best matches; patches without
-    a peak are left out.
+    """How the image's patches agree with a registration. parts: number of patches that can be
+    compared; votes: number of those that match best at their own position; peak: match of the whole
+    image at its position against its matches at other shifts, in their standard deviations.
+    displacements: shifts of the best matches; patches without a peak are left out.
     """
 
     patches: int

@@ -44,10 +44,10 @@ _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
 
 @dataclass(frozen=True)
 class TargetSettings:
-    """pixel_sigma: of an observation, pixels; map_sigma_m: of the map's surface; max_sigma_m,
-    max_range_m: limits of reported positions; outline_sigma_m: of the map's outlines, across the
-    ray; confirm_s: time over which observations must agree before the first report, 0 for single
-    ones.
+    """Settings of a target's track. pixel_sigma: of an observation, pixels; map_sigma_m: of the
+    map's surface; max_sigma_m, max_range_m: limits of reported positions; outline_sigma_m: of the
+    map's outlines, across the ray; confirm_s: time over which observations must agree before the
+    first report, 0 for single ones.
     """
 
     pixel_sigma: float = 1.5

@@ -67,7 +67,8 @@ class Doctor:
 
 @dataclass
 class CaseRecord:
-    """errors: (seconds, north, east) of every EKF position against the truth of its time.
+    """Record of one scenario's flight. errors: (seconds, north, east) of every EKF position against
+    the truth of its time.
 
     refusals: texts of the last refused arming; None if arming was not tried or accepted. pace:
     lowest ratio of simulated to intended seconds over ten seconds; below 1 the machine was too

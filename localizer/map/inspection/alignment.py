@@ -22,8 +22,9 @@ _LEAST_PEAK = 4.0  # of the best shift's correlation over the others', in their 
 
 @dataclass(frozen=True)
 class ImageryOffset:
-    """east_m, north_m: offset of the imagery from the surface; peak: its significance, in standard
-    deviations; edges: cells of the surface with a step. known: whether it is significant.
+    """Offset between imagery and surface. east_m, north_m: offset of the imagery from the surface;
+    peak: its significance, in standard deviations; edges: number of cells of the surface with a
+    step. known: whether it is significant.
     """
 
     east_m: float
