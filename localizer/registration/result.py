@@ -34,7 +34,8 @@ class Registration:
     inf without another. focal_gain: relative improvement with another focal length
     (`zoom.FocalTest`), -inf if not tested. mode_covariance: (6, 6), part of the covariance that
     stems from other modes (equation 14). noise: (6, 6), the part that is independent in each frame,
-    for a filter over frames; None: the whole covariance.
+    for a filter over frames; None: the whole covariance. earlier_log_odds: smallest log odds of the
+    image's earlier passes (`localizer.integrity.probability`), inf without any.
     """
 
     world_from_camera: Pose
@@ -49,6 +50,7 @@ class Registration:
     focal_gain: float = -np.inf
     mode_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     noise: Array | None = None
+    earlier_log_odds: float = np.inf
 
 
 @dataclass(frozen=True)
