@@ -15,7 +15,7 @@ _LANDMARKS = "compare the position with landmarks"
 _UNVERIFIED = "fixes are sent although map and calibration are not verified against GNSS"
 _MAP = "do not fly on vision: check map, calibration and datum"
 _NONE = "nothing"
-_SENT = "fixes are still sent"
+_SENT = "fixes are sent"
 _NOT_VERIFIED = "vision is not verified against GNSS; nothing is sent"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 

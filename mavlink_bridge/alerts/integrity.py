@@ -9,8 +9,8 @@ from mavlink_bridge.alerts.words import CalibrationError, GnssDisagreement
 WARNING, ERROR = Severity.WARNING, Severity.ERROR
 _CALIBRATE = "run `companion calibrate flight` on this flight's record before the next flight"
 _STABILIZE = "fly in STABILIZE or ALT_HOLD until it clears; land if it lasts and there is no GNSS"
-_SENT = "fixes are still sent"
-_WIDER = "fixes are still sent, with a larger covariance"
+_SENT = "fixes are sent"
+_WIDER = "fixes are sent, with a larger covariance"
 _LAND = "if it lasts and there is no GNSS, land in ALT_HOLD or STABILIZE"
 
 INTEGRITY: tuple[AlertSpec, ...] = (
@@ -163,7 +163,7 @@ SOURCES: tuple[AlertSpec, ...] = (
               "the EKF uses vision and GNSS is back, but its position or velocity differs from "
               "vision or IMU, it scatters, or it states an accuracy above 5 m, for 2 s",
               "it agrees for 5 s",
-              "fixes are still sent, and the EKF stays on vision; the receiver is jammed, "
+              "fixes are sent, and the EKF stays on vision; the receiver is jammed, "
               "spoofed or not settled, or the map has an offset",
               "stay on vision; select GNSS only if landmarks confirm it",
               cleared_text="GNSS agrees with vision", raise_s=2.0, clear_s=5.0, repeat_s=10.0),

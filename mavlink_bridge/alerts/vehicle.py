@@ -18,7 +18,7 @@ from mavlink_bridge.alerts.words import (
 WARNING, NOTICE, INFO = Severity.WARNING, Severity.NOTICE, Severity.INFO
 _SIGN = "check the wiring; if it is right, sign the link"
 _NONE = "nothing"
-_SENT = "fixes are still sent"
+_SENT = "fixes are sent"
 _BY_HAND = "without GNSS fly in STABILIZE or ALT_HOLD"
 _CHECK_LINK = "check the link between computer and flight controller"
 _WHERE = "a ground station sees this only over bridge.ground_connection"
@@ -35,8 +35,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
     condition(A.FC_SILENT, WARNING, "no heartbeat from the flight controller", {},
               "sent once: no heartbeat in the first 5 s after the start; in health.json: no "
               "heartbeat for 3 s, also later in the flight", "a heartbeat is received",
-              f"no fix is sent; {_WHERE}",
-              f"before take-off: {_CHECK_LINK}; in flight act as for `fc_lost`"),
+              "no fix is sent", f"before take-off: {_CHECK_LINK}; in flight act as for `fc_lost`"),
     event(A.FC_REBOOTED, WARNING, "flight controller rebooted", {},
           "the boot time in its messages ran back",
           "the EKF has restarted with its first source set; fixes relative to its origin are sent "
