@@ -84,7 +84,7 @@ def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report
         versions=made_by(),
         notes=(*trial.notes, *pictures.notes),
         verdict=judgement.sentence,
-        overlays_of="the frames, those that failed first",
+        overlays_of="Frames that failed, then localized ones, spread over the flight",
     )  # fmt: skip
 
 
