@@ -289,8 +289,8 @@ def _overlays(report: Report) -> str:
             f"<figcaption>{escape(o.caption)}</figcaption></figure>"
         )
     return (
-        f"<p class=sub>{escape(report.overlays_of)}. The first slider selects the frame; the second "
-        "one uncovers the map from the estimated pose: if the pose is right, edges run on.</p>"
+        f"<p class=sub>{escape(report.overlays_of)}. The second slider uncovers the map as the "
+        "estimated pose sees it: if the pose is right, edges run on.</p>"
         "<div class=controls><label>frame <input type=range id=which min=0 "
         f"max={len(sheets) - 1} value=0></label> <label>video | map <input type=range id=share "
         "min=0 max=100 value=50></label></div>" + "".join(sheets)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,7 +65,7 @@ def run_trial(
         opened.callback(stack.close)
         known = priors_of(flight, stack.cache)
         kind = map_kind(stack.cache)
-        search = _LazyRelocalizer(stack.cache, config, opened)
+        search = _opened_once(stack.cache, config, opened)
         first_loader = FrameLocalizer(
             build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
         )
@@ -83,7 +84,12 @@ def run_trial(
             told: dict[int, Pose] = {}
             sure = build_localizer(stack, found.camera, _known_to(config, begun), sensors_of(told))
             loader = FrameLocalizer(sure, search, found.camera, told)
-            second = _all(flight, begun, loader, stage, "localizing again")
+            second = tuple(
+                localize_each(
+                    range(len(begun)), (), lambda k: loader.from_prior(flight.frames[k], begun[k]),
+                    stage("localizing again"),
+                ).values()
+            )  # fmt: skip
         searched, left = _searched(flight, priors, loader, options.searches, stage)
     why = reasons(flight.frames, priors, second, found, kind)
     notes = (*flight.notes, *known.notes, *left, *_map_notes(kind, flight))
@@ -95,51 +101,51 @@ def spread(items: Sequence[int], most: int) -> list[int]:
     return [items[k] for k in sorted(range(len(items)), key=lambda k: f"{k:032b}"[::-1])][:most]
 
 
-def until_in_vain(
-    order: Sequence[int], localize: Callable[[int], Localized], done: Callable[[int], None]
+def localize_each(
+    order: Sequence[int],
+    searched: Collection[int],
+    localize: Callable[[int], Localized],
+    counter: AbstractContextManager[Count],
 ) -> dict[int, Localized]:
-    """Search frames in this order, but no more than 6 if none of these is found."""
-    tried: dict[int, Localized] = {}
-    for k in order:
-        if len(tried) == _VAIN and not any(one.accepted for one in tried.values()):
-            break
-        tried[k] = localize(k)
-        done(len(tried))
-    return tried
+    """Localize frames in this order: of those in `searched` no more than 6 if none is found."""
+    done: dict[int, Localized] = {}
+    with counter as count:
+        for k in order:
+            tried = [one.accepted for j, one in done.items() if j in searched]
+            if k in searched and len(tried) >= _VAIN and not any(tried):
+                continue
+            done[k] = localize(k)
+            count(len(done), len(order))
+    return done
 
 
 def placed(
     flight: RecordedFlight, known: FlightPriors, loader: FrameLocalizer, stage: Stage
 ) -> tuple[RecordedFlight, FlightPriors, tuple[Localized, ...]]:
-    """Localize from telemetry. Frames without heading or height need a search: those that were not
-    searched are left out of the flight, and a note says so.
+    """Localize from telemetry. Of frames without heading or height, which need a search, those that
+    are not tried are left out of the flight; a note says so.
     """
     frames, priors = flight.frames, known.priors
     slow = [k for k, p in enumerate(priors) if p.pose is not None and not p.is_complete]
     chosen = spread(slow, _MOST_PLACED)
-    with stage("localizing") as count:
-        total = len(priors) - len(slow) + len(chosen)
-        done = until_in_vain(
-            chosen, lambda k: loader.from_prior(frames[k], priors[k]), lambda n: count(n, total)
-        )
-        left_out = set(slow) - done.keys()
-        tried = len(done)
-        for k in range(len(priors)):
-            if k not in left_out and k not in done:
-                done[k] = loader.from_prior(frames[k], priors[k])
-                count(len(done), total)
-    notes = list(known.notes)
+    done = localize_each(
+        [*chosen, *(k for k in range(len(priors)) if k not in slow)], chosen,
+        lambda k: loader.from_prior(frames[k], priors[k]), stage("localizing"),
+    )  # fmt: skip
+    kept = sorted(done)
+    left_out, notes = len(priors) - len(kept), known.notes
     if left_out:
+        tried = len(slow) - left_out
         vain = ", and none of them is found" if tried < len(chosen) else ""
-        notes.append(
+        notes = (
+            *notes,
             f"{len(slow)} frames lack a heading or a usable height and would each be searched "
             f"about their position: {tried} of them, spread over the flight, stand for all{vain}; "
-            f"{len(left_out)} are not tried"
+            f"{left_out} are not tried",
         )
-    kept = sorted(done)
     return (
         replace(flight, frames=tuple(frames[k] for k in kept)),
-        replace(known, priors=tuple(priors[k] for k in kept), notes=tuple(notes)),
+        replace(known, priors=tuple(priors[k] for k in kept), notes=notes),
         tuple(done[k] for k in kept),
     )
 
@@ -168,36 +174,19 @@ def _map_notes(kind: MapKind, flight: RecordedFlight) -> tuple[str, ...]:
     return (f"map: {kind.line()}", *([advice] if advice else []))
 
 
-class _LazyRelocalizer:
+def _opened_once(
+    cache: TileCache, config: LocalizerConfig, opened: ExitStack
+) -> Callable[[], Relocalizer]:
     """Opens the relocalizer when it is first needed: it computes the map's overview."""
+    relocalization = config.relocalization.model_copy(update={"threads": 2})
 
-    def __init__(self, cache: TileCache, config: LocalizerConfig, opened: ExitStack) -> None:
-        relocalization = config.relocalization.model_copy(update={"threads": 2})
-        self._config = config.model_copy(update={"relocalization": relocalization})
-        self._cache, self._opened = cache, opened
-        self._relocalizer: Relocalizer | None = None
+    @functools.cache
+    def relocalizer() -> Relocalizer:
+        made = open_relocalizer(cache, config.model_copy(update={"relocalization": relocalization}))
+        assert made is not None  # only a `should_stop` gives None
+        return opened.enter_context(made)
 
-    def __call__(self) -> Relocalizer:
-        if self._relocalizer is None:
-            made = open_relocalizer(self._cache, self._config)
-            assert made is not None  # only a `should_stop` gives None
-            self._relocalizer = self._opened.enter_context(made)
-        return self._relocalizer
-
-
-def _all(
-    flight: RecordedFlight,
-    priors: tuple[FramePrior, ...],
-    loader: FrameLocalizer,
-    stage: Stage,
-    what: str,
-) -> tuple[Localized, ...]:
-    done = []
-    with stage(what) as count:
-        for recorded, prior in zip(flight.frames, priors, strict=True):
-            done.append(loader.from_prior(recorded, prior))
-            count(len(done), len(priors))
-    return tuple(done)
+    return relocalizer
 
 
 def _begun(prior: FramePrior, first: Localized) -> FramePrior:
@@ -222,15 +211,10 @@ def _searched(
     chosen = spread(range(len(priors)), most)
     if not chosen:
         return {}, ()
-    with stage("searching without positions") as count:
-        found = until_in_vain(
-            chosen,
-            lambda k: loader.anywhere(flight.frames[k], priors[k]),
-            lambda n: count(n, len(chosen)),
-        )
-    if len(found) == len(chosen):
-        return found, ()
-    return found, (
-        f"without positions none of {len(found)} frames is found: {len(chosen) - len(found)} more "
-        "are not searched",
-    )
+    found = localize_each(
+        chosen, chosen, lambda k: loader.anywhere(flight.frames[k], priors[k]),
+        stage("searching without positions"),
+    )  # fmt: skip
+    left_out = len(chosen) - len(found)
+    note = f"without positions none of {len(found)} frames is found; {left_out} are not tried"
+    return found, (note,) if left_out else ()

@@ -19,7 +19,7 @@ from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer, Localized, height_bands
 from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
-from companion.trial.run import placed, spread, until_in_vain
+from companion.trial.run import localize_each, placed, spread
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -182,16 +182,17 @@ def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(
 
 
 def test_searches_end_where_none_of_the_first_finds_anything():
-    def search(found):
-        return until_in_vain(
-            spread(range(100), 20),
-            lambda k: Localized(str(k), None, accepted=k in found),
-            lambda _done: None,
-        )
+    chosen = spread(range(100), 20)
 
-    assert len(search(())) == 6
-    assert len(search(range(100))) == 20
-    assert len(search({spread(range(100), 6)[-1]})) == 20
+    def count(found, searched=chosen):
+        return len(localize_each(chosen, searched, lambda k: Localized(str(k), None, accepted=k in
+                                 found), _silent("")))  # fmt: skip
+
+    assert count(()) == 6
+    assert count((), ()) == 20
+    assert count(range(100)) == 20
+    assert count({chosen[5]}) == 20
+    assert count({chosen[6]}) == 6
 
 
 def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_assets, tmp_path):
