@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 
 import cv2
 import numpy as np
@@ -59,8 +60,12 @@ class ClockOffset:
     @property
     def text(self) -> str:
         """The values as text."""
+        offset = f"{self.offset_s:+.2f} s"
+        if abs(self.offset_s) > 86_400.0:  # a video's clock begins at 0
+            begin = datetime.fromtimestamp(self.offset_s, timezone.utc)
+            offset = f"the video begins at {begin:%Y-%m-%d %H:%M:%S} UTC"
         return (
-            f"{self.offset_s:+.2f} s by motion ({self.pairs} pairs of images, "
+            f"{offset} by motion ({self.pairs} pairs of images, "
             f"{self.residual_deg:.2f} degrees left, {self.second_deg:.2f} at the next best offset; "
             f"by chance: {self.chance:.1g})"
         )

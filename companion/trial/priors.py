@@ -305,9 +305,12 @@ def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) 
             f"the camera's tilt is not measured in {assumed} of {len(priors)} frames: taken as "
             f"straight down, {priors[0].tilt_sigma_deg:.0f} degrees unsure"
         )
-    unknown = sum(p.heading_sigma_deg is None for p in priors)
-    if unknown:
-        notes.append(f"the heading is not known in {unknown} of {len(priors)} frames: searched")
+    for what, unknown in (
+        ("heading", sum(p.heading_sigma_deg is None for p in priors)),
+        ("height", sum(p.pose is not None and not p.height_known for p in priors)),
+    ):
+        if unknown:
+            notes.append(f"no usable {what} in {unknown} of {len(priors)} frames: searched")
     beside = sum(f.telemetry.position is not None for f in frames) - sum(p.over_map for p in priors)
     if beside:
         notes.append(f"{beside} frames were taken beside the map")
