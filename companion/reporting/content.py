@@ -141,9 +141,9 @@ class Report:
     """All contents of a report. first: the first fault as text; abscissa: label of the plots and
     timeline.
 
-    spans: named lanes of stretches (states, GNSS denied); notes: what the report could not show;
-    overlays_of: the frames that the overlays show; verdict: the result in one
-    sentence; tables: further ones with their titles.
+    spans: named lanes of time spans (states, GNSS denied); notes: what the report could not show;
+    overlays_of: the frames that the overlays show; verdict: the result in one sentence; tables:
+    further tables with their titles.
     """
 
     title: str

@@ -254,8 +254,10 @@ def _usable(
 
 
 def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: float) -> list[str]:
-    """A note where absolute less relative heights, which is the take-off's, differ from the map's
-    ground there as feet differ from metres. takeoff_m: the map's, above the ellipsoid.
+    """A note if the heights seem to be in feet: absolute minus relative height is the height of the
+    take-off, which then differs from the map's by the ratio of feet and metres.
+
+    takeoff_m: the map's ground at the take-off, above the ellipsoid.
     """
     for datum, ground in ((Datum.ELLIPSOID, takeoff_m), (Datum.AMSL, takeoff_m - geoid_m)):
         both = [(told[datum], told[Datum.TAKEOFF]) for told in levels
