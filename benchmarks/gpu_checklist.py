@@ -70,8 +70,8 @@ def steps(sequence: Path | None, cache: Path | None, out: Path) -> list[Checklis
         ("pairs", "pairs configs/train_s0.yaml --pairs 32 --no-photos", 150),
         ("optimizer", "optimizer.gpu", 150),
     ):
-        command = (python, "-m", *f"benchmarks.{module}".split(), "--json", f"{out}/{title}.json")
-        found.append(ChecklistStep(title, command, limit_s))
+        words = (*f"benchmarks.{module}".split(), "--json", f"{out}/{title}.json")
+        found.append(ChecklistStep(title, (python, "-m", *words), limit_s))
     if sequence is not None and cache is not None:
         evaluation = (python, "-m", "companion", "eval", str(sequence), "--map", str(cache),
                       "--limit", "100")  # fmt: skip
