@@ -105,12 +105,12 @@ def available_providers() -> list[str]:
     """Full names of the usable execution providers on this computer."""
     names = ort.get_available_providers()
     if _CUDA in names:
-        _load_cuda_packages()
+        load_cuda_packages()
     return [*names, *([_OPENVINO] if is_worthwhile() else [])]
 
 
 @functools.cache
-def _load_cuda_packages() -> None:
+def load_cuda_packages() -> None:
     """Load CUDA and cuDNN from Python packages, where onnxruntime does not look by itself."""
     with contextlib.redirect_stdout(io.StringIO()) as told:
         ort.preload_dlls(directory="")

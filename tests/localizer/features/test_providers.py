@@ -220,11 +220,11 @@ def test_cuda_is_loaded_from_python_packages_once(monkeypatch: pytest.MonkeyPatc
     def preload(directory: str) -> None:
         asked.append(directory)
 
-    providers._load_cuda_packages.cache_clear()
+    providers.load_cuda_packages.cache_clear()
     monkeypatch.setattr(ort, "preload_dlls", preload)
     for names, expected in ((["CPU"], []), (["CUDA", "CPU"], [""]), (["CUDA", "CPU"], [""])):
         there = [f"{name}ExecutionProvider" for name in names]
         monkeypatch.setattr(ort, "get_available_providers", lambda there=there: there)
         assert set(there) <= set(providers.available_providers())
         assert asked == expected
-    providers._load_cuda_packages.cache_clear()
+    providers.load_cuda_packages.cache_clear()
