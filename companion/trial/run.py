@@ -137,7 +137,7 @@ class _LazyRelocalizer:
     """Opens the relocalizer when it is first needed: it computes the map's overview."""
 
     def __init__(self, cache: TileCache, config: LocalizerConfig, opened: ExitStack) -> None:
-        relocalization = config.relocalization.model_copy(update={"threads": 2})
+        relocalization = replace(config.relocalization, threads=2)
         self._config = config.model_copy(update={"relocalization": relocalization})
         self._cache, self._opened = cache, opened
         self._relocalizer: Relocalizer | None = None
