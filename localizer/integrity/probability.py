@@ -80,6 +80,12 @@ def evidence(quality: float, patches: int, share: float, peak: float, lead: floa
 
 
 def log_odds(result: Registration) -> float:
-    """Natural log odds that a registration shows the right position; -inf without evidence."""
+    """Natural log odds that a registration shows the right position; -inf without evidence.
+
+    Of several passes over one image the least counts: a later pass searches a smaller space about
+    the result before, so it finds no rival position, at a wrong one as well.
+    """
     features = place_features(result)
-    return -np.inf if features is None else place_model().log_odds(features)
+    if features is None:
+        return -np.inf
+    return float(np.minimum(place_model().log_odds(features), result.earlier_log_odds))

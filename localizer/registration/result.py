@@ -35,7 +35,8 @@ class Registration:
     the swarm is worse, as a share of the score, inf without another. focal_gain: how much better
     another focal length fits (`zoom.FocalTest`), -inf where that was not tested. mode_covariance:
     (6, 6), what of the covariance stems from other modes (equation 14). noise: (6, 6), what is new
-    in each frame, for a filter over frames; None: the covariance.
+    in each frame, for a filter over frames; None: the covariance. earlier_log_odds: the least of
+    the same image's earlier passes (`localizer.integrity.probability`), inf without any.
     """
 
     world_from_camera: Pose
@@ -50,6 +51,7 @@ class Registration:
     focal_gain: float = -np.inf
     mode_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     noise: Array | None = None
+    earlier_log_odds: float = np.inf
 
 
 @dataclass(frozen=True)
