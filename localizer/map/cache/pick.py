@@ -87,8 +87,8 @@ def _nearest(
 def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) -> BundleHits:
     """The nearest hits of rays from `origin` (3,) with similar directions (N, 3).
 
-    For N rays about as fast as `cast_rays` for one: a triangle on the far side of one of the
-    bundle's four bounding planes is passed over for all of them.
+    It takes about as long as one ray of `cast_rays`: a triangle outside one of the bundle's four
+    bounding planes is skipped for all rays.
     """
     nearest, normals = _nearest_of_bundle(meshes, origin, directions, 0.0)
     missed = ~np.isfinite(nearest)
