@@ -34,6 +34,7 @@ _IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not us
 _UNKNOWN_CLEARANCE_M = (15.0, 150.0)  # of small drones: 120 m is the usual limit, over relief
 _DATUM_M = 10.0  # between the heights of two datums: more is worth a look before a flight
 _FOOT_M = 0.3048
+_CLIMB_M = 100.0  # between take-off and photos; less is no sign of feet: on a hillside by the sea
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
 _FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
@@ -254,8 +255,10 @@ def _usable(
 
 
 def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: float) -> list[str]:
-    """A note where absolute less relative heights, which is the take-off's, differ from the map's
-    ground there as feet differ from metres. takeoff_m: the map's, above the ellipsoid.
+    """A note if the heights seem to be in feet: absolute minus relative height is the height of the
+    take-off, which then differs from the map's by the ratio of feet and metres.
+
+    takeoff_m: the map's ground at the take-off, above the ellipsoid.
     """
     for datum, ground in ((Datum.ELLIPSOID, takeoff_m), (Datum.AMSL, takeoff_m - geoid_m)):
         both = [(told[datum], told[Datum.TAKEOFF]) for told in levels
@@ -264,7 +267,10 @@ def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: floa
             continue
         photos = ground + float(np.median([a.value_m - b.value_m for a, b in both]))
         sigma = float(np.median([math.hypot(a.sigma_m, b.sigma_m) for a, b in both]))
-        if abs(photos - ground) > 3.0 * sigma and abs(photos - _FOOT_M * ground) < 2.0 * sigma:
+        if (
+            abs(photos - ground) > max(3.0 * sigma, _CLIMB_M)
+            and abs(photos - _FOOT_M * ground) < 2.0 * sigma
+        ):
             return [
                 f"the map's ground is {ground:.0f} m above the {datum.value}, by the photos' "
                 f"heights {photos:.0f} m: are its heights in feet? Build it with --height-unit ft"
@@ -303,9 +309,12 @@ def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) 
             f"the camera's tilt is not measured in {assumed} of {len(priors)} frames: taken as "
             f"straight down, {priors[0].tilt_sigma_deg:.0f} degrees unsure"
         )
-    unknown = sum(p.heading_sigma_deg is None for p in priors)
-    if unknown:
-        notes.append(f"the heading is not known in {unknown} of {len(priors)} frames: searched")
+    for what, unknown in (
+        ("heading", sum(p.heading_sigma_deg is None for p in priors)),
+        ("height", sum(p.pose is not None and not p.height_known for p in priors)),
+    ):
+        if unknown:
+            notes.append(f"no usable {what} in {unknown} of {len(priors)} frames: searched")
     beside = sum(f.telemetry.position is not None for f in frames) - sum(p.over_map for p in priors)
     if beside:
         notes.append(f"{beside} frames were taken beside the map")

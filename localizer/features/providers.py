@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import io
 import logging
 import os
 from collections.abc import Callable, Sequence
@@ -67,9 +69,9 @@ def start_session(
     """Start a session on the best installed provider that works. check: runs the model once, so
     that engines are built and algorithms chosen before the first frame.
 
-    only: short name of the provider to use instead of the best. Each provider that does not run the
-    model is one warning; TensorRT is tried again without what it kept, which may be damaged. Raises
-    `ModelError` when none does.
+    only: short name of the only provider to use. A provider that cannot run the model is reported
+    by one warning. TensorRT is tried a second time without its cached engines, which may be
+    damaged. Raises `ModelError` if no provider works.
     """
     available = available_providers()
     names = [name for name in SHORT_NAMES if name in available]
@@ -101,7 +103,18 @@ def start_session(
 
 def available_providers() -> list[str]:
     """Full names of the usable execution providers on this computer."""
-    return [*ort.get_available_providers(), *([_OPENVINO] if is_worthwhile() else [])]
+    names = ort.get_available_providers()
+    if _CUDA in names:
+        load_cuda_packages()
+    return [*names, *([_OPENVINO] if is_worthwhile() else [])]
+
+
+@functools.cache
+def load_cuda_packages() -> None:
+    """Load CUDA and cuDNN from Python packages, where onnxruntime does not look by itself."""
+    with contextlib.redirect_stdout(io.StringIO()) as told:
+        ort.preload_dlls(directory="")
+    _log.debug("features: %s", told.getvalue())
 
 
 def _started(

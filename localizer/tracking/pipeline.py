@@ -24,7 +24,7 @@ from localizer.errors import (
     OutsideMapError,
 )
 from localizer.features.extractor import FeatureExtractor
-from localizer.geometry.camera import Camera, followed
+from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import LocalFrame
 from localizer.integrity.probability import log_odds
 from localizer.map.kind import MapKind
@@ -156,12 +156,12 @@ class Localizer:
     Above 200 lines and 15 public methods: it is the library's whole interface for one camera.
     Motion, acceptance and dead reckoning are `Tracker`'s.
 
-    sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
-    rate of the motion model. Their roll, pitch and height are fused with each registration
+    sensors: attitude and motion of autopilot and gimbal. Their rotations replace the constant
+    angular rate of the motion model. Their roll, pitch and height are fused with each registration
     (`tracking.sensor_fusion`). With the displacement they confirm or refute a tentative track.
-    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: what is not
-    known of the ground, hills where nobody says. on_close: releases what was opened for this
-    localizer. is_loading: whether requested tiles are still loading.
+    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: uncertainty of
+    the ground, that of hills by default. on_close: releases what was opened for this localizer.
+    is_loading: whether requested tiles are still loading.
     """
 
     def __init__(
@@ -307,7 +307,7 @@ class Localizer:
         stage_ms: dict[str, float] = {}
         features: FeaturePyramid | None = None
         least_odds = np.inf
-        self.camera = followed(self._pinhole, frame.camera)
+        self.camera = with_field_of_view(self._pinhole, frame.camera)
         for remaining in range(passes - 1, -1, -1):
             prior = self.predict(frame.exposure_time_ns)
             if prior is None:
@@ -369,8 +369,8 @@ class Localizer:
     ) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2).
 
-        at: where the camera will be soon, if the view is to be rendered from there.
-        `OutsideMapError` if the view shows no map, `MapLoadingError` while tiles are being read.
+        at: a later pose of the camera, if the view is to be rendered there. `OutsideMapError` if
+        the view shows no map, `MapLoadingError` while tiles are being read.
         """
         pose = (at or prior).world_from_camera
         view = self._renderer.render(pose, self.camera, wait=wait)
@@ -394,7 +394,7 @@ class Localizer:
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
         """Features of the frame. They do not need the reference, so this may run in parallel."""
-        undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
+        undistorter, camera = self._undistorter, with_field_of_view(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
@@ -415,7 +415,7 @@ class Localizer:
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors, seen: TrackerState,
         ahead: MotionState,
     ) -> Registration:  # fmt: skip
-        camera = followed(self._pinhole, frame.camera)
+        camera = with_field_of_view(self._pinhole, frame.camera)
         image = self._optimizer.register(
             query,
             camera,
@@ -438,13 +438,13 @@ class Localizer:
     ) -> PoseEstimate:
         """Register the frame against the anchors, test the result and update the filter.
 
-        anchors: None where no reference can be had: the odometry answers, if it can.
+        anchors: None without a reference; the odometry then estimates the pose, if it can.
         earlier_log_odds: as `Registration`'s. `OutsideMapError` before there is a prior.
         """
         seen = self.tracker
         ahead = self._ahead(seen, frame)
         stage_ms: dict[str, float] = {}
-        camera = followed(self._pinhole, frame.camera)
+        camera = with_field_of_view(self._pinhole, frame.camera)
         result, image, sweep = None, None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
@@ -452,7 +452,7 @@ class Localizer:
                 image = self._register(frame, query, seen_anchors, seen, ahead)
                 image = replace(image, earlier_log_odds=earlier_log_odds)
                 result = self._fusion.fuse(image, frame.exposure_time_ns)
-        estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
+        estimate = self._tracker.update(seen, ahead, frame, query, anchors, result)
         if anchors is not None and image is not None and estimate.status is RegistrationStatus.OK:
             # Added to what is reported, not to what is filtered: the next frame has the same error.
             moving = (ahead.velocity, ahead.rate)
