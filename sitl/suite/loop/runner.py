@@ -30,7 +30,7 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 class RunOptions:
     """Vehicles, seeds (world, light, errors), and folders of records and worlds. say: receives
     progress lines; building: receives the progress of world generation (step, share done).
-    resume: keep what ``out`` holds, and fly what it does not hold yet.
+    resume: fly only what ``out`` does not hold yet, or holds as not flown or too slow.
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -51,10 +51,14 @@ def fly_loop(
     """
     options.out.mkdir(parents=True, exist_ok=True)
     kept = options.out / "loop.json"
-    rows = [row for row in read_rows(kept) if row.valid] if options.resume and kept.exists() else []
+    rows = list(read_rows(kept)) if options.resume and kept.exists() else []
     for kind, seed, case in product(options.vehicles, options.seeds, cases):
-        if any((row.name, row.vehicle, row.seed) == (case.name, kind, seed) for row in rows):
+        flown = [
+            row for row in rows if (row.name, row.vehicle, row.seed) == (case.name, kind, seed)
+        ]
+        if any(row.valid for row in flown):
             continue
+        rows = [row for row in rows if row not in flown]
         options.say(f"flying {case.name} on {kind}, seed {seed}: {case.title}")
         row = _flown(case, kind, seed, options)
         rows.append(row)
