@@ -59,11 +59,11 @@ def vision_fix(
     gimbal: GimbalAttitude | None,
     reset_count: int,
 ) -> VisionFix:
-    """The vehicle's position and attitude from the camera's estimate.
+    """The vehicle's position and attitude from the camera's estimate; for accepted estimates.
 
-    attitude and gimbal at the exposure: together they give the camera's orientation on the body.
-    Without them the vehicle's attitude is unknown, and the camera's position is reported: the
-    square of the lever arm's length is added to each axis' variance. For accepted estimates.
+    attitude, gimbal: at the exposure. Together they give the camera's orientation on the body.
+    Without them the vehicle's attitude is unknown. The camera's position is then reported as that
+    of the vehicle, and the square of the lever arm's length is added to the variance of each axis.
     """
     frame, arm, pose = extrinsics.frame, extrinsics.lever_arm_m, estimate.world_from_camera
     world_from_body: Array | None = None
@@ -103,8 +103,8 @@ def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
 def camera_rotation(gimbal: GimbalAttitude) -> Array:
     """Rotation (3, 3) world_from_camera by the gimbal's report.
 
-    The axes at the map's origin are used instead of the vehicle's: 0.1° at 10 km, far below the
-    gimbal's error.
+    The axes are those at the map's origin and not at the vehicle: this error is 0.1° at 10 km, far
+    below the gimbal's.
     """
     world_from_camera: Array = (
         NED_FROM_ENU.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA

@@ -12,8 +12,9 @@ _PATIENCE_S = 5.0
 
 
 def joined(thread: threading.Thread) -> bool:
-    """Whether a daemon thread that was told to end has ended. A thread that hangs, for example on a
-    disk or device, is named in the log, and the shutdown continues: record and link are closed.
+    """Wait for a daemon thread that was told to end; returns whether it has ended. A thread that
+    hangs, for example on a disk or device, is named in the log. The shutdown then continues, so
+    that record and link are closed.
     """
     thread.join(_PATIENCE_S)
     if thread.is_alive():

@@ -25,8 +25,8 @@ class GimbalFrame(Enum):
     """Reference frame of a gimbal's angles.
 
     HEADING: roll and pitch from the horizon, yaw from the vehicle's heading (MAVLink's
-    GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, what ArduPilot sends). EARTH: yaw from true north.
-    BODY: all three from the body, as of a camera that is screwed on.
+    GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, as ArduPilot sends it). EARTH: yaw from true north.
+    BODY: all three angles from the body, as for a fixed camera.
     """
 
     HEADING = "heading"

@@ -56,7 +56,8 @@ class VehicleTelemetry(Protocol):
 class InertialDisplacement:
     """The IMU's integral at a time: velocity and position (2,), north and east, m/s, m.
 
-    Both have begun at zero at some time and drift; only their changes over seconds mean something.
+    Both start at zero at an arbitrary time and drift, so only their changes over seconds are
+    meaningful.
     """
 
     time_ns: int

@@ -45,7 +45,8 @@ REMOVED = {
 def with_current_keys(model: type[BaseModel], data: dict[str, Any], where: str) -> dict[str, Any]:
     """The settings of `model` with today's names; `where` names the file in warnings.
 
-    A key that is given under both names keeps both: the model then refuses the old one.
+    If a key is given under its old and its new name, both are kept, and the model refuses the old
+    one.
     """
     data = copy.deepcopy(data)
     for old, new in RENAMED.items():

@@ -56,8 +56,8 @@ def refuse_input(path: Path, option: str, *inputs: Path | None) -> None:
 
 
 class NewestFile:
-    """A file with the newest text, replaced atomically by its own thread, so that a slow disk
-    blocks nobody; texts that it is too slow for are skipped.
+    """A file with the newest text. Its own thread replaces it atomically, so that a slow disk
+    blocks no other thread. If the disk is slower than new texts come, older texts are skipped.
 
     failed: called in that thread with the error.
     """

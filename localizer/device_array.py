@@ -22,10 +22,10 @@ class DeviceArray:
 
     @classmethod
     def of(cls, other: Any) -> DeviceArray:
-        """From anything with ``__cuda_array_interface__`` (CuPy, PyTorch, numba).
+        """From any object with ``__cuda_array_interface__`` (CuPy, PyTorch, numba).
 
-        The producer must have finished: the registration's stream does not wait for others.
-        `DeviceArrayError` if it has strides.
+        The array must be complete, because the registration's stream does not wait for other
+        streams. `DeviceArrayError` if it has strides.
         """
         interface = other.__cuda_array_interface__
         if interface.get("strides") is not None:

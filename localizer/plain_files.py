@@ -17,8 +17,8 @@ MOST_BYTES = 1 << 28  # of text and pictures; what is longer is another file, gi
 def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
     """Content of a plain file. most: size limit in bytes; None: no limit.
 
-    OSError for a pipe, whose reader waits for who writes into it, for a device, which may have no
-    end, and for more than `most` bytes.
+    OSError for a pipe, which may block the reader, for a device, which may have no end, and for
+    more than `most` bytes.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with open(descriptor, "rb") as file:

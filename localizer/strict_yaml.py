@@ -16,8 +16,8 @@ _OCTAL = re.compile(r"[-+]?0[0-9_]+")
 class _StrictLoader(yaml.SafeLoader):
     """A safe loader that refuses a repeated key and the merge key `<<`.
 
-    How a merge expands differs between releases of PyYAML, and merges of merges grow ninefold with
-    each line. No setting needs one.
+    Releases of PyYAML expand merges differently, and nested merges can grow ninefold with each
+    line. No setting needs a merge.
     """
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:

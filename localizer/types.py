@@ -23,8 +23,8 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Frame:
-    """One video frame. image: (height, width, 3) uint8 RGB, as the (distorted) camera saw it; a
-    grey one (height, width) gets three equal channels, counts of 16 bits are a `GreyRangeError`.
+    """One video frame. image: (height, width, 3) uint8 RGB, as the (distorted) camera recorded it;
+    a grey image (height, width) gets three equal channels; 16-bit values are a `GreyRangeError`.
     """
 
     image: Image
@@ -159,16 +159,16 @@ class FocalFit:
 class PoseEstimate:
     """The localizer's answer for one frame.
 
-    covariance: (6, 6) as in `PosePrior`, so east, north, up (m) and rotation about them (rad).
-    quality: 0 to 1. status: whether the registration gave a pose. accepted: whether integrity
-    allows its use; it can refuse a pose with status OK. stage_ms: latency of each stage,
+    covariance: (6, 6) as in `PosePrior`: east, north, up (m) and rotation about them (rad).
+    quality: 0 to 1. status: whether the registration gave a pose. accepted: whether the integrity
+    test allows its use; it can refuse a pose with status OK. stage_ms: latency of each stage,
     milliseconds. last_fix_ns: exposure of the newest estimate that the map confirmed, this one
     included; None before the first.
 
     state: INITIALIZING for a single photo, which cannot be confirmed. BRIDGING estimates come from
     odometry with a growing covariance. focal: the fitted focal length, if it was fitted
-    (`LocalizerConfig.focal_fit_s`) and observable. scale_sigma: of BRIDGING, the share by which its
-    way and velocity may be too long or too short; None otherwise.
+    (`LocalizerConfig.focal_fit_s`) and observable. scale_sigma: of BRIDGING, the relative sigma of
+    its displacement and velocity; None otherwise.
     """
 
     world_from_camera: Pose
@@ -233,9 +233,9 @@ class TargetFix:
     square about the position including other surfaces. elsewhere: probability, 0 to 1, that the
     target is on another surface than the reported one.
 
-    pixel: its place in the frame; None beside the picture. velocity: (3,) m/s, world axes, with its
-    covariance (3, 3); None of what stands still or was seen once. extent: its width and height in
-    the frame, pixels, where they are known.
+    pixel: its position in the frame; None outside the frame. velocity: (3,) m/s, world axes, with
+    its covariance (3, 3); None for a static target or after one observation. extent: its width and
+    height in the frame, pixels, if known.
     """
 
     target_id: str

@@ -15,8 +15,8 @@ PRIVATE = 0o600
 def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = False) -> None:
     """Write the text beside the file and rename it; raises `OSError` if the disk refuses.
 
-    The file beside it is always a new one: a link that somebody laid there is not followed.
-    durable: it is on the disk before it is in its place, for what must outlive a loss of power.
+    The temporary file is always a new one, so a symbolic link of another user is not followed.
+    durable: the text is on the disk before the file is renamed, so that it survives a power loss.
     mode: access rights of the new file.
     """
     temporary = path.with_name(f".{path.name}.tmp")
@@ -34,8 +34,8 @@ def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = 
 def read_small_file(path: Path, most: int = 1000) -> str:
     """Read the UTF-8 text. most: size limit in bytes.
 
-    `OSError` for a link, a pipe, whose reader waits for who writes, and for a longer file;
-    ValueError for what is no text.
+    `OSError` for a link, for a pipe, which would block the reader, and for a larger file;
+    ValueError if the content is no text.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     with open(descriptor, "rb") as file:

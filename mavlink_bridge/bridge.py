@@ -62,15 +62,15 @@ _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one
 class Bridge:
     """The localizer's MAVLink interface. Every public method may be called from any thread.
 
-    Above 200 lines and 15 public methods: it is the package's whole surface, and each method hands
-    one thing to, or asks one thing of, the part that does the work.
+    Above 200 lines and 15 public methods: it is the package's whole interface, and each method
+    passes one call to the component that does the work.
 
-    on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
-    on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
-    on_alert: called likewise with every alert for the operator.
-    clock: CLOCK_MONOTONIC, ns; for a recorded flight, which `play` and `tick` go through instead of
-    `start`, the time in the record.
-    Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
+    on_track: called in a link's thread when the operator asks for tracking; it must return at once.
+    on_hint: called likewise when the operator gives the vehicle's position; returns whether it can
+    be used. on_alert: called likewise with every alert for the operator. clock: CLOCK_MONOTONIC,
+    ns; for a recorded flight, which uses `play` and `tick` in place of `start`, the time in the
+    record. Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be
+    used.
     """
 
     def __init__(
@@ -87,12 +87,12 @@ class Bridge:
         self._started = self._stopped = False
         self._utc = SteadyUtc()
         self._status = OperatorStatus(self._send_text, on_alert, clock)
-        teller = StatusNotifier(self.report_alert)
+        notifier = StatusNotifier(self.report_alert)
         self._recorder = None
         if config.tlog is not None:
 
             def incomplete(why: str) -> None:
-                teller.report(alert(AlertId.TLOG_INCOMPLETE, why=Name(why)))
+                notifier.report(alert(AlertId.TLOG_INCOMPLETE, why=Name(why)))
 
             self._recorder = TlogRecorder(config.tlog, incomplete)
         self._tracker = VehicleTracker(
@@ -101,7 +101,7 @@ class Bridge:
             config.camera.mount == "fixed",
             (config.camera.gimbal_component, config.camera.gimbal_device),
         )
-        enable = _enable(config, teller)
+        enable = _enable(config, notifier)
         self._shared = shared = Shared(
             config,
             geoid_separation_m,
@@ -423,12 +423,12 @@ class _LinkMaker:
         return Link(Endpoint.parse(connection), handler, options)
 
 
-def _enable(config: BridgeConfig, teller: StatusNotifier) -> InjectionEnable | None:
+def _enable(config: BridgeConfig, notifier: StatusNotifier) -> InjectionEnable | None:
     if config.mode != "rc":
         return None
     file = config.state_file
     memory = None if file is None else InjectionEnableMemory(RestartMemory(file))
-    return InjectionEnable(config.rc, teller.report, memory)
+    return InjectionEnable(config.rc, notifier.report, memory)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

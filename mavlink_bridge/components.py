@@ -126,10 +126,10 @@ class Components:
         self._camera.tick(now_ns, position, self._shared.uptime_ms(now_ns), link.send)
 
     def command(self, link: Link, message: Any, time_ns: int) -> None:
-        """A command of a ground station to one of our components.
+        """Process a command of a ground station to one of our components.
 
-        While the link is congested it is left unanswered, as if lost: the sender repeats it, and
-        a flood of commands costs no position its place.
+        While the link is congested, the command is not answered, as if it were lost. The sender
+        repeats it, and many commands cannot delay positions.
         """
         if link.congested:
             return

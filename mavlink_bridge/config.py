@@ -27,10 +27,10 @@ class StrictModel(BaseModel):
 
 
 class OriginConfig(StrictModel):
-    """The EKF origin to set when the vehicle has none: WGS84 degrees and metres AMSL.
+    """The EKF origin to set if the vehicle has none: WGS84 degrees and metres AMSL.
 
-    ArduPilot ignores a second origin, so an origin that the vehicle already has wins.
-    Give the altitude of the take-off ground: the barometer reads zero there.
+    ArduPilot ignores a second origin, so an existing origin is kept. Give the altitude of the
+    take-off ground, where the barometer reads zero.
     """
 
     latitude_deg: float = Field(ge=-90.0, le=90.0)

@@ -66,7 +66,7 @@ def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
 class FlightControllerEnd:
     """Runs in the flight-controller link's thread; only `sender.put` is called from others.
 
-    Above 200 lines: it hands each message and each turn of the clock to one of a dozen parts.
+    Above 200 lines: it passes each message and each clock tick to one of a dozen components.
     """
 
     def __init__(self, shared: Shared) -> None:
@@ -75,25 +75,27 @@ class FlightControllerEnd:
         self.components = Components(shared, ground=False)
         self._shared = shared
         self._tracker = shared.tracker
-        self._teller = teller = StatusNotifier(shared.report, {"inject": None, "loop": None})
+        self._notifier = notifier = StatusNotifier(shared.report, {"inject": None, "loop": None})
         self._commander = commander = Commander(config.companion_component)
         self.requests = VehicleRequests(config, commander)
-        self.time_sync = TimeSync(shared.tracker, config.companion_component, teller, shared.clock)
-        self.origin = OriginExchange(config, shared.tracker, commander, teller, self.counters)
-        self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
-        self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
-        self.sources = SourceOrders(config.switch, commander, teller, self.counters)
+        self.time_sync = TimeSync(
+            shared.tracker, config.companion_component, notifier, shared.clock
+        )
+        self.origin = OriginExchange(config, shared.tracker, commander, notifier, self.counters)
+        self.outcome = InjectionOutcome(shared, self.origin, notifier, self.counters)
+        self.sender = FixSender(shared, self.origin, self.outcome, notifier, self.counters)
+        self.sources = SourceOrders(config.switch, commander, notifier, self.counters)
         self._no_go = no_go = _no_go_memory(config)
         self._interlock = ShadowInterlock(
             config.injection.force,
             self.shadow_score,
             lambda: self.outcome.compared_ns,
-            teller,
+            notifier,
             None if no_go is None else ShadowFailureMemory(no_go),
         )
-        self.news = VehicleEvents(teller)
-        self._warnings = FixWarnings(shared, self.sender.injector, teller)
-        self._strangers = UnexpectedSenderMonitor(config, shared.tracker, teller, self.counters)
+        self.news = VehicleEvents(notifier)
+        self._warnings = FixWarnings(shared, self.sender.injector, notifier)
+        self._strangers = UnexpectedSenderMonitor(config, shared.tracker, notifier, self.counters)
         self._next_check_ns = 0
         self._connected = False
         self._mode: Mode = "off"
@@ -231,7 +233,7 @@ class FlightControllerEnd:
         self.sender.rebooted()
         self.sources.rebooted()
         self.requests.reset()
-        self._teller.report(alert(AlertId.FC_REBOOTED))
+        self._notifier.report(alert(AlertId.FC_REBOOTED))
 
     # --- the clockwork --------------------------------------------------------------------------
 
@@ -304,7 +306,7 @@ class FlightControllerEnd:
         sender = self.sender
         self.outcome.compare(state, now_ns, on_gnss=self.on_gnss(now_ns))
         self._strangers.check(link, now_ns)
-        if self.outcome.judge(state, now_ns):
+        if self.outcome.check_ekf(state, now_ns):
             sender.injector.announce_jump()
         came = sender.is_good(now_ns)
         may_switch = self._interlock.may_switch(now_ns)

@@ -41,10 +41,11 @@ class GnssRefusal:
 
 @dataclass(frozen=True)
 class _Report:
-    """One report; differences are north and east, metres. off_m: from vision at its time.
+    """One report; differences are north and east, metres. off_m: difference from vision at its
+    time.
 
-    slipped_m: from the integral of the EKF's velocity, with an arbitrary zero. claimed_m: None
-    where the receiver does not say.
+    slipped_m: difference from the integral of the EKF's velocity, with an arbitrary zero.
+    claimed_m: the accuracy that the receiver states, None without one.
     """
 
     time_ns: int
@@ -58,8 +59,9 @@ class _Report:
 class GnssReturnCheck:
     """Compares the receiver with vision and with the inertial motion over some seconds.
 
-    It is accepted after 5 s in which it is near vision, keeps still against vision and the EKF's
-    velocity, scatters no more than it claims and claims enough. One thread.
+    The receiver is accepted after 5 s in which four conditions hold: it is near vision, it does not
+    drift against vision and the EKF's velocity, it scatters no more than its stated accuracy, and
+    this accuracy is 5 m or better. One thread.
     """
 
     def __init__(self) -> None:
@@ -95,7 +97,7 @@ class GnssReturnCheck:
         if state.gps_time_ns - last_ns > _GAP_NS:
             self._reports.clear()
         self._add(state, vision)
-        self._judge()
+        self._decide()
 
     def _add(self, state: VehicleState, vision: PropagatedFix) -> None:
         latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
@@ -121,7 +123,7 @@ class GnssReturnCheck:
         while state.gps_time_ns - self._reports[0].time_ns > _WINDOW_NS:
             self._reports.popleft()
 
-    def _judge(self) -> None:
+    def _decide(self) -> None:
         span_ns = self._reports[-1].time_ns - self._reports[0].time_ns
         if len(self._reports) < _REPORTS or span_ns < _REFUSED_NS:
             return

@@ -21,7 +21,7 @@ class GroundEnd:
     def __init__(self, shared: Shared) -> None:
         self.components = Components(shared, ground=True)
         self._shared = shared
-        self._teller = StatusNotifier(shared.report)
+        self._notifier = StatusNotifier(shared.report)
 
     def on_open(self, link: Link) -> None:
         """Announce at once."""
@@ -43,7 +43,9 @@ class GroundEnd:
         link.system_id = config.system_id or state.system_id or 0
         self._shared.watch.check(state)
         if link.stranger:
-            self._teller.tell("foreign", alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger)))
+            self._notifier.notify(
+                "foreign", alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
+            )
         if link.system_id:
             self.components.heartbeat(link, now_ns)
             if config.camera.announce:

@@ -30,7 +30,7 @@ class Shared:
     """Objects that the bridge shares with its links' handlers. report: sends an alert to the
     operator.
 
-    gate: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or a record's.
+    enable: None unless the mode is ``rc``. clock: CLOCK_MONOTONIC, ns, or the clock of a record.
     """
 
     config: BridgeConfig

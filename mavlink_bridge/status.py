@@ -58,8 +58,8 @@ class OperatorStatus:
         """Set the active alerts, most severe first; call it repeatedly. New ones are sent if
         `tell`.
 
-        A condition that comes and goes is sent once in 10 s, and its end once that has lasted: an
-        overload may begin and end every other second. now_ns: CLOCK_MONOTONIC.
+        An alert that comes and goes is sent at most every 10 s. Its end is sent only after it has
+        lasted, because an overload may begin and end every other second. now_ns: CLOCK_MONOTONIC.
         """
         now_ns = self._clock() if now_ns is None else now_ns
         keys = tuple(alert.key for alert in alerts)

@@ -13,7 +13,7 @@ class Hysteresis:
     """Decides when a problem is over: after some time without it, and later after each relapse.
 
     On an overloaded computer problems come and go every second. A relapse soon after the end
-    doubles the wait. What recurs during the wait is the same problem, which was reported.
+    doubles the wait. A problem that recurs during the wait is not reported again.
     """
 
     def __init__(self, wait_s: float = 1.5, longest_s: float = 60.0) -> None:
@@ -60,7 +60,7 @@ class StatusNotifier:
         """Report the next alert of a topic even if it equals the last."""
         self._reported.pop(topic, None)
 
-    def tell(self, topic: str, problem: Alert | None, relief: Alert | None = None) -> None:
+    def notify(self, topic: str, problem: Alert | None, relief: Alert | None = None) -> None:
         """Report a problem when it begins or changes in more than numbers, and `relief` when it
         ends. No relief is reported before the first problem.
         """
@@ -72,7 +72,7 @@ class StatusNotifier:
         if news is not None and (problem is not None or is_known):
             self.report(news)
 
-    def tell_settled(
+    def notify_settled(
         self,
         topic: str,
         problem: Alert | None,
@@ -81,15 +81,15 @@ class StatusNotifier:
         *,
         wait_s: float = 1.5,
     ) -> None:
-        """As `tell`, for problems that come and go: each problem once, then the relief after a time
-        without problems (`wait_s` at first, see `Hysteresis`).
+        """As `notify`, for problems that come and go: reports each problem once, then the relief
+        after a time without problems (`wait_s` at first, see `Hysteresis`).
         """
         settling = self._settling.setdefault(topic, Hysteresis(wait_s))
         over = settling.is_over(now_ns, bad=problem is not None)
         told = self._since_relief.setdefault(topic, set())
         if problem is not None and problem.key not in told:
             told.add(problem.key)
-            self.tell(topic, problem, relief)
+            self.notify(topic, problem, relief)
         elif over:
             told.clear()
-            self.tell(topic, None, relief)
+            self.notify(topic, None, relief)

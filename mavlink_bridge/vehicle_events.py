@@ -19,8 +19,8 @@ _HELD_NS = 10_000_000_000
 class VehicleEvents:
     """Reports each lasting change once. Called ten times a second by one thread."""
 
-    def __init__(self, teller: StatusNotifier) -> None:
-        self._teller = teller
+    def __init__(self, notifier: StatusNotifier) -> None:
+        self._notifier = notifier
         self._gnss: bool | None = None  # None: never seen healthy
         self._back_ns: int | None = None  # since when it is well again
         self._bad_ns = self._looked_ns = 0  # for how long it was not, on balance
@@ -36,7 +36,7 @@ class VehicleEvents:
         healthy = gnss_healthy(state, now_ns)
         self._follow_gnss(healthy and not (refused and not self._gnss), now_ns, injecting=injecting)
         if state.armed and not self._armed and not healthy:
-            self._teller.report(alert(AlertId.ARMED_WITHOUT_GNSS, output=_output(injecting)))
+            self._notifier.report(alert(AlertId.ARMED_WITHOUT_GNSS, output=_output(injecting)))
         self._armed = state.armed
 
     def held(self, reason: Alert | None, now_ns: int) -> None:
@@ -49,7 +49,7 @@ class VehicleEvents:
             return
         self._held_ns = self._held_ns or now_ns
         if now_ns - self._held_ns >= _HELD_NS:
-            self._teller.tell("held", reason)
+            self._notifier.notify("held", reason)
 
     def _follow_gnss(self, healthy: bool, now_ns: int, *, injecting: bool) -> None:
         passed_ns, self._looked_ns = min(now_ns - self._looked_ns, _LOST_NS), now_ns
@@ -58,14 +58,14 @@ class VehicleEvents:
             well = self._back_ns is not None and now_ns - self._back_ns >= _BACK_NS
             if healthy and (well or self._gnss is None):
                 if self._gnss is not None:
-                    self._teller.report(alert(AlertId.GNSS_BACK))
+                    self._notifier.report(alert(AlertId.GNSS_BACK))
                 self._gnss, self._bad_ns = True, 0
             return
         change_ns = round(-_PAID_BACK * passed_ns) if healthy else passed_ns
         self._bad_ns = max(self._bad_ns + change_ns, 0)
         if self._bad_ns > _LOST_NS:
             self._gnss, self._back_ns = False, None
-            self._teller.report(alert(AlertId.GNSS_LOST, output=_output(injecting)))
+            self._notifier.report(alert(AlertId.GNSS_LOST, output=_output(injecting)))
 
 
 def _output(injecting: bool) -> Output:

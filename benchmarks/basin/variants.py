@@ -108,8 +108,8 @@ def paper_rows() -> list[Variant]:
     it the filter's.
     """
     paper = JNGOConfig(
-        hypotheses=1, keep=(144, 144), iterations=(2, 3, 4), sharpen=0,
-        swarm_anchors=(500, 500, 500), distinct_px=0.0, preselected=0,
+        hypotheses=1, survivors=(144, 144), iterations=(2, 3, 4), sharpen=0,
+        swarm_anchors=(500, 500, 500), duplicate_px=0.0, preselected=0,
     )  # fmt: skip
     swarm = replace(paper, hypotheses=144)
 
@@ -135,9 +135,9 @@ def our_rows() -> list[Variant]:
         changed("one hypothesis", hypotheses=1),
         changed("swarm alone, no draws of the prior", preselected=0),
         Variant("without motion term", motion=False),
-        changed("no halving: all 144 to the end", keep=(144, 144)),
-        changed("halving to 32 and 8", keep=(32, 8)),
-        changed("survivors may repeat", distinct_px=0.0),
+        changed("no halving: all 144 to the end", survivors=(144, 144)),
+        changed("halving to 32 and 8", survivors=(32, 8)),
+        changed("survivors may repeat", duplicate_px=0.0),
         changed("10 iterations at the end, not 4", iterations=(2, 3, 10)),
         Variant("without detail level", detail=False),
         Variant("without detail level, N = 2000", anchors=2000, detail=False),

@@ -41,7 +41,7 @@ REPEATS, WARM_UP = 50, 5
 SETTINGS = LMSettings(min_overlap=0.01)
 _SEARCH = JNGOConfig(
     iterations=(2, 3, 4), sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01,
-    distinct_px=0.0,
+    duplicate_px=0.0,
 )  # fmt: skip
 SCHEDULES = (  # label, settings, anchors
     ("2/3/4, 144 -> 64 -> 16, N=500", _SEARCH, 500),

@@ -240,8 +240,8 @@ def _paper(stack: MapStack, setting: Setting) -> Tracking:
 def _pixloc(stack: MapStack, setting: Setting) -> Tracking:
     """PixLoc's optimizer: one hypothesis, 50 LM steps on each of three levels."""
     config = JNGOConfig(
-        hypotheses=1, keep=(1, 1), iterations=(50, 50, 50), sharpen=0,
-        swarm_anchors=(2000, 2000, 2000), distinct_px=0.0, preselected=0,
+        hypotheses=1, survivors=(1, 1), iterations=(50, 50, 50), sharpen=0,
+        swarm_anchors=(2000, 2000, 2000), duplicate_px=0.0, preselected=0,
     )  # fmt: skip
     extractor = load_extractor(setting.config.model, threads=1)
     step = DirectRival(extractor, JNGO(config, threads=1), 2000, False, np.zeros(6))

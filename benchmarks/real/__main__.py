@@ -7,7 +7,8 @@ FOLDER keeps the maps between runs. Each image begins from a prior up to 10 m of
 the height (3 m) are reported with the stated sigma, or not at all. A registration is right where
 the middle of its image lies on its true ground. NEES: squared error over the claimed covariance and
 the truth's own, per degree of freedom, the median of the accepted. --search: each image without a
-prior, heading unknown, on its map and on one that does not hold it. --rivals: SIFT, XFeat and
+prior, heading unknown, on its map and on one that does not hold it. --displaced N: N times from
+priors 45 to 110 m off that claim 6 m, roll and pitch known to 1 degree. --rivals: SIFT, XFeat and
 ALIKED + LightGlue on the same images, those that are installed.
 """
 
@@ -25,6 +26,8 @@ with needs_torch():
     from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
     from benchmarks.real.report import (
         attitude_text,
+        displaced_row,
+        displaced_table,
         judged_row,
         judged_table,
         plot,
@@ -38,7 +41,7 @@ with needs_torch():
     from benchmarks.real.sets import SETS, describe, load
 from companion.versions import made_by
 
-_RIVALS_AT = 1.0  # degrees of attitude
+_JUDGED_AT = 1.0  # degrees of attitude, of rivals and displaced priors
 _ELSEWHERE = {"caliterra": "fengyuan"}  # whose map holds no place of a set; else caliterra's
 _SEARCHED = ("fengyuan", "caliterra")
 
@@ -59,6 +62,7 @@ def parser() -> Parser:
     )
     p.add_argument("--width", type=whole(64, 2048), default=320, help="working width, px")
     p.add_argument("--search", action="store_true", help="without a prior, too")
+    p.add_argument("--displaced", type=whole(1, 100), default=0, help="wrong priors of each image")
     p.add_argument("--rivals", action="store_true", help="matchers on the same images")
     p.add_argument("--json", type=output, help="rows and every image")
     p.add_argument("--plot", type=output, help="PNG: error over protection level")
@@ -86,13 +90,27 @@ def main() -> None:
             if name in _SEARCHED
         ]
         print(searched_table(result["searched"]))
+    if args.displaced:
+        result["displaced"] = [
+            displaced_row(
+                [
+                    image
+                    for seed in range(args.displaced)
+                    for image in judged_images(
+                        name, describe(name), views[name], _JUDGED_AT, args.width, seed
+                    )
+                ]
+            )
+            for name in args.sets
+        ]
+        print(displaced_table(result["displaced"]))
     if args.rivals:
-        rivals, at = load_rivals(), [i for i in judged if i.attitude_deg == _RIVALS_AT]
+        rivals, at = load_rivals(), [i for i in judged if i.attitude_deg == _JUDGED_AT]
         matched = [
             row
             for name in args.sets
             for row in rival_images(
-                name, describe(name), views[name], rivals, _RIVALS_AT, args.width
+                name, describe(name), views[name], rivals, _JUDGED_AT, args.width
             )
         ]
         result["rivals"] = rival_rows(matched, at)

@@ -7,8 +7,8 @@ about the truth. Every image stands for itself: nothing is learned from the ones
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from localizer.types import Frame, PoseEstimate, PosePrior
 ATTITUDES: tuple[float | None, ...] = (0.3, 1.0, 3.0, None)
 HEIGHT_SIGMA_M = 3.0
 OFF_M, OFF_HEADING_DEG = 10.0, 3.0  # of the prior: largest east and north, sigma of the heading
+DISPLACED_M = 45.0, 110.0  # of a wrong prior, which claims the sigma of the others
 _UNKNOWN_TILT_DEG = 2.0  # sigma of the prior where no attitude is reported
 _INSIDE_3, _INSIDE_2 = 7.815, 5.991  # chi square, 95 %
 _PASSES = 3
@@ -68,9 +69,15 @@ class JudgedImage:
 
 def judged_images(
     name: str, described: SetDescription, views: Sequence[RealView], attitude_deg: float | None,
-    width: int, progress: Callable[[], None] = lambda: None,
+    width: int, displaced: int | None = None,
 ) -> Iterator[JudgedImage]:  # fmt: skip
-    """Of every image of a set that meets the map from its prior."""
+    """Of every image of a set that meets the map from its prior. displaced: seed of priors that lie
+    `DISPLACED_M` off and claim what the others do; where each image has its own small map, the
+    image begins on another one's.
+    """
+    own = [view.map_cache for view in views]
+    if displaced is not None:
+        views = _exchanged(views, displaced)
     height = None if attitude_deg is None else HEIGHT_SIGMA_M
     sensors = DrawnSensors(attitude_deg, height, by_frame=True, seed=5)
     times = tuple((k + 1) * 10**9 for k in range(len(views)))
@@ -92,11 +99,16 @@ def judged_images(
             renderer = NumbaRenderer(streamer, 1)
             for k, view in mine:
                 frame = Frame(view.image(), times[k], view.camera, k)
-                estimate = _localized(localizer, frame, view.truth, sensors, k)
-                progress()
+                prior = prior_of(view.truth, sensors, k, times[k])
+                if displaced is not None and view.map_cache == own[k]:
+                    prior = _displaced(prior, (displaced, k))
+                estimate = _localized(localizer, frame, prior)
                 if estimate is not None:
                     away_m = distance_to_ground(renderer, view)
-                    yield _judged(name, k, attitude_deg, described, view.truth, estimate, away_m)
+                    image = _judged(name, k, attitude_deg, described, view.truth, estimate, away_m)
+                    if view.map_cache != own[k]:  # it holds no right place
+                        image = replace(image, right=False, beyond_level=True)
+                    yield image
 
 
 def prior_of(truth: Pose, sensors: DrawnSensors, index: int, time_ns: int) -> PosePrior:
@@ -112,10 +124,27 @@ def prior_of(truth: Pose, sensors: DrawnSensors, index: int, time_ns: int) -> Po
     return sensors.in_prior(PosePrior(pose, np.diag(sigma**2), time_ns), truth, index)
 
 
-def _localized(
-    localizer: Localizer, frame: Frame, truth: Pose, sensors: DrawnSensors, index: int
-) -> PoseEstimate | None:
-    localizer.set_prior(prior_of(truth, sensors, index, frame.exposure_time_ns))
+def _exchanged(views: Sequence[RealView], seed: int) -> Sequence[RealView]:
+    """Each image with another one's map, if they have maps of their own."""
+    caches = list(dict.fromkeys(view.map_cache for view in views))
+    if len(caches) == 1:
+        return views
+    by = 2 + 2 * (seed % (len(caches) // 2 - 1))  # a place has two maps, one of each date
+    other = dict(zip(caches, caches[by:] + caches[:by], strict=True))
+    return [replace(view, map_cache=other[view.map_cache]) for view in views]
+
+
+def _displaced(prior: PosePrior, seed: tuple[int, int]) -> PosePrior:
+    """The prior moved horizontally by more than it claims."""
+    rng = np.random.default_rng(seed)
+    direction, off_m = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*DISPLACED_M)
+    moved = np.array([np.cos(direction), np.sin(direction), 0.0]) * off_m
+    pose = prior.world_from_camera
+    return replace(prior, world_from_camera=Pose(pose.rotation, pose.translation + moved))
+
+
+def _localized(localizer: Localizer, frame: Frame, prior: PosePrior) -> PoseEstimate | None:
+    localizer.set_prior(prior)
     try:
         return localizer.track(frame, passes=_PASSES)
     except OutsideMapError:

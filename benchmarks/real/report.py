@@ -71,6 +71,36 @@ def judged_table(rows: Iterable[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def displaced_row(images: Sequence[JudgedImage]) -> dict[str, Any]:
+    """The figures of one set from wrong priors."""
+    wrong = [i for i in images if not i.right]
+    accepted = [i for i in wrong if i.accepted]
+    return {
+        "set": images[0].set,
+        "registrations": len(images),
+        "wrong": len(wrong),
+        "wrong_accepted": len(accepted),
+        "beyond_level": sum(i.beyond_level for i in accepted),
+        "farthest_m": max((i.horizontal_m for i in accepted), default=None),
+    }
+
+
+def displaced_table(rows: Iterable[dict[str, Any]]) -> str:
+    """One line for each set."""
+    lines = [
+        "| set, priors 45 to 110 m off | registrations | wrong | wrong accepted | farthest m "
+        "| beyond level |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        farthest = "-" if r["farthest_m"] is None else f"{r['farthest_m']:.1f}"
+        lines.append(
+            f"| {r['set']} | {r['registrations']} | {r['wrong']} | {r['wrong_accepted']} "
+            f"| {farthest} | {r['beyond_level']} |"
+        )
+    return "\n".join(lines)
+
+
 def searched_row(images: Sequence[SearchedImage]) -> dict[str, Any]:
     """The figures of one set's searches."""
     here, away = ([i for i in images if i.away is k] for k in (False, True))

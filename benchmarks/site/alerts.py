@@ -21,10 +21,11 @@ Made from the catalogue by `python -m benchmarks.site`; do not edit.
 
 An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `health.json` with its
 identifier. *Fix*: a position from vision; it is sent in mode inject, and in mode rc while injection
-is enabled. *Still sent* refers to these modes. *Output held*: no position is sent. *Exclude and
+is enabled. *Sent* refers to these modes. *Output held*: no position is sent. *Exclude and
 reset*: as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the
 switch to vision do not start; injection that is running continues. The pilot (mode rc) and
-`bridge.injection.force` override it. *Event*: it has no end.
+`bridge.injection.force` override *inhibit* and *not ready*. *Event*: it has no end. PX4 sends
+ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 
 A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
 the shadow check, which compares fixes with the EKF's position on GNSS over two minutes. It becomes

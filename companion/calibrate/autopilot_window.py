@@ -67,7 +67,7 @@ def autopilot_window_at(
 ) -> AutopilotWindow | None:
     """The window around a timestamp; None if attitude or gimbal are not known throughout.
 
-    mount: (3, 3), the deployment's own correction, which `gimbal_at` has in it already.
+    mount: (3, 3), the deployment's mounting angles. The angles of `gimbal_at` contain them already.
     """
     camera, body, place = [], [], []
     for offset_s in OFFSETS_S:

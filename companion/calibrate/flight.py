@@ -42,9 +42,9 @@ _OURS = ("inject", "rc")
 @dataclass(frozen=True)
 class CalibrationResult:
     """Result of a calibration flight. solution: see `solve`; before, after: mean distance of the
-    image patches from their map positions, px of the stream, poses free; frames, parts: numbers
-    used. gnss_bias_m: constant error of the receiver, already in `covariance`. notes: sentences for
-    the reader.
+    image patches from their map positions before and after the calibration, px of the stream, each
+    with free poses; frames, parts: numbers of images and patches used. gnss_bias_m: constant error
+    of the receiver, already contained in `covariance`. notes: sentences for the reader.
     """
 
     camera: Camera

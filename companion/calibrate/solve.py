@@ -34,8 +34,9 @@ _CONVERGED = 1e-3  # of a sigma
 
 @dataclass(frozen=True)
 class Solution:
-    """guess: the most probable values and poses. covariance: (COUNT, COUNT) of the shared values,
-    with the weak priors; information: the same of the flight alone. pixel_sigma: of a patch, px.
+    """Result of the least-squares solution. guess: the most probable values and poses. covariance:
+    (COUNT, COUNT) of the shared values, with the weak priors; information: of the shared values,
+    from the flight alone. pixel_sigma: sigma of a patch, px.
     """
 
     guess: Guess

@@ -20,9 +20,9 @@ _MOST_ALIKE = 0.5  # of all pairs: beyond it the flight was over one place, and 
 
 @dataclass(frozen=True)
 class ImageNormalEquations:
-    """Normal equations of K pictures, each by S numbers of the optics and its own pose. own:
-    (K, 6, 6); both: (K, 6, S); shared: (K, S, S); pull: (K, 6) and shared_pull: (K, S), their right
-    sides.
+    """Normal equations of K images; each depends on S shared values of the optics and on its own
+    pose. own: (K, 6, 6), both: (K, 6, S), shared: (K, S, S): blocks of the matrix; pull: (K, 6),
+    shared_pull: (K, S): right sides.
     """
 
     own: Array
@@ -61,8 +61,8 @@ def pictures_part(
     """The images' part (C, C) of the shared values' covariance for independent image errors, and
     the factor (C,) by which correlation increases each sigma, at least 1.
 
-    gain: (C, C + 6 K), the first rows of the normal equations' inverse; count: C; grounds: (K, 2),
-    east and north of what each picture shows, m.
+    gain: (C, C + 6 K), the first rows of the inverse of the normal equations; count: C; grounds:
+    (K, 2), east and north of the ground that each image shows, m.
     """
     K, S = pictures.shared_pull.shape
     alone, pulls = np.zeros((count, count)), np.zeros((K, count))

@@ -48,9 +48,9 @@ class GaussMarkovProcess:
 
     @classmethod
     def of(cls, left: Array, times_s: Array, least: float) -> GaussMarkovProcess:
-        """Estimate from residuals (K, 3) without their mean, by restricted likelihood (Patterson
-        and Thompson 1971); of equally likely correlation times the longest. Otherwise correlation
-        time and sigmas would be too small.
+        """Estimate from residuals (K, 3) minus their mean, by restricted likelihood (Patterson
+        and Thompson 1971); of equally likely correlation times it takes the longest. A shorter one
+        would make the sigmas too small.
         """
         sigmas, memories = np.zeros(3), np.zeros(3)
         gaps, free_of_mean = np.diff(times_s), len(times_s) - 1
@@ -68,7 +68,9 @@ class GaussMarkovProcess:
         return cls(sigmas, memories)
 
     def over_long_steps(self, left: Array, times_s: Array) -> GaussMarkovProcess:
-        """The same correlation times, with sigmas not smaller than steps over `_LONG_STEP_S` show.
+        """The same correlation times, with sigmas that are at least those of steps over
+        `_LONG_STEP_S`.
+
         An EKF smooths its receiver's errors from frame to frame, so short steps underestimate its
         drift. left: residuals (K, 3).
         """
@@ -89,8 +91,9 @@ class GaussMarkovProcess:
 
 
 def _restricted(errors: Array, gaps_s: Array, memory_s: float) -> tuple[float, float]:
-    """Squares of errors (K,) that last for memory_s, less their mean, in units of their variance;
-    and what else minus twice the logarithm of the restricted likelihood has in it.
+    """Minus twice the restricted log likelihood, in two parts: the sum of squares of the errors
+    (K,) minus their mean, in units of their variance, and the remaining terms. memory_s:
+    correlation time of the errors.
     """
     kept = np.exp(-gaps_s / memory_s)
     free = np.maximum(1.0 - kept**2, 1e-6)
@@ -103,9 +106,9 @@ def _restricted(errors: Array, gaps_s: Array, memory_s: float) -> tuple[float, f
 
 @dataclass(frozen=True)
 class AttitudeProcess:
-    """Of attitudes, rad. sigma: (5,) about the camera's axes, and about the vertical of a gimbal
-    and of a compass; the gimbal's errors last for memory_s. up: (K, 3), the vertical in each
-    camera's axes.
+    """Error process of attitudes, rad. sigma: (5,) about the camera's three axes, about the
+    vertical of a gimbal, and about that of a compass; memory_s: correlation time of the gimbal's
+    errors. up: (K, 3), the vertical in each camera's axes.
     """
 
     sigma: Array
@@ -125,9 +128,9 @@ class AttitudeProcess:
     def of(
         cls, left: Array, up: Array, times_s: Array, least: float, white: float
     ) -> AttitudeProcess:
-        """Of residuals (K, 3) after a mounting and a heading were estimated, by restricted
+        """Estimate from residuals (K, 3) of a solution with mounting and heading, by restricted
         likelihood as `GaussMarkovProcess.of`. If a flight cannot separate vertical and boresight,
-        they share the error.
+        each gets half of the error.
         """
         few = np.unique(np.linspace(0, len(times_s) - 1, min(_FEW, len(times_s))).round())
         k = few.astype(int)

@@ -30,8 +30,8 @@ class BoardViewing:
 def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> BoardViewing:
     """Collect views of the board until all are there, the source ends, or `seconds` have passed.
 
-    told: called with the views, the result of the newest image and the missing views, after each
-    change. keep: folder for the images used.
+    told: called after each change with the views, the result of the newest image and the missing
+    views. keep: folder for the images used.
     """
     size = read_stream_size(source)
     views = BoardViews(size.width, size.height)

@@ -78,8 +78,8 @@ class MapOffset:
 def estimate(blocks: Array, bias_m: float) -> MapOffset:
     """Estimate the offset from blocks (N, 2) of median differences, north and east, metres.
 
-    Blocks beyond three robust sigmas of the median are left out. bias_m: sigma of GNSS's own
-    error, per axis, which no averaging takes away.
+    Blocks more than three robust sigmas from the median are left out. bias_m: sigma of GNSS's own
+    error, per axis; averaging does not reduce it.
     """
     middle = np.median(blocks, axis=0)
     spread = 1.4826 * np.median(np.abs(blocks - middle), axis=0)
@@ -93,12 +93,12 @@ def estimate(blocks: Array, bias_m: float) -> MapOffset:
 
 
 class MapOffsetEstimator:
-    """Estimates the map offset. As a check of fixes (`FixInjection.add_judge`) it returns them
+    """Estimates the map offset. As a check of fixes (`FixInjection.add_check`) it returns them
     unchanged or shifted.
 
-    It comes before the other judges, so that they compare with GNSS what is injected. It keeps its
-    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: the vehicle's receiver
-    is our own GPS_INPUT, which shows nothing.
+    It runs before the other checks, so that they compare the corrected fix with GNSS. It keeps its
+    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: whether the vehicle's
+    GNSS is our own GPS_INPUT, which is no evidence.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class MapOffsetEstimator:
         self._block_ns = 0
         self._blocks: deque[Array] = deque(maxlen=_BLOCKS)
         self._shift: MapOffset | None = None
-        self._told: tuple[float, float] | None = None
+        self._reported: tuple[float, float] | None = None
         self._applied = np.zeros(2)
         self._applied_ns: int | None = None
 
@@ -143,7 +143,7 @@ class MapOffsetEstimator:
             "applied_east_m": float(applied[1]),
         }
 
-    def judge(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
+    def check(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
         """Compare the fix with GNSS; return it shifted if the offset is applied."""
         if seen.state is TrackingState.TRACKING and not self._gnss_is_ours:
             self._waiting.append(fix)
@@ -175,10 +175,10 @@ class MapOffsetEstimator:
             self._shift = shift
         if not shift.significant or math.hypot(*shift.ne_m) > _LARGEST_M:
             return
-        told = self._told
-        if told is not None and math.dist(told, shift.ne_m) < _AGAIN_M:
+        reported = self._reported
+        if reported is not None and math.dist(reported, shift.ne_m) < _AGAIN_M:
             return
-        self._told = shift.ne_m
+        self._reported = shift.ne_m
         applied = MapOffsetUse.APPLIED if self._policy == "apply" else MapOffsetUse.REPORTED
         self._vehicle.report_alert(
             alert(AlertId.MAP_OFFSET, metres=math.hypot(*shift.ne_m), direction=shift.direction,

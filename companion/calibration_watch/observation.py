@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 class CalibrationObservation:
     """Pose of one registered frame, and the autopilot's data of the same time.
 
-    place: latitude, longitude (degrees) and height above the ellipsoid (m) of the vehicle;
-    sigma_m: horizontal, 1 sigma. ned_from_camera: (3, 3), OpenCV axes. depth_m: of the ground along
-    the optical axis, as the map is seen from there. horizontal_fov_deg: of this picture's zoom.
+    place: latitude, longitude (degrees) and height above the ellipsoid (m) of the vehicle; sigma_m:
+    horizontal, 1 sigma. ned_from_camera: (3, 3), OpenCV axes. depth_m: distance of the ground along
+    the optical axis, from the map. horizontal_fov_deg: at this frame's zoom.
     """
 
     time_ns: int

@@ -135,8 +135,9 @@ class CalibrationWatch:
         """Time offset from the motion over ground; the camera's rotation is used only where it
         agrees.
 
-        A gimbal's angles may be late themselves. A camera without gimbal turns with the autopilot's
-        own attitude: there the surer account counts, if the other does not speak against it.
+        The angles of a gimbal may be late themselves. A camera without gimbal rotates with the
+        autopilot's own attitude. There the more certain of both estimates is used, if the other one
+        does not contradict it.
         """
         if self._doubted_ns is not None:
             return CalibrationEstimate(0.0, math.inf)

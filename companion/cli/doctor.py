@@ -82,7 +82,7 @@ def doctor_command(
 def print_diagnosis(console: Console, diagnosis: Diagnosis, left_out: Sequence[str] = ()) -> None:
     """Print a table of 80 columns, then one or two lines for each failed check.
 
-    left_out: what was not examined, which a title that says "fit" must not hide.
+    left_out: checks that were not made; the title names them, so that "fit" is not misunderstood.
     """
     title = "fit to fly" if diagnosis.ok else "NOT fit to fly"
     if left_out:

@@ -187,9 +187,9 @@ def _require_flat(
 def _with_ground(
     source: list[Path], ground_m: float | None, out: Path, rules: ImportRules
 ) -> Iterator[list[Path]]:
-    """The source, and a flat ground in a folder beside the cache that is removed afterwards: the
-    workers of a scheduler share that file system. Warnings name a raster by its file's name, so
-    the ground has the orthophoto's.
+    """The source, and a flat ground in a folder beside the cache that is removed afterwards. The
+    workers of a scheduler can read this folder. Warnings name a raster by its file name, so the
+    ground has the name of the orthophoto.
     """
     from localizer.map.importers.raster_file import write_flat_ground
 
@@ -275,8 +275,8 @@ def info(
 def verify(cache: CachePath) -> None:
     """Check every tile's hash and list holes. Exit code 1: a tile is damaged.
 
-    Holes may be in the source, as under a bridge's parapet or at a ragged edge: they are listed,
-    and do not count as damage.
+    A hole may be in the source, for example under a bridge's parapet or at a ragged edge. Holes are
+    listed and do not count as damage.
     """
     from companion.preflight.map_pin import map_hash
     from localizer.map.cache.cache import TileCache

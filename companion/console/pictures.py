@@ -75,8 +75,8 @@ def unpack(message: Message) -> OverlayFrame:
 def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]) -> bytes:
     """The message for the page: uint32 length of the header, the header, then its parts.
 
-    The head's `parts` are the lengths of JPEG, edges (uint16 pairs, pixels) and the map's JPEG.
-    width_px: the picture is not wider.
+    The header's `parts` are the lengths of the JPEG, the edges (uint16 pairs, pixels) and the map's
+    JPEG. width_px: largest width of the image.
     """
     picture = narrowed(unpack(message), width_px)
     parts = [_jpeg(picture.image), edges(picture).tobytes(), b""]

@@ -154,8 +154,8 @@ class RequestGuard:
         return acts and _only(headers, ACTION_HEADER) != "1"
 
     def _is_ours(self, host: str | None) -> bool:
-        """Whether that Host names this console. A name that is not listed may be one that somebody
-        made to point here, so addresses count, and localhost, and what is configured.
+        """Whether the Host header names this console: an IP address, localhost or a configured
+        name. Another name may be one that an attacker has made to point here.
         """
         if host is None:
             return False

@@ -87,12 +87,6 @@ def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Angles:
     return angles_of_matrix(to_ned @ pose.rotation @ GIMBAL_FROM_CAMERA.T)
 
 
-def pose_of_gimbal(position: Geodetic, gimbal: Angles, frame: LocalFrame) -> Pose:
-    """Inverse of `gimbal_of_pose` for a camera position."""
-    angles = AutopilotAngles("", None, position, Angles(0.0, 0.0, 0.0), gimbal, GimbalFrame.EARTH)
-    return pose_of_autopilot(angles, frame)
-
-
 def angles_of_matrix(R: Array) -> Angles:
     """Euler angles of a rotation (3, 3). At pitch -90, where roll and yaw merge, roll is 0."""
     if np.hypot(R[0, 0], R[1, 0]) < _LOCKED:

@@ -88,8 +88,8 @@ def _write_tum(path: Path, poses: Sequence[StampedPose], place: MapReference) ->
 
 
 def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    """Poses of an ``images.txt``: camera from world, two lines an image, the second of points; it
-    may be left out, as in files of known poses that are written by hand.
+    """Poses (camera from world) of an ``images.txt``, which has two lines an image. The second
+    line, of points, may be missing, as in files of known poses that are written by hand.
     """
     if path.suffix.lower() == ".bin":
         raise PoseFileError(

@@ -63,11 +63,11 @@ def export_mcap(
     tlog: Path | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> ExportResult:
-    """Write the record's rows, pictures and MAVLink in the order of their times.
+    """Write the record's rows, images and MAVLink messages in the order of their times.
 
-    out: ``record.mcap`` in the record if None; tlog: instead of the record's own; progress: takes
-    the number of rows written now and then. `RecordError` for a folder that is no record,
-    `ReportError` where the file cannot be written.
+    out: ``record.mcap`` in the record if None; tlog: another file than the record's own; progress:
+    called now and then with the number of rows written. `RecordError` for a folder that is no
+    record, `ReportError` if the file cannot be written.
     """
     folder = record_folder(folder)
     tables = read_record(folder)

@@ -39,8 +39,8 @@ class Companion:
     """The flight process of one deployment.
 
     `run` blocks until `stop` is called or the feed ends. pulse: descriptor of the supervisor's
-    pipe, see `Pulse`; None without a supervisor. restart: an earlier process of this flight died.
-    lost_settings: why `config` is not from the deployment's file; else empty.
+    pipe, see `Pulse`; None without a supervisor. restart: whether an earlier process of this flight
+    died. lost_settings: why `config` is not that of the deployment file; empty if it is.
     """
 
     def __init__(
@@ -112,9 +112,9 @@ class Companion:
         self._parts.start(up)
         integrity_monitor = self._parts.get(IntegrityMonitor)
         if integrity_monitor is not None:
-            integrity_monitor.watch(self._untold_turns)
+            integrity_monitor.watch(self._unsupervised_ticks)
         if self._pulse is not None:
-            pulse = Pulse(self._turns, self._pulse)
+            pulse = Pulse(self._last_ticks, self._pulse)
             pulse.start()
             # First of all: what comes down takes no turns.
             up.push(lambda error, *_: pulse.stop(clean_shutdown=self._is_clean_shutdown(error)))
@@ -147,7 +147,7 @@ class Companion:
         """Whether `run` ends normally. error: what ended it, or None."""
         return error is None and self._parts[Feed].error is None
 
-    def _turns(self) -> dict[str, int]:
+    def _last_ticks(self) -> dict[str, int]:
         """Time of the last run of each thread that is needed for a position, ns, by name."""
         parts, last_ticks_ns = self._parts, self._parts[DualThreadEngine].last_ticks_ns()
         last_ticks_ns |= {"feed": parts[Feed].last_tick_ns, **parts[Bridge].last_ticks_ns()}
@@ -157,7 +157,7 @@ class Companion:
             last_ticks_ns["integrity monitor"] = integrity_monitor.last_tick_ns
         return last_ticks_ns
 
-    def _untold_turns(self) -> dict[str, int]:
+    def _unsupervised_ticks(self) -> dict[str, int]:
         """Time of the last run of the threads that no other component monitors."""
         health = self._parts.get(HealthMonitor)
         ends = self._is_stopping or self._parts[Feed].ended.is_set()

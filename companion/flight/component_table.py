@@ -351,7 +351,7 @@ def _map_shift(making: BuildContext) -> MapOffsetEstimator:
         making.channels.events.send,
         gnss_is_ours=injection.message == "gps_input",
     )
-    making[FixInjection].add_judge(shift.judge)
+    making[FixInjection].add_check(shift.check)
     return shift
 
 
@@ -369,8 +369,10 @@ def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
     integrity_monitor = IntegrityMonitor(
         watched, limits, making[Bridge], _forbid_memory(config), making.clock, making[InertialTrack]
     )
-    making[FixInjection].add_judge(lambda _, fix: integrity_monitor.judge(fix))
-    making.channels.frames.subscribe(lambda f: integrity_monitor.see(f.exposure_time_ns, f.image))
+    making[FixInjection].add_check(lambda _, fix: integrity_monitor.check(fix))
+    making.channels.frames.subscribe(
+        lambda f: integrity_monitor.add_frame(f.exposure_time_ns, f.image)
+    )
     observer = CalibrationObserver(making[CameraExtrinsics], integrity_monitor.add_observation)
     making[FixInjection].add_observer(observer.add_fix)
     return integrity_monitor

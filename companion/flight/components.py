@@ -22,8 +22,8 @@ def _always(_: CompanionConfig) -> bool:
 class Component(Generic[T]):
     """One row of the table. All components are built before the first is started.
 
-    close and stop are called only for what was made and started. What a part needs is looked up by
-    its class in `BuildContext`, and nothing else is found there.
+    close is called only for a component that was built, and stop only for one that was started. A
+    component looks up the components that it needs in `BuildContext`, by their class.
     """
 
     name: str

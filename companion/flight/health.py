@@ -240,8 +240,8 @@ class HealthMonitor:
         """Alerts of a lost position: duration, the autopilot's uncertainty, and why no search is
         possible.
 
-        Not whether the map is being searched: that begins and ends every few seconds, and each time
-        the loss would be reported again (`engine.searching` in health.json has it).
+        A running search is not reported here. A search begins and ends every few seconds, and each
+        time the loss would be reported again (`engine.searching` in health.json shows it).
         """
         fix_ns = estimate.last_fix_ns
         since_s = 0.0 if fix_ns is None else (time.monotonic_ns() - fix_ns) * 1e-9
@@ -333,7 +333,8 @@ def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
 def _of_state(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
     """Alert of the tracking state. BRIDGING: duration and 95 % bound of the error.
 
-    A second or two of it is no news: a shadow of a cloud, a car that fills the frame.
+    BRIDGING of less than two seconds counts as TRACKING: the cause may be a cloud's shadow, or a
+    car that fills the frame.
     """
     if estimate.state is TrackingState.LOST:
         return HealthLevel.FAILED, alert(AlertId.LOST, seconds=0.0)

@@ -18,14 +18,14 @@ from mavlink_bridge.messages import VisionFix
 
 _log = logging.getLogger(__name__)
 
-Judge = Callable[[PoseEstimate, VisionFix], VisionFix | None]
-"""Has a word before injection: the fix, or one with another covariance; None withholds it. Called
-on the localization thread: it looks up what its own thread found and returns at once. One that
-raises withholds the fix, and the operator is told.
+FixCheck = Callable[[PoseEstimate, VisionFix], VisionFix | None]
+"""Checks a fix before injection. Returns the fix, perhaps with another covariance; None holds it.
+It is called on the localization thread and returns at once. If it raises an exception, the fix is
+held and an alert is raised.
 """
 
 Observer = Callable[[PoseEstimate, ReferenceBundle, VisionFix], None]
-"""Sees each fix as it was made, whether it is injected or not. It returns at once, likewise."""
+"""Takes each fix before the checks change it, injected or not. It returns at once."""
 
 _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 
@@ -39,8 +39,8 @@ class JumpCounter:
     """Counts the jumps of the estimate (`VisionFix.reset_count`), so that the EKF resets to the new
     position.
 
-    A jump is each start after LOST, also the first, and a registration after BRIDGING, because it
-    corrects the drift. DEGRADED is none.
+    A jump is each start after LOST, also the first. A registration after BRIDGING is a jump, too,
+    because it corrects the drift. DEGRADED causes no jump.
     """
 
     def __init__(self) -> None:
@@ -58,9 +58,9 @@ class JumpCounter:
 class FixInjection:
     """Passes a fix to the bridge for every accepted estimate while tracking.
 
-    Runs on the localization thread, and converts there: 0.12 ms in the median (two geodetic
-    conversions and two rotations, no look at the map), no more than waking another thread would
-    take, and a fix's age counts.
+    It runs on the localization thread and converts there. The conversion takes 0.12 ms in the
+    median (two geodetic conversions and two rotations, no access to the map). To wake another
+    thread would take as long and make the fix older.
     """
 
     def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:
@@ -68,14 +68,14 @@ class FixInjection:
         self._extrinsics = extrinsics
         self._jumps = JumpCounter()
         self._observers: tuple[Observer, ...] = ()
-        self._judges: tuple[Judge, ...] = ()
-        self._unjudged = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
+        self._checks: tuple[FixCheck, ...] = ()
+        self._checks_failed = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
 
-    def add_judge(self, judge: Judge) -> None:
-        """Call `judge` with every fix from now on, after the earlier ones; it may hold or change
+    def add_check(self, check: FixCheck) -> None:
+        """Call `check` with every fix from now on, after the earlier ones; it may hold or change
         it.
         """
-        self._judges = (*self._judges, judge)
+        self._checks = (*self._checks, check)
 
     def add_observer(self, observer: Observer) -> None:
         """Call `observer` with every fix from now on, after its injection."""
@@ -94,23 +94,23 @@ class FixInjection:
             self._bridge.gimbal_at(time_ns),
             self._jumps.count,
         )
-        judged = self._judged(estimate, fix)
-        if judged is not None:
-            self._bridge.submit(judged)
+        checked = self._checked(estimate, fix)
+        if checked is not None:
+            self._bridge.submit(checked)
         for observer in self._observers:
             observer(estimate, bundle, fix)
 
-    def _judged(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:
+    def _checked(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:
         """The fix after all checks; None if one holds it."""
         failed = False
         try:
-            for judge in self._judges:
-                fix = judge(estimate, fix) if fix is not None else None
-        except Exception:  # a position that nobody judged would be believed unwarned
-            if not self._unjudged.raised:
-                _log.exception("a fix could not be judged")
+            for check in self._checks:
+                fix = check(estimate, fix) if fix is not None else None
+        except Exception:  # a position that nobody checked would be believed unwarned
+            if not self._checks_failed.raised:
+                _log.exception("a fix could not be checked")
             failed, fix = True, None
-        alert = self._unjudged.update(estimate.exposure_time_ns, CheckResult(failed))
+        alert = self._checks_failed.update(estimate.exposure_time_ns, CheckResult(failed))
         if alert is not None:
             self._bridge.report_alert(alert)
         return fix

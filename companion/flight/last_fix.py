@@ -42,9 +42,10 @@ LocalAt = Callable[[int], tuple[float, ...] | None]
 
 @dataclass(frozen=True)
 class LastFix:
-    """time_ns: CLOCK_MONOTONIC of `boot`. Position of the camera, WGS84; sigma_m: worst axis.
+    """A confirmed position, as it is kept for a restart. time_ns: CLOCK_MONOTONIC of `boot`.
+    latitude_deg, longitude_deg, height_m: of the camera, WGS84; sigma_m: of its worst axis.
     local_ned: the EKF's position at that time, m; autopilot_ns: time since the autopilot's boot;
-    origin of local_ned: latitude, longitude, altitude AMSL; None where unknown.
+    origin: of local_ned, latitude, longitude, altitude AMSL; None where unknown.
     """
 
     boot: str
@@ -124,8 +125,8 @@ def _is_place(fix: LastFix) -> bool:
 class FixMemory:
     """Writes the newest confirmed position in flight, and reads that of the previous process.
 
-    trusted: whether no check holds the output now; state: the vehicle's telemetry. Thread-safe; the
-    file is written by its own thread.
+    trusted: whether no check holds the output now; state: the vehicle's telemetry. Thread-safe; its
+    own thread writes the file.
     """
 
     def __init__(

@@ -93,7 +93,7 @@ class Belief:
 class PositionBelief:
     """Estimates the quality of the EKF's position at any time from GNSS and our own fixes.
 
-    Thread-safe: estimates come on the localization thread, states from the bridge's.
+    Thread-safe: the localization thread passes estimates, the bridge's thread states.
     """
 
     def __init__(self, config: PriorConfig) -> None:

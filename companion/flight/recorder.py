@@ -152,11 +152,11 @@ def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
 
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder, and the accepted
-    estimates as a trajectory (`TrajectoryFiles`, made at the first of them).
+    estimates as a trajectory (`TrajectoryFiles`, created with the first of them).
 
-    Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted. So is what
-    the disk does not take (full, gone): the flight goes on without its record, and on_failure is
-    called once, in the recorder's thread, with the reason.
+    No method blocks its caller: rows beyond a bounded queue are dropped and counted. If the disk is
+    full or gone, rows are dropped and counted too, and the flight continues without its record.
+    on_failure is then called once with the reason, in the recorder's thread.
     """
 
     def __init__(
@@ -310,7 +310,7 @@ class Recorder:
 class RecordKeeper:
     """The record of one process, if the disk allows one. A start may be a restart in flight.
 
-    say_incomplete: tells the operator why something is missing in it; from any thread.
+    say_incomplete: tells the operator why a part of the record is missing; called from any thread.
     """
 
     def __init__(self, frame: LocalFrame, say_incomplete: Callable[[str], None]) -> None:

@@ -73,12 +73,13 @@ class RelocalizationHypothesis:
     found: Relocalization
     reach: SearchRegion | None = None
 
-    def followed(
+    def predicted_query(
         self, query: PlaceQuery, velocity: Array | None, reach: SearchRegion | None
     ) -> PlaceQuery | None:
         """A later frame's query, limited to where the camera can be; None after too long.
 
-        velocity: (3,) m/s in the map's axes by the EKF, None where it knows none; reach: as then.
+        velocity: (3,) m/s in the map's axes, of the EKF, None if unknown; reach: the reachable
+        region at the time of the later frame.
         """
         elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
         if not 0.0 < elapsed_s <= _LONGEST_S:
@@ -152,9 +153,9 @@ def place_on_map(
 class PlaceSearch:
     """Searches the position with a frame and the autopilot's data.
 
-    The map's overview is opened (or, the first time, computed) on a thread of its own, so that
-    neither the start nor a search waits for it. reach: where the camera can be at a time since the
-    map last said where it was, asked where the autopilot knows no position.
+    A thread of its own opens the map's overview, or computes it at the first start, so that neither
+    the start nor a search waits for it. reach: region that the camera can have reached at a time
+    since the last position on the map; used if the autopilot knows no position.
     """
 
     def __init__(
@@ -223,18 +224,18 @@ class PlaceSearch:
             return None
         seen, self._sighting = self._sighting, None
         velocity, about = self._autopilot.velocity, self._reach(frame.exposure_time_ns)
-        followed = seen.followed(query, velocity, about) if seen is not None else None
+        predicted = seen.predicted_query(query, velocity, about) if seen is not None else None
         began = self._clock()
-        found = self._open.relocalizer.find(followed or _on_plane(query), should_stop)
+        found = self._open.relocalizer.find(predicted or _on_plane(query), should_stop)
         if found is None:
             return None
         seconds = self._clock() - began
-        if followed is None and seconds * _speed_sigma(velocity) > _STALE_M:
+        if predicted is None and seconds * _speed_sigma(velocity) > _STALE_M:
             self._sighting = RelocalizationHypothesis(query, found, about)
             self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
             return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")
-        if velocity is None and followed is not None and seen is not None:
+        if velocity is None and predicted is not None and seen is not None:
             velocity = seen.velocity_to(found)
         least = np.repeat([_PLACE_SIGMA_M, _PLACE_SIGMA_RAD], 3) ** 2
         return PosePrior(

@@ -23,7 +23,7 @@ def ready(
 ) -> Companion | None:
     """Return the flight process: at once, or when the standby is released; None if it never is.
 
-    pulse, restart, lost_settings: see `Companion`; a standby always is a restart.
+    pulse, restart, lost_settings: see `Companion`. For a standby, restart is always true.
     """
     companion = Companion(
         config, pulse=pulse, restart=restart or standby, lost_settings=lost_settings
@@ -34,7 +34,8 @@ def ready(
 def _stand_by(companion: Companion) -> Companion | None:
     """Prepare what takes long, then wait for a line on standard input.
 
-    None where it ends without one: the supervisor is gone. Neither link nor feed is opened before.
+    None if the input ends without a line, because the supervisor is gone. Neither link nor feed is
+    opened before.
     """
     try:
         companion.prepare()

@@ -63,7 +63,7 @@ class IntegrityLimits:
 class IntegrityChecks:
     """Call every method under one lock, or from one thread.
 
-    Above 200 lines: each check has a few lines here that hand it its evidence and take its finding.
+    Above 200 lines: a few lines for each check pass its evidence to it and take its result.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class IntegrityChecks:
 
     # --- evidence -----------------------------------------------------------------------------
 
-    def see(self, time_ns: int, image: Image) -> None:
+    def add_frame(self, time_ns: int, image: Image) -> None:
         """Add a frame (H, W, 3) uint8 at its exposure time."""
         if self._picture is not None and time_ns <= self._picture[0]:
             self._backwards += 1
@@ -180,8 +180,8 @@ class IntegrityChecks:
         None holds it. A fix of the odometry that only its protection level holds is marked
         `position_withheld`; its velocity gets the scale error that the IMU has shown.
 
-        attitude: the autopilot's at the fix's time, None where it is not known; held: another has a
-        reason against it.
+        attitude: the autopilot's at the fix's time, None if unknown; held: whether another check
+        holds the fix.
         """
         self._tilt.add(fix, attitude)
         verdict = self._verdict
@@ -219,7 +219,7 @@ class IntegrityChecks:
         """Run all checks, a few times a second; returns the alerts to report."""
         state = vehicle.state()
         self._track.follow(vehicle)
-        self._jumps.hear(state)
+        self._jumps.add_state(state)
         self._follow(now_ns, state)
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
@@ -349,7 +349,7 @@ class IntegrityChecks:
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
         """Whether the EKF moved by metres during a frozen frame; unknown in a hover.
 
-        The EKF keeps its speed at first: it follows a frozen position after a second or two.
+        The EKF keeps its speed at first. Only after a second or two it follows the frozen position.
         """
         if state.local_velocity_ned is None or verdict.still_s < _MOVED_LEAST_S:
             return False

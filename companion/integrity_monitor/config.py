@@ -37,8 +37,9 @@ class ProtectionConfig(StrictModel):
     """Error sources of the protection level that the fix's covariance does not contain, each as one
     standard deviation along an axis.
 
-    The covariance holds what `localizer.calibration` states of the camera. Where that is the result
-    of a calibration, little is left beside it; else it is a guess, and the camera may be worse.
+    The covariance contains the camera errors that `localizer.calibration` states. After a
+    calibration the remaining camera error is small. Without one these values are a guess, and the
+    remaining error may be larger.
     """
 
     risk: float = Field(

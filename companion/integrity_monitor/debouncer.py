@@ -33,7 +33,7 @@ class CheckResult:
 class AlertDebouncer:
     """Raises an alert after raise_s of bad evidence and clears it after clear_s of good evidence.
 
-    Time without evidence counts for neither, and nothing is repeated in it.
+    Time without evidence counts for neither, and no alert is repeated during it.
     """
 
     def __init__(self, spec: AlertSpec) -> None:
@@ -43,7 +43,7 @@ class AlertDebouncer:
         self.word: CalibrationError | Name | None = None
         self._since_ns: int | None = None
         self._updated_ns = 0
-        self._told_ns = 0
+        self._reported_ns = 0
 
     def update(self, now_ns: int, result: CheckResult) -> Alert | None:
         """Add a result; returns the alert to report, if it changed."""
@@ -64,7 +64,7 @@ class AlertDebouncer:
         wait_s = self.spec.clear_s if self.raised else self.spec.raise_s
         if now_ns - self._since_ns < wait_s * 1e9:
             return self._again(now_ns)
-        self._since_ns, self.raised, self._told_ns = None, not self.raised, now_ns
+        self._since_ns, self.raised, self._reported_ns = None, not self.raised, now_ns
         return self.alert() if self.raised else cleared(self.spec.id)
 
     def restore(self, figure: float, word: CalibrationError) -> None:
@@ -78,9 +78,9 @@ class AlertDebouncer:
 
     def _again(self, now_ns: int) -> Alert | None:
         repeats = self.raised and self.spec.repeat_s > 0.0
-        if not repeats or now_ns - self._told_ns < self.spec.repeat_s * 1e9:
+        if not repeats or now_ns - self._reported_ns < self.spec.repeat_s * 1e9:
             return None
-        self._told_ns = now_ns
+        self._reported_ns = now_ns
         return self.alert()
 
 
@@ -112,7 +112,7 @@ class InhibitMemory:
             return
         self._kept = frozenset(found)
         if found:
-            self._memory.keep({"inhibits": {of.value: row for of, row in found.items()}})
+            self._memory.store({"inhibits": {of.value: row for of, row in found.items()}})
         else:
             self._memory.drop()
 

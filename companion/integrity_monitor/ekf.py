@@ -32,8 +32,9 @@ class EkfWatch:
     def jumped(self, state: VehicleState, now_ns: int, *, agrees: bool) -> CheckResult:
         """Size of the EKF's jump, until the IMU has agreed with vision for a while.
 
-        agrees: there is evidence that vision moves as the IMU does; no evidence is no agreement.
-        On the ground an EKF begins with a jump: from its origin onto the first position.
+        agrees: whether there is evidence that vision moves as the IMU; False without evidence. A
+        jump on the ground is ignored, because an EKF jumps from its origin to its first position
+        there.
         """
         leap_m = self._leap(state)
         if not state.armed:

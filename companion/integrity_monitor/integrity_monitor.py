@@ -25,9 +25,9 @@ from mavlink_bridge.messages import VisionFix
 
 _log = logging.getLogger(__name__)
 _PERIOD_S = 0.1
-_BLIND_TURNS = 10  # that failed in a row
-_STANDS_NS = 2_000_000_000  # since its last turn: its thread hangs, or is gone
-_PART_STANDS_NS = 4_000_000_000  # of another part, as the supervisor has it
+_BLIND_RUNS = 10  # that failed in a row
+_STALLED_NS = 2_000_000_000  # since its last turn: its thread hangs, or is gone
+_COMPONENT_STALLED_NS = 4_000_000_000  # of another part, as the supervisor has it
 _LOCK_S = 1.0  # a turn takes a twentieth of it
 
 
@@ -58,11 +58,11 @@ class IntegrityMonitor:
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
-        self._failed, self._stands = (
+        self._failed, self._stalled = (
             AlertDebouncer(CATALOGUE[of])
             for of in (AlertId.MONITOR_FAILED, AlertId.COMPONENT_STALLED)
         )
-        self._turns: Callable[[], Mapping[str, int]] = dict
+        self._last_ticks: Callable[[], Mapping[str, int]] = dict
         self._inhibiting: frozenset[AlertId] = frozenset()
         self._fails: dict[str, int] = {}  # how often in a row, by what is failing
         self._failures = threading.Lock()
@@ -98,9 +98,9 @@ class IntegrityMonitor:
         """Report components that stall. last_ticks_ns: time of the last run of each,
         CLOCK_MONOTONIC ns.
         """
-        self._turns = last_ticks_ns
+        self._last_ticks = last_ticks_ns
 
-    def see(self, time_ns: int, image: Image) -> None:
+    def add_frame(self, time_ns: int, image: Image) -> None:
         """Submit a frame; the newest is checked. Never blocks."""
         self._picture = (time_ns, image)
 
@@ -110,7 +110,7 @@ class IntegrityMonitor:
             if answers:
                 self._monitor.add_observation(sighting)
 
-    def judge(self, fix: VisionFix) -> VisionFix | None:
+    def check(self, fix: VisionFix) -> VisionFix | None:
         """The fix as it may be injected; None holds it."""
         try:
             if self._hangs():
@@ -129,7 +129,7 @@ class IntegrityMonitor:
 
     def submit(self, fix: VisionFix) -> None:
         """Check a fix and pass it to the bridge if it may be injected."""
-        admitted = self.judge(fix)
+        admitted = self.check(fix)
         if admitted is not None:
             self._bridge.submit(admitted)
 
@@ -167,17 +167,17 @@ class IntegrityMonitor:
     def _hangs(self) -> bool:
         """Whether the monitor's own thread has stalled; the calling threads report it."""
         now_ns = self._clock()
-        if now_ns - self.last_tick_ns < _STANDS_NS:
+        if now_ns - self.last_tick_ns < _STALLED_NS:
             return False
         self._fail("taking turns")
-        self._tell_failure(now_ns)
+        self._report_failure(now_ns)
         return True
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S):
-            self.turn()
+            self.run_checks()
 
-    def turn(self) -> None:
+    def run_checks(self) -> None:
         """Run all checks once; the thread calls it ten times a second."""
         self.last_tick_ns = self._clock()
         self._works("taking turns")
@@ -191,29 +191,29 @@ class IntegrityMonitor:
             self._works("watching")
             if looks:
                 self._works("looking")
-        self._tell_failure(self.last_tick_ns)
-        self._tell_what_stands(self.last_tick_ns)
+        self._report_failure(self.last_tick_ns)
+        self._report_stalled(self.last_tick_ns)
 
-    def _tell_failure(self, now_ns: int) -> None:
+    def _report_failure(self, now_ns: int) -> None:
         with self._failures:
             alert = self._failed.update(now_ns, CheckResult(bool(self._fails)))
         if alert is not None:
             self._bridge.report_alert(alert)
 
-    def _tell_what_stands(self, now_ns: int) -> None:
+    def _report_stalled(self, now_ns: int) -> None:
         """Report a stalled component, because its last state is outdated."""
-        last_ticks_ns = self._turns()
+        last_ticks_ns = self._last_ticks()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
-        stalled = CheckResult(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, Name(name))
-        alert = self._stands.update(now_ns, stalled)
+        stalled = CheckResult(age_ns >= _COMPONENT_STALLED_NS, age_ns * 1e-9, Name(name))
+        alert = self._stalled.update(now_ns, stalled)
         if alert is not None:
             self._bridge.report_alert(alert)
 
     @property
     def _is_blind(self) -> bool:
         with self._failures:
-            return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_TURNS
+            return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_RUNS
 
     def _fail(self, what: str) -> None:
         """Note a failure of the monitor; the next run reports it."""
@@ -231,7 +231,7 @@ class IntegrityMonitor:
     def _step(self, picture: tuple[int, Image] | None) -> None:
         with self._lock:
             if picture is not None:
-                self._monitor.see(*picture)
+                self._monitor.add_frame(*picture)
             alerts = self._monitor.step(self._clock(), self._bridge)
             inhibiting, found = self._monitor.inhibiting, self._monitor.to_remember()
         self._inhibit(inhibiting)

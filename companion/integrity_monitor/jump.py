@@ -129,7 +129,7 @@ class JumpCheck:
         again from here on.
         """
 
-    def hear(self, state: VehicleState) -> None:
+    def add_state(self, state: VehicleState) -> None:
         """Update with the vehicle's state, a few times a second, with or without fixes."""
         self._reckoning.add(state)
 
@@ -186,8 +186,8 @@ class JumpCheck:
     def _is_turned(self, turn: HeadingChange) -> bool:
         """Whether a fix is rotated against the last accepted ones.
 
-        What gyros may have drifted grows: once a frame was seen to be turned, a fix is of the one
-        whose heading is nearer.
+        The gyros' drift grows with time. Therefore, after a rotation was detected, a fix belongs to
+        the frame of reference (accepted or held) whose heading is nearer.
         """
         if self._passed is None or turn.time_ns - self._passed.fix.time_ns > _HEADING_S * 1e9:
             return False

@@ -40,8 +40,9 @@ _LEAST_FIXES = 3  # of a window
 
 @dataclass(frozen=True)
 class MotionVerdict:
-    """settled: whether there is evidence. share: the largest mean deviation divided by its limit;
-    deviation_m: that deviation. still_s: how long the position has not moved.
+    """Result of the motion check. settled: whether there is evidence. share: the largest mean
+    deviation divided by its limit; deviation_m: that deviation. still_s: how long the position has
+    not moved.
     """
 
     settled: bool
@@ -89,7 +90,7 @@ class MotionCheck:
         else:
             self._step(last, moved, here, sigma)
         settled = (fix.time_ns - self._began_ns) * 1e-9 >= _SETTLE_S
-        share, deviation_m = self._judge(fix.time_ns) if settled else (0.0, 0.0)
+        share, deviation_m = self._largest_deviation(fix.time_ns) if settled else (0.0, 0.0)
         return MotionVerdict(settled, share, deviation_m, still_s)
 
     def ready(self, fix: VisionFix) -> bool:
@@ -125,7 +126,7 @@ class MotionCheck:
         self._x = self._x + np.outer(K, deviation)
         self._P = self._P - np.outer(K, self._P[0])
 
-    def _judge(self, now_ns: int) -> tuple[float, float]:
+    def _largest_deviation(self, now_ns: int) -> tuple[float, float]:
         rows = np.array(self._deviations)
         worst = (0.0, 0.0)
         for window_s, limit_m in self._limits.items():

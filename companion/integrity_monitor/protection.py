@@ -50,10 +50,10 @@ def budget(
 ) -> tuple[float, float]:
     """Horizontal and vertical level, metres: k times the root of the summed variances.
 
-    Noise, map, calibration and time fail independently. Horizontally the error is that of a
-    circular distribution of the worst axis: exp(-k^2/2) = risk; vertically a normal one, bounded by
-    the same exponential. sigma_m, speeds_mps: horizontal and vertical; height_m: above the
-    ground.
+    Errors of noise, map, calibration and time are independent. The horizontal error is taken as
+    circular with the sigma of the worst axis: exp(-k^2/2) = risk. The vertical error is normal and
+    bounded by the same exponential. sigma_m, speeds_mps: horizontal and vertical; height_m: above
+    the ground.
     """
     k = math.sqrt(-2.0 * math.log(config.risk))
     maps = (config.map_m, config.map_height_m)

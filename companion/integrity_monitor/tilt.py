@@ -18,8 +18,9 @@ _HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
 
 
 class TiltCheck:
-    """Takes every fix. A constant bias of the gimbal is not estimated here: a wrong tilt that came
-    slowly and with the first fix (1.5 degrees in 2 s, `begins-denied`) would become part of it.
+    """Takes every fix. It does not estimate a constant bias of the gimbal. A wrong tilt that grows
+    slowly from the first fix on (1.5 degrees in 2 s, `begins-denied`) would become part of such a
+    bias.
     """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
@@ -28,7 +29,7 @@ class TiltCheck:
         self._most_m = config.unreported_jump_m
         self._off_rad = 0.0
         self._share = 0.0  # of its sigma
-        self._judged_ns: int | None = None
+        self._checked_ns: int | None = None
         self.tilts = False
         """The newest fix is tilted as neither gimbal nor autopilot explain."""
         self.is_known = False
@@ -52,10 +53,10 @@ class TiltCheck:
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
         """Add a fix with the autopilot's attitude at its time, None where unknown."""
         if attitude is None or fix.quaternion is None:
-            since = self._judged_ns
+            since = self._checked_ns
             self.is_known = since is not None and abs(fix.time_ns - since) <= _HOLDS_NS
             return
-        self._judged_ns, self.is_known = fix.time_ns, True
+        self._checked_ns, self.is_known = fix.time_ns, True
         self._off_rad = math.dist(_level(fix.quaternion), _level(attitude.quaternion))
         self._share = self._off_rad / math.hypot(self._sigma_rad, fix.attitude_sigma_rad)
         self.tilts = self._share > (_CALM_SIGMAS if self.tilts else _SIGMAS)

@@ -41,9 +41,9 @@ class FrameVerdict:
     """Result of the video checks. still_s: how long the image has not moved; identical_s: how long
     the frames have been bit-identical.
 
-    repeat_lag_s: the pictures are those of so long ago; 0 where they are new. contrast: standard
-    deviation of the thumbnail, gray levels of 255; detail: the same of a block of 4 by 4 of its
-    pixels, the median of all blocks.
+    repeat_lag_s: age of the frames that are repeated; 0 for new frames. contrast: standard
+    deviation of the thumbnail, gray levels of 255; detail: standard deviation of a block of 4 by 4
+    pixels of it, median over all blocks.
     """
 
     still_s: float

@@ -38,8 +38,8 @@ def picture_fields(
 ) -> dict[int, float | str]:
     """ST 0601 fields of an accepted estimate's frame.
 
-    ned_from_body: (3, 3), the aircraft's attitude; None leaves out its angles and those of the
-    camera on it. Without map under the centre or a corner these are left out.
+    ned_from_body: (3, 3), the aircraft's attitude. If it is None, the angles of the aircraft and of
+    the camera relative to it are left out. A centre or corner without map below it is left out.
     """
     pose, camera = estimate.world_from_camera, estimate.camera
     position = scene.frame.position(pose.translation)

@@ -44,8 +44,9 @@ class _RelayItem:
 class KlvRelay:
     """A `PacketTap` that writes to `config.output` on its own thread.
 
-    attitude: the aircraft's, NED from body (3, 3), at a time; None if unknown.
-    utc_minus_monotonic_ns: of this computer. Failures are counted and reported once.
+    attitude: gives the aircraft's attitude at a time, NED from body (3, 3); None if unknown.
+    utc_minus_monotonic_ns: difference of this computer's clocks. Failures are counted; the first
+    one is reported.
     """
 
     def __init__(

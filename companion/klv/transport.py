@@ -51,8 +51,8 @@ class TransportWriter:
     def write(self, packet: av.Packet) -> None:
         """Write a video packet and the metadata of frames up to its decoding time.
 
-        Pictures are stored in the order in which they are decoded; metadata must be in the order
-        of presentation. Raises OSError.
+        Frames are stored in decoding order; their metadata must be in presentation order. Raises
+        OSError.
         """
         stamp = packet.dts if packet.dts is not None else packet.pts
         until = None if stamp is None else round(stamp * packet.time_base / _CLOCK)

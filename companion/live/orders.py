@@ -87,8 +87,9 @@ class Orders:
 
 
 def _pointed_into(order: dict[str, Any]) -> int:
-    """When the picture was taken that the operator saw; now where the order does not say. One of
-    long ago, or of another flight, shows something else at that place than the picture of now.
+    """Exposure time of the clicked frame; now if the order does not state it. `OrderError` for an
+    old frame, or one of another flight, because it shows another place at this pixel than the
+    present frame.
     """
     now_ns = time.monotonic_ns()
     if order.get("exposure_ns") is None:

@@ -75,7 +75,7 @@ class MessageDecoder:
 def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
     """Socket path of a deployment, the same for both processes, in a folder of this user.
 
-    A path of its own for each deployment; short, because such addresses end at 107 bytes.
+    Each deployment has its own path. It is short, because socket addresses end at 107 bytes.
     """
     key = f"{Path(map_path).absolute()}\0{record and Path(record).absolute()}\0{listen}"
     name = hashlib.sha256(key.encode()).hexdigest()[:16]

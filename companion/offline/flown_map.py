@@ -18,8 +18,8 @@ _SAME_FRAME_M = 1.0
 
 @dataclass(frozen=True)
 class FlownMap:
-    """What a record tells about its map. sha256: of the map's manifest, None in old records. place,
-    point: one pose in WGS84 and in the map's ENU, m; None if not recorded.
+    """A record's data about its map. sha256: hash of the map's manifest, None in old records.
+    place, point: one pose in WGS84 and in the map's ENU, m; None if not recorded.
     """
 
     folder: Path

@@ -23,8 +23,8 @@ _PASSES = 3  # of an image that starts from a prior: the view from there shows a
 
 @dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of priors per axis. attitude_deg, height_m: of roll and pitch and of the
-    height if sensors measured them; None: used as start values only.
+    """Standard deviations of priors per axis. attitude_deg, height_m: of measured roll and pitch,
+    and of a measured height; None: the values are only used as start values.
     """
 
     position_m: float
@@ -75,9 +75,9 @@ def localize_images(
 ) -> Iterator[LocalizedImage]:
     """Yield the result of each image in order.
 
-    An image named in `priors` starts from its own prior; the others continue from the image before,
-    as frames of a video do. An image that cannot be used, or that is outside the map, is reported
-    and left out.
+    An image named in `priors` starts from its own prior. The others continue from the image before,
+    as frames of a video. An image that cannot be used, or that is outside the map, is reported and
+    left out.
     """
     for sequence, (path, time_ns) in enumerate(zip(images, times_ns, strict=True)):
         prior = priors.get(path.name)

@@ -120,8 +120,8 @@ def replay(
 def _told_factor(
     zoom: ZoomTable | None, autopilot: RecordedAutopilot, recorded: RecordedEstimate
 ) -> float | None:
-    """Multiple of the model's focal length that the log tells of a frame whose row does not, as in
-    older records; 1 where none is needed, None where nobody tells.
+    """Multiple of the model's focal length by the log, for a frame whose row has none, as in older
+    records; 1 if the camera has no zoom, None if the log has no value.
     """
     if zoom is None or recorded.focal_px is not None:
         return 1.0

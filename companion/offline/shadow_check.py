@@ -245,7 +245,7 @@ class _Player:
         self._parts.make(up)
         self.bridge, self._monitor = self._parts[Bridge], self._parts.get(IntegrityMonitor)
         injection = self._parts[FixInjection]
-        injection.add_judge(self._passed)
+        injection.add_check(self._passed)
         self._localizer, self._search = self._parts[Localizer], self._parts[PlaceSearch]
         self._search.prepare()
         self._reference: ReferenceBundle | None = None
@@ -262,7 +262,7 @@ class _Player:
             if state.connected and state.origin is None:
                 self.bridge.play(self._origin)
             if self._monitor is not None and next_ns % _TURN_NS == 0:
-                self._monitor.turn()
+                self._monitor.run_checks()
                 if (reason := self._monitor.reason) is not None:
                     self._counts.held[reason.id.value] += 1
             if next_ns % _SCORE_NS == 0 and self._begun_ns is not None:

@@ -19,9 +19,9 @@ Columns = Mapping[str, np.ndarray]
 def read_columns(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """Columns of a CSV file as float64 arrays, NaN where a field is empty.
 
-    Those named in `text` are strings, those that end in ``_ns`` int64 (a float64 would round them).
-    A last row that a loss of power cut short is left out. `RecordError` if the file is not a table
-    of a record.
+    Columns named in `text` are strings; columns whose name ends in ``_ns`` are int64, because
+    float64 would round them. A last row that a power loss cut short is left out. `RecordError` if
+    the file is not a table of a record.
     """
     lines = io.StringIO(plain_text(path, None), newline="").readlines()
     if lines and not lines[-1].endswith("\n"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.offline.record import read_estimates, read_record
-from companion.planning.judge import LegVerdict
+from companion.planning.verdicts import LegVerdict
 from localizer.forecast.risk import RISK_LIMIT
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
@@ -41,20 +41,20 @@ class FlownLeg:
 def flown_legs(
     verdicts: Sequence[LegVerdict], places: Array, accepted: np.ndarray
 ) -> tuple[FlownLeg, ...]:
-    """Each leg's places against the flight's frames within half a step, horizontally. places:
-    (F, 3) of all frames; accepted: (F,), whether each was localized.
+    """Compares each leg's samples with the frames of the flight within half a step horizontally.
+    places: (F, 3) of all frames; accepted: (F,), whether each was localized.
     """
     legs = []
     for verdict in verdicts:
         forecast, held = [], []
-        for judged in verdict.judged:
+        for judged in verdict.samples:
             away = np.linalg.norm(places[:, :2] - judged.sample.position[:2], axis=1)
             near = away <= max(verdict.leg.step_m / 2, 1.0)
             if near.any():
                 forecast.append(judged.holds)
                 held.append(bool(accepted[near].mean() >= 1.0 - RISK_LIMIT))
         told = (np.array(forecast, bool), np.array(held, bool))
-        legs.append(FlownLeg(verdict.leg.name, len(verdict.judged), *told))
+        legs.append(FlownLeg(verdict.leg.name, len(verdict.samples), *told))
     return tuple(legs)
 
 

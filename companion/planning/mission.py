@@ -84,8 +84,8 @@ def _plan(text: str) -> _Read:
 
 
 def _expanded(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A simple item; those that a survey or a corridor was turned into when it was saved; those
-    that QGroundControl makes of a landing pattern; else the entry itself, which is not read.
+    """The mission items of an entry: a simple item; the saved items of a survey or corridor; the
+    items that QGroundControl makes of a landing pattern; else the entry itself, which is not read.
     """
     if entry["type"] == "SimpleItem":
         yield entry
@@ -101,8 +101,8 @@ def _expanded(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _landing_pattern(entry: dict[str, Any], kind: str) -> Iterator[dict[str, Any]]:
-    """Approach and landing (QGroundControl's LandingComplexItem). Older files name the approach
-    after the loiter, and say for each place what its altitude is above.
+    """Approach and landing (QGroundControl's LandingComplexItem). Older files call the approach the
+    loiter, and state for each position the reference of its altitude.
     """
     name = "landingApproachCoordinate"
     approach = entry[name if name in entry else "loiterCoordinate"]

@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from companion.planning.judge import LegVerdict, VisionGap
 from companion.planning.plan import MissionForecast
+from companion.planning.verdicts import LegVerdict, VisionGap
 from companion.reporting.layout import data_uri
 from companion.writing import writing
 from localizer.types import Image
@@ -27,7 +27,7 @@ LEG_HEADINGS = (
     "leg", "m", "holds", "sigma m", "lost or wrong", "map", "like it", "in", "why not"
 )  # fmt: skip
 STRETCH_HEADINGS = ("from m", "to m", "length m", "seconds", "drift m", "odometry")
-INSTEAD_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
+PROPOSAL_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
 
 
 def verdict_words(plan: MissionForecast) -> str:
@@ -82,7 +82,7 @@ def stretch_row(stretch: VisionGap) -> tuple[str, ...]:
     )
 
 
-def instead_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
+def proposal_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
     """Table rows of the alternatives."""
     return [
         (
@@ -92,7 +92,7 @@ def instead_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
             f"{i.sigma_m:.2f}",
             "yes" if i.holds else "better, but no",
         )
-        for i in plan.instead
+        for i in plan.proposals
     ]
 
 
@@ -126,7 +126,7 @@ def as_data(plan: MissionForecast) -> dict[str, Any]:
                         "likest_place": j.forecast.rival.share,
                         "reason": j.reason.value,
                     }
-                    for j in v.judged
+                    for j in v.samples
                 ],
             }
             for v in plan.verdicts
@@ -137,7 +137,7 @@ def as_data(plan: MissionForecast) -> dict[str, Any]:
         ],
         "instead": [
             {"leg": i.leg, "fly": i.change.words, "risk": i.risk, "holds": i.holds}
-            for i in plan.instead
+            for i in plan.proposals
         ],
         "notes": list(plan.notes),
     }
@@ -159,7 +159,7 @@ def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], pat
         + "<h2>Legs</h2>"
         + _table(LEG_HEADINGS, map(leg_row, plan.verdicts), bad)
         + _part("To be bridged", STRETCH_HEADINGS, map(stretch_row, plan.stretches))
-        + _part("What would do instead", INSTEAD_HEADINGS, instead_rows(plan))
+        + _part("What would do instead", PROPOSAL_HEADINGS, proposal_rows(plan))
         + shown
         + "<ul>"
         + "".join(f"<li><small>{escape(note)}</small>" for note in plan.notes)

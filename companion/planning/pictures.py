@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from companion.planning.judge import JudgedSample, LegVerdict
 from companion.planning.plan import MissionForecast
+from companion.planning.verdicts import LegVerdict, SampleVerdict
 from companion.planning.way import Aim, camera_pose
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -65,15 +65,15 @@ def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
     """The path in green (holds), amber (doubtful) and red (fails), with numbered waypoints."""
     picture = sheet.rgb.copy()
     for verdict in plan.verdicts:
-        pixels = sheet.pixels(_places(verdict.judged))
-        for judged, pixel in zip(verdict.judged, pixels, strict=True):
+        pixels = sheet.pixels(_places(verdict.samples))
+        for judged, pixel in zip(verdict.samples, pixels, strict=True):
             half = _half_step(verdict, judged, sheet.gsd_m)
             a, b = np.int32(np.stack([pixel - half, pixel + half]) * 16).tolist()
             cv2.line(picture, a, b, (20, 20, 20), _LINE_PX + 4, cv2.LINE_AA, 4)
             cv2.line(picture, a, b, colour_of(judged), _LINE_PX, cv2.LINE_AA, 4)
     for verdict in plan.verdicts:
-        start = sheet.pixels(_places(verdict.judged))[0]
-        start = start - _half_step(verdict, verdict.judged[0], sheet.gsd_m)
+        start = sheet.pixels(_places(verdict.samples))[0]
+        start = start - _half_step(verdict, verdict.samples[0], sheet.gsd_m)
         _label(picture, start, verdict.leg.name.split(" to ")[0])
     return _with_legend(picture, ("holds", "doubtful", "will not do"))
 
@@ -105,22 +105,22 @@ def heat_picture(
     return _with_legend(picture, ("seen, holds", "doubtful", "seen, will not do"))
 
 
-def colour_of(judged: JudgedSample) -> tuple[int, int, int]:
+def colour_of(judged: SampleVerdict) -> tuple[int, int, int]:
     """RGB colour of a sample."""
     if not judged.holds:
         return _COLOURS[2]
     return _COLOURS[1] if judged.forecast.risk > _DOUBTFUL else _COLOURS[0]
 
 
-def _all(plan: MissionForecast) -> list[JudgedSample]:
-    return [j for v in plan.verdicts for j in v.judged]
+def _all(plan: MissionForecast) -> list[SampleVerdict]:
+    return [j for v in plan.verdicts for j in v.samples]
 
 
-def _places(judged: Sequence[JudgedSample]) -> Array:
+def _places(judged: Sequence[SampleVerdict]) -> Array:
     return np.array([j.sample.position[:2] for j in judged])
 
 
-def _half_step(verdict: LegVerdict, judged: JudgedSample, gsd_m: float) -> Array:
+def _half_step(verdict: LegVerdict, judged: SampleVerdict, gsd_m: float) -> Array:
     """Half of the way (2,) that a sample of the leg stands for, pixels."""
     heading = np.radians(judged.sample.heading_deg)
     along = np.array([np.sin(heading), -np.cos(heading)])
@@ -128,7 +128,7 @@ def _half_step(verdict: LegVerdict, judged: JudgedSample, gsd_m: float) -> Array
     return half
 
 
-def _footprint(judged: JudgedSample, cache: TileCache, camera: Camera, aim: Aim) -> Array | None:
+def _footprint(judged: SampleVerdict, cache: TileCache, camera: Camera, aim: Aim) -> Array | None:
     """(N, 2) corners of the ground in view, at most as far as three times its middle."""
     ground = judged.forecast.ground_m
     if ground <= 0:

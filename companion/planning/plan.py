@@ -11,10 +11,10 @@ from statistics import median
 
 from companion.config import CompanionConfig
 from companion.geometry import Mount
-from companion.planning.instead import Instead, instead
-from companion.planning.judge import LegVerdict, MissionLimits, VisionGap, stretches
+from companion.planning.alternatives import LegProposal, leg_proposals
 from companion.planning.mission import PlannedMission
 from companion.planning.survey import Progress, surveyor
+from companion.planning.verdicts import LegVerdict, MissionLimits, VisionGap, stretches
 from companion.planning.way import Aim, FlightLeg, MapHeights, legs_of, length_m
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
@@ -44,8 +44,8 @@ class Question:
 @dataclass(frozen=True)
 class MissionForecast:
     """The result. length_m: of all legs; verdicts: of each leg once, however often it is flown;
-    not_judged: commands of the mission that are not in it, by MAVLink name; notes: limits of the
-    forecast for this mission, as sentences.
+    not_judged: MAVLink names of the mission's commands that the forecast cannot include; notes:
+    limits of the forecast for this mission, as sentences.
     """
 
     question: Question
@@ -53,7 +53,7 @@ class MissionForecast:
     speed_m_s: float
     verdicts: tuple[LegVerdict, ...]
     stretches: tuple[VisionGap, ...]
-    instead: tuple[Instead, ...]
+    proposals: tuple[LegProposal, ...]
     notes: tuple[str, ...]
     not_judged: tuple[str, ...] = ()
 
@@ -86,26 +86,26 @@ def make_plan(
     aim = aim_of(deployment, question.pitch_deg)
     ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)
-    thinned = length_m(_once(legs)) / _MOST_SAMPLES
-    if thinned > question.spacing_m:
-        legs = legs_of(mission, cache, ground, aim, thinned)
+    coarser_m = length_m(_once(legs)) / _MOST_SAMPLES
+    if coarser_m > question.spacing_m:
+        legs = legs_of(mission, cache, ground, aim, coarser_m)
     samples = [s for leg in _once(legs) for s in leg.samples]
 
     with surveyor(cache, deployment, aim, question.conditions, question.limits) as found:
-        judged = iter(found.judged(samples, progress))
+        judged = iter(found.verdicts(samples, progress))
         times = Counter(leg.first for leg in legs)
         verdicts = tuple(
             LegVerdict(leg, tuple(next(judged) for _ in leg.samples), times[leg.first])
             for leg in _once(legs)
         )
-        options = instead(found, verdicts, aim.fixed, progress) if question.seek else ()
+        options = leg_proposals(found, verdicts, aim.fixed, progress) if question.seek else ()
     odometry = deployment.localizer.odometry or OdometryConfig()
     speed_m_s = mission.speed_m_s or question.speed_m_s
     bridged = stretches(
         _as_flown(legs, verdicts), speed_m_s, odometry,
         terrain=deployment.localizer.terrain is not None,
     )  # fmt: skip
-    notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
+    notes = _notes(mission, deployment, aim, max(coarser_m, question.spacing_m))
     notes += _kind_notes(cache, deployment, [s.position for s in samples], ground)
     unknown = tuple(n.text for n in mission.not_judged if not (aim.fixed and n.gimbal_only))
     length = length_m(legs)
@@ -125,7 +125,7 @@ def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list
             leg,
             tuple(
                 replace(judged, sample=sample)
-                for judged, sample in zip(of[leg.first].judged, leg.samples, strict=True)
+                for judged, sample in zip(of[leg.first].samples, leg.samples, strict=True)
             ),
         )
         for leg in legs

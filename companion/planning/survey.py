@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 from companion.config import CompanionConfig
-from companion.planning.judge import JudgedSample, MissionLimits, judge
+from companion.planning.verdicts import MissionLimits, SampleVerdict, sample_verdict
 from companion.planning.way import Aim, PathSample, camera_pose
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
@@ -26,10 +26,10 @@ _MOST_THREADS = 8
 
 
 class Surveyor:
-    """Judges path samples in threads; create it by `surveyor`.
+    """Forecasts path samples in threads; create it by `surveyor`.
 
-    Each thread takes a forecaster for itself: renderers, networks and optimizers are used by one
-    thread at a time.
+    Each thread uses its own forecaster, because a renderer, network or optimizer serves one thread
+    at a time.
     """
 
     def __init__(
@@ -47,9 +47,9 @@ class Surveyor:
             self._idle.put(forecaster)
         self._threads = len(forecasters)
 
-    def judged(
+    def verdicts(
         self, samples: Sequence[PathSample], progress: Progress | None = None
-    ) -> list[JudgedSample]:
+    ) -> list[SampleVerdict]:
         """Judge the samples, in their order; deterministic."""
         made = []
         with ThreadPoolExecutor(self._threads, "forecast") as pool:
@@ -59,11 +59,13 @@ class Surveyor:
                     progress(done, len(samples))
         return made
 
-    def _one(self, number: int, sample: PathSample) -> JudgedSample:
+    def _one(self, number: int, sample: PathSample) -> SampleVerdict:
         pose = camera_pose(sample, self._cache, self._aim)
         forecaster = self._idle.get()
         try:
-            return judge(sample, forecaster.at(pose, self._conditions, number), self._limits)
+            return sample_verdict(
+                sample, forecaster.at(pose, self._conditions, number), self._limits
+            )
         finally:
             self._idle.put(forecaster)
 

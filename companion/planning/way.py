@@ -58,9 +58,9 @@ class PathSample:
 
 @dataclass(frozen=True)
 class FlightLeg:
-    """The path between two positions. name: of their numbers, "home" or "take-off"; step_m:
+    """The path between two positions. name: made of their numbers, "home" or "take-off"; step_m:
     distance between samples; speed_m_s: None if the mission has none; first: index of the first
-    identical leg; is_circle: a loiter circle.
+    identical leg; is_circle: whether it is a loiter circle.
     """
 
     name: str
@@ -99,7 +99,7 @@ def legs_of(
     """The mission's legs in flight order with samples every spacing_m; legs with an unknown path
     are left out.
 
-    MissionFileError where the mission does not say how high it flies over the map.
+    MissionFileError if the mission does not state its height above the map.
     """
     site = _Site(cache, ground, _launch(mission, cache))
     path = [replace(p, after_gap=False) for p in mission.path]

@@ -44,9 +44,8 @@ def examine_deployment(
 ) -> Diagnosis:
     """Run all checks.
 
-    vehicle, feed: false leaves out flight controller or camera. Feed and vehicle are checked in
-    parallel, after the localizer, whose compilation would delay the link. say: receives each step
-    as text.
+    vehicle, feed: False leaves out flight controller or camera. Both are checked in parallel, after
+    the localizer, because its compilation would delay the link. say: receives each step as text.
     """
     say("reading the map")
     cache, findings = _check_map(config)
@@ -154,8 +153,8 @@ def _localizer_name(config: CompanionConfig) -> str:
 
 
 def _check_camera(config: CompanionConfig) -> DoctorFinding:
-    """Read the feed for a few seconds: pictures of the calibrated size, often enough. A feed that
-    delivers is read for less time than one that must be called silent.
+    """Read the feed for a few seconds, and check size and rate of the frames. A feed without frames
+    is read for longer before it is called silent.
     """
     feed = config.camera
     settings = feed.settings.model_copy(update={"realtime": True})

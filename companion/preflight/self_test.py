@@ -45,8 +45,9 @@ class SelfTestError(CompanionError):
 
 @dataclass(frozen=True)
 class SelfTestReport:
-    """error_m: of the tracked positions, worst frame; found_error_m: of the search without a prior;
-    frame_ms: processor time per frame, median; compiled_s: time to the first result.
+    """Result of the self-test. error_m: of the tracked positions, worst frame; found_error_m: of
+    the search without a prior; frame_ms: processor time per frame, median; compiled_s: time to the
+    first result.
     """
 
     error_m: float
@@ -65,7 +66,7 @@ def self_test(
 ) -> SelfTestReport:
     """Build a map in `folder`, track frames over it and find one without a prior.
 
-    Raises SelfTestError where a result is off by more than 0.5 m or none is accepted.
+    Raises SelfTestError if a result is off by more than 0.5 m, or if none is accepted.
     """
     config = config or LocalizerConfig()
     say("building a map")

@@ -87,9 +87,10 @@ class _LogRows:
 
 
 def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
-    """Read a log's telemetry. fixed_pitch_deg: of a camera on the body if no gimbal reports.
+    """Read a log's telemetry. fixed_pitch_deg: pitch of a camera on the body, used if no gimbal
+    reports.
 
-    `FootageError` where the log lacks positions or attitudes, or is none.
+    `FootageError` if the file is no log, or has no positions or attitudes.
     """
     raw = _read(path)
     for rows, what in ((raw.positions, "position"), (raw.attitudes, "attitude")):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 
 import cv2
 import numpy as np
@@ -37,9 +38,10 @@ _TAG_NS = 600_000_000  # EXIF's times may be whole seconds
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """offset_s: to add to the images' times. residual_deg: of the features at this offset;
-    second_deg: at the next best offset, infinite without one; pairs: of images used; chance:
-    probability that another flight's log reaches so low a residual.
+    """Offset of an autopilot log's clock from the images'. offset_s: to add to the images' times.
+    residual_deg: of the features at this offset; second_deg: at the next best offset, infinite
+    without one; pairs: number of image pairs used; chance: probability that another flight's log
+    reaches so low a residual.
     """
 
     offset_s: float
@@ -58,8 +60,12 @@ class ClockOffset:
     @property
     def text(self) -> str:
         """The values as text."""
+        offset = f"{self.offset_s:+.2f} s"
+        if abs(self.offset_s) > 86_400.0:  # a video's clock begins at 0
+            begin = datetime.fromtimestamp(self.offset_s, timezone.utc)
+            offset = f"the video begins at {begin:%Y-%m-%d %H:%M:%S} UTC"
         return (
-            f"{self.offset_s:+.2f} s by motion ({self.pairs} pairs of images, "
+            f"{offset} by motion ({self.pairs} pairs of images, "
             f"{self.residual_deg:.2f} degrees left, {self.second_deg:.2f} at the next best offset; "
             f"by chance: {self.chance:.1g})"
         )
@@ -115,9 +121,10 @@ def _outside(scores: Array, best: int) -> np.ndarray:
 
 
 def _chance(residuals: Array, outside: np.ndarray, best: float) -> float:
-    """Of a median of so many pairs as low as the best: each pair's residual is so low at some share
-    of the other offsets, and as many valleys as wide as the best one's were looked at. Half of the
-    pairs count, because neighbours share an image.
+    """Probability that another log gives a median residual as low as the best, from this many
+    pairs. Each pair's residual is so low at some share of the other offsets. As many valleys were
+    tried as fit into the range of offsets. Half of the pairs count, because neighbours share an
+    image.
     """
     elsewhere = residuals[outside]
     known = np.isfinite(elsewhere)

@@ -287,6 +287,8 @@ def _places_file(
         try:
             if names & read_places(file).keys():
                 candidates.append(file)
+            else:
+                notes.append(f"not used: {file.name} names none of the photos")
         except FootageError as error:
             if file.suffix.lower() == ".csv":
                 notes.append(f"not used: {error}")

@@ -30,8 +30,8 @@ Fields = dict[int, float | str | int]
 
 @dataclass(frozen=True)
 class KlvTrack:
-    """Telemetry of a video's KLV packets. samples: time from its first frame, ns; packets: number
-    read; damaged: number not decoded; field_of_view_deg: horizontal, first value.
+    """Telemetry of a video's KLV packets. samples: telemetry by time from the first frame, ns;
+    packets: number read; damaged: number not decoded; field_of_view_deg: horizontal, first value.
     """
 
     samples: tuple[Telemetry, ...]

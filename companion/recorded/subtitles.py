@@ -11,6 +11,7 @@ import math
 import re
 from dataclasses import dataclass
 from datetime import date
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def read_subtitles(path: Path) -> Subtitles:
         raise FootageError(f"{path}: cannot be read: {error}") from error
     cues = list(_CUE.finditer(text))
     samples, focal = [], None
-    for cue, after in zip(cues, [*cues[1:], None], strict=True):
+    for cue, after in zip_longest(cues, cues[1:]):
         body = text[cue.end() : after.start() if after else len(text)]
         body = re.sub(r"<[^>]*>", " ", body)
         hours, minutes, seconds, part = cue.groups()

@@ -45,7 +45,7 @@ def ulog_messages(path: Path) -> Iterator[Dated]:
     home = topics.get("home_position", topics.get("vehicle_global_position", {})).get("alt", [0.0])
     rows: list[tuple[int, str, int]] = []
     for name, data in topics.items():
-        rows.extend((int(data["timestamp"][k]), name, k) for k in _thinned(data["timestamp"]))
+        rows.extend((int(data["timestamp"][k]), name, k) for k in _subsampled(data["timestamp"]))
     for us, name, k in sorted(rows):
         row = {field: values[k] for field, values in topics[name].items()}
         message = _TOPICS[name](row, us, float(home[0]))
@@ -53,7 +53,7 @@ def ulog_messages(path: Path) -> Iterator[Dated]:
             yield from autopilot((us + utc_us) * 1000, message)
 
 
-def _thinned(times_us: np.ndarray) -> np.ndarray:
+def _subsampled(times_us: np.ndarray) -> np.ndarray:
     """Which samples are used, about one each `_LONGEST_STEP_US`."""
     slot = np.asarray(times_us, np.int64) // _LONGEST_STEP_US
     return np.flatnonzero(np.diff(slot, prepend=-1) != 0)

@@ -28,7 +28,7 @@ class TimedTrack:
         """Horizontal distance (E,) from each accepted estimate to the track, interpolated; NaN
         without a near sample.
 
-        It includes the lever arm, and the message's delay times the speed.
+        The distance contains the lever arm, and the delay of the messages times the speed.
         """
         times = np.asarray(estimates["exposure_time_ns"])
         begin = int(self.time_ns[0])

@@ -141,9 +141,9 @@ class Report:
     """All contents of a report. first: the first fault as text; abscissa: label of the plots and
     timeline.
 
-    spans: named lanes of stretches (states, GNSS denied); notes: what the report could not show;
-    overlays_of: the frames of which the overlays show the worst; verdict: the result in one
-    sentence; tables: further ones with their titles.
+    spans: named lanes of time spans (states, GNSS denied); notes: what the report could not show;
+    overlays_of: the frames that the overlays show; verdict: the result in one sentence; tables:
+    further tables with their titles.
     """
 
     title: str
@@ -162,6 +162,6 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
-    overlays_of: str = "all frames"
+    overlays_of: str = "The worst of all frames"
     verdict: str = ""
     tables: tuple[tuple[str, ReportTable], ...] = ()

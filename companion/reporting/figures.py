@@ -102,8 +102,8 @@ def first_fault(
     estimates: Columns, time_s: np.ndarray, happened: Sequence[ReportEvent], large_error: str = "",
     since_s: float | None = None,
 ) -> str:  # fmt: skip
-    """Text: the first fault after localization began. large_error: text of the first large error,
-    if the truth is known. since_s: earlier faults are reported only if there is no later one.
+    """The first fault after localization began, as text. large_error: text of the first large
+    error, if the truth is known. since_s: a fault before it counts only if there is no later one.
     """
     states = np.asarray(estimates.get("state", np.empty(0)))
     began = np.flatnonzero(states == "tracking")

@@ -53,8 +53,8 @@ def describe_recording(
 ) -> Written:
     """Write `video` as MPEG-TS with ST 0601 metadata for each localized frame.
 
-    begin_s: when its first picture was taken, seconds since the record's start; None: the pictures
-    carry MISP time stamps. Raises `RecordError`, `StreamOpenError`.
+    begin_s: exposure of its first frame, seconds since the record's start; None if the frames have
+    MISP timestamps. Raises `RecordError`, `StreamOpenError`.
     """
     tables = read_record(record)
     map_path = map_cache or tables.map_path

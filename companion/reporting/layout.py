@@ -81,7 +81,7 @@ def _sections(report: Report) -> list[str]:
         _section("Timeline", _timeline(report)) if report.lanes or report.events else "",
         _section("Errors and figures", _plots(report)) if report.plots else "",
         _section("Protection levels", _stanford(report.stanford)) if report.stanford else "",
-        _section("Worst frames", _overlays(report)) if report.overlays else "",
+        _section("Frames and map", _overlays(report)) if report.overlays else "",
         _section("Targets", _table(report.targets)) if report.targets else "",
         _section("Latency by stage, ms", _table(report.stages)) if report.stages else "",
         _section("Settings and versions", _settings(report)),
@@ -289,7 +289,8 @@ def _overlays(report: Report) -> str:
             f"<figcaption>{escape(o.caption)}</figcaption></figure>"
         )
     return (
-        f"<p class=sub>Of {escape(report.overlays_of)}.</p>"
+        f"<p class=sub>{escape(report.overlays_of)}. The second slider uncovers the map as the "
+        "estimated pose sees it: if the pose is right, edges run on.</p>"
         "<div class=controls><label>frame <input type=range id=which min=0 "
         f"max={len(sheets) - 1} value=0></label> <label>video | map <input type=range id=share "
         "min=0 max=100 value=50></label></div>" + "".join(sheets)

@@ -105,7 +105,7 @@ def map_pictures(
     path: Path | None, say: Say = silent, flown: FlownMap | None = None
 ) -> Iterator[MapPictures]:
     """Context manager: images of the map in that folder; a note in the report if it cannot be used.
-    flown: what the record tells about its map, to reject a map with another origin.
+    flown: the record's data about its map, to reject a map with another origin.
     """
     if path is None:
         yield MapPictures(None, None, ["the map is not named: no pictures of it"])

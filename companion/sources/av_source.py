@@ -287,7 +287,7 @@ class LiveVideoSource:
     """A live stream, decoded by a reader thread; only the newest frame is kept. A stream that stops
     is reported and reopened, with longer waits after failures.
 
-    Above 200 lines: what the reader's thread finds and what the taker's does are one state to tell.
+    Above 200 lines: the reader's thread and the thread that takes frames share one state.
     """
 
     def __init__(
@@ -330,8 +330,8 @@ class LiveVideoSource:
     def frames(self) -> Iterator[Frame]:
         """Yield the newest frame; ends only when closed.
 
-        Raises `StreamSizeError` when the first picture has another shape than the camera model. A
-        stream that changes its shape later is reported as MISFIT until it fits again.
+        Raises `StreamSizeError` if the first frame has another aspect ratio than the camera model.
+        If the ratio changes later, MISFIT is reported until it fits again.
         """
         self._start()
         while (item := self._newest.take()) is not None:
@@ -350,8 +350,8 @@ class LiveVideoSource:
     def close(self) -> None:
         """End `frames`; waits for the reader, at most about two open timeouts.
 
-        FFmpeg's opening and its probing have one each. A reader still in them when the interpreter
-        ends would call back into it: a segmentation fault.
+        Opening and probing in FFmpeg take one timeout each. If the interpreter ended during them,
+        FFmpeg's callback into it would cause a segmentation fault.
         """
         with self._lock:  # a reader that is being started is started
             self._closing.set()

@@ -39,8 +39,8 @@ _SHAPE_TOLERANCE = 0.005
 class StreamState(Enum):
     """State of a feed; `SourceSettings` says when a live one is stalled.
 
-    SCALED: its pictures have another size than the calibration but the same shape, and are used.
-    MISFIT: they have another shape, and are not.
+    SCALED: the frames have another size than the calibration but the same aspect ratio, and are
+    used. MISFIT: they have another aspect ratio, and are not used.
     """
 
     IDLE = "not started"
@@ -59,10 +59,11 @@ StateCallback = Callable[[StreamState, str], None]
 
 @dataclass(frozen=True)
 class SourceCounters:
-    """received: frames decoded; delivered: passed on by `frames`; dropped: replaced by a newer one
-    first; undecodable: packets without a complete frame, or with one predicted from a lost frame
-    (`companion.sources.references`); misfits: frames whose shape is not the calibration's;
-    reconnects: connections after the first; foreign: datagrams of other senders, which are ignored.
+    """Frame counters of a source. received: frames decoded; delivered: passed on by `frames`;
+    dropped: replaced by a newer one first; undecodable: packets without a complete frame, or with
+    one predicted from a lost frame (`companion.sources.references`); misfits: frames whose shape is
+    not the calibration's; reconnects: connections after the first; foreign: datagrams of other
+    senders, which are ignored.
     """
 
     received: int = 0
@@ -212,7 +213,8 @@ class FrameSource(Protocol):
     def frames(self) -> Iterator[Frame]:
         """Frames in order of exposure, until a file ends or the source is closed.
 
-        A live stream that stops does not end it: it reports its state and connects again.
+        If a live stream stops, the iteration continues: the source reports its state and connects
+        again.
         """
         ...
 
@@ -234,7 +236,7 @@ class FrameSource(Protocol):
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
     """Camera model of a frame of this size: the calibrated one, scaled if necessary.
 
-    Raises `StreamSizeError` when the picture's shape shows that it was cropped or padded.
+    Raises `StreamSizeError` if the aspect ratio shows that the frame was cropped or padded.
     """
     if (width, height) == (camera.width, camera.height):
         return camera

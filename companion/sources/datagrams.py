@@ -39,8 +39,8 @@ class SilentSenderError(Exception):
 class UdpAddress:
     """Parsed ``udp://HOST:PORT?localaddr=ADDRESS``.
 
-    host: of this computer's interface to listen on, or a multicast group. interface: by which a
-    group is joined; empty: the system's choice.
+    host: address of this computer to listen at, or a multicast group. interface: by which a group
+    is joined; empty: the system's choice.
     """
 
     host: str
@@ -102,10 +102,10 @@ class UdpAddress:
 class SenderLock:
     """Accepts the datagrams of one sender: the configured one or the first one.
 
-    A sender that is followed is kept for good once a picture of it was decoded. It may come back
-    from another port (a camera that restarts takes a new one) after `quiet_ns` of silence, and
-    never from another address. Before its first picture, a first sender that gives none makes room
-    after 6 s: a stray packet must not lock the camera out.
+    Once a frame of the sender was decoded, its address stays locked. The sender may change its port
+    after `quiet_ns` of silence, as a camera does that restarts. If no frame of the first sender is
+    decoded within 6 s, another sender may replace it, so that a stray packet does not lock the
+    camera out.
 
     only: HOST or HOST:PORT, a numeric address; None: the first.
     """
@@ -161,12 +161,11 @@ class VideoDatagrams:
     """The feed's socket. It stays bound from the first open to `close`, so the accepted sender
     stays, too.
 
-    FFmpeg reads it as a file (`read`) in the decoding thread; `close` may be called from any. What
-    comes is MPEG-TS, RTP (its pictures are put together here) or H.264, H.265 by itself.
+    FFmpeg reads it as a file (`read`) in the decoding thread; any thread may call `close`. The data
+    are MPEG-TS, RTP (whose frames are assembled here), or raw H.264 or H.265.
 
-    on_stranger: told the address of each that is
-    refused, once, in the reading thread. sets: of RTP, the parameter sets that a session
-    description gives, where the stream itself may lack them.
+    on_stranger: called in the reading thread, once for the address of each refused sender. sets:
+    parameter sets of a session description, for an RTP stream that has none itself.
     """
 
     def __init__(
@@ -218,9 +217,9 @@ class VideoDatagrams:
     def read(self, size: int) -> bytes:
         """Data of the sender, at most `size` bytes, as soon as there are any.
 
-        b"" after `close`; raises `SilentSenderError` when nothing came within `patience_s`, and
-        gives b"" from then on until `begin`: the demuxer asks again, and PyAV would print the trace
-        of a second error over the first.
+        b"" after `close`. Raises `SilentSenderError` if nothing was received within `patience_s`;
+        from then on it returns b"" until `begin`, because the demuxer reads again after the error,
+        and a second error would hide the first.
         """
         if self._silent:
             return b""

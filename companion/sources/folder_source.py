@@ -103,8 +103,8 @@ def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | Non
 
 
 class FolderSource:
-    """Frames from a folder. Times are those of ``timestamps.txt``, or of a fixed rate that starts
-    now; in real time the recorded ones are shifted to start now.
+    """Frames from a folder. Times are those of ``timestamps.txt``, or those of a constant rate from
+    now on. In real time, recorded times are shifted to start now.
     """
 
     def __init__(

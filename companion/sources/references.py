@@ -87,8 +87,9 @@ class Damage:
     def is_damaged(self, arrival_ns: int, *, marked: bool, clean: bool) -> bool:
         """Whether this frame is damaged or predicted from a damaged one.
 
-        marked: the decoder's own mark. clean: the frame is predicted from none. After 5 s the
-        stream counts as whole: one without key frames is refreshed part by part.
+        marked: whether the decoder marked the frame as damaged. clean: whether the frame is
+        predicted from no other. After 5 s the stream counts as undamaged, because an encoder
+        without key frames has refreshed all parts of the image by then.
         """
         self._has_begun = True
         waited = self._since_ns is not None and arrival_ns - self._since_ns > _LONGEST_NS
@@ -107,8 +108,8 @@ class Damage:
 class References:
     """Follows a stream's `frame_num`; call `is_broken` for each packet (one frame), in order.
 
-    A stream without H.264 start codes, or whose encoder does not count as the standard demands,
-    never counts as broken.
+    A stream without H.264 start codes never counts as broken, nor one whose encoder does not count
+    as the standard demands.
     """
 
     def __init__(self, extradata: bytes = b"") -> None:
@@ -122,10 +123,10 @@ class References:
             self._learn(nal)
 
     def is_broken(self, packet: bytes, arrival_ns: int) -> bool:
-        """Whether this packet's frame is predicted from a frame that never came.
+        """Whether this packet's frame is predicted from a frame that was lost.
 
-        That ends with a frame that is predicted from none, after as many frames as a recovery point
-        names, and after 5 s at the latest (a stream without key frames).
+        The damage ends with a frame that is predicted from none, after the number of frames that a
+        recovery point states, and after 5 s at the latest (a stream without key frames).
         """
         slices = []
         for nal in _nal_units(packet):

@@ -92,8 +92,8 @@ def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
 class RtpPictures:
     """Assembles RTP packets of H.264 or H.265 to IVF or MPEG-TS, each frame with its time.
 
-    A picture that lacks a packet is left out: a decoder would show the hole for seconds. sets:
-    parameter sets that an SDP gives, put before the first picture.
+    A frame that lacks a packet is left out, because a decoder would show the damage for seconds.
+    sets: parameter sets of an SDP, put before the first frame.
     """
 
     codec: Literal["h264", "hevc"]

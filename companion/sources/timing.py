@@ -32,8 +32,8 @@ _STEP_NS = 20_000_000  # what a clock that is only slewed does not do between tw
 class MinimumLag:
     """Converts a sender's clock of unknown epoch to CLOCK_MONOTONIC by the smallest lag seen.
 
-    The results never run backwards while arrival times do not: a new smallest lag gives the arrival
-    time itself. latency_ns: the part of the lag that every frame has.
+    If arrival times do not decrease, the results do not: a new smallest lag gives the arrival time
+    itself. latency_ns: the part of the lag that every frame has.
     """
 
     latency_ns: int = 0

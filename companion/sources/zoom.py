@@ -120,7 +120,7 @@ class ZoomedFrames:
         self._correction = FocalCorrection(table.refine)
         self._by_table: float | None = None  # the newest picture's factor
         self._given: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
-        self._told_ns: int | None = None
+        self._reported_ns: int | None = None
         self.unknown = 0  # frames
 
     def __call__(self, frame: Frame) -> Frame | None:
@@ -132,7 +132,7 @@ class ZoomedFrames:
         if factor is None:
             self._doubt(level, frame.exposure_time_ns)
             return None
-        self._told_ns = None
+        self._reported_ns = None
         with self._lock:
             if self._by_table is not None:
                 self._correction.moved(math.log(factor / self._by_table))
@@ -173,9 +173,9 @@ class ZoomedFrames:
 
     def _doubt(self, level: float | None, time_ns: int) -> None:
         self.unknown += 1
-        if self._told_ns is not None and 0 <= time_ns - self._told_ns < _AGAIN_NS:
+        if self._reported_ns is not None and 0 <= time_ns - self._reported_ns < _AGAIN_NS:
             return
-        self._told_ns = time_ns
+        self._reported_ns = time_ns
         if level is None:
             self._report(alert(AlertId.ZOOM_UNKNOWN))
         else:

@@ -21,9 +21,10 @@ def keep(config: CompanionConfig) -> int:
 
 
 def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:
-    """The deployment of a file; if that cannot be read, the kept one and the reason.
+    """The deployment of a file; if the file cannot be read, the kept deployment and the reason.
 
-    kept: the descriptor that `keep` gave, None at a first start, which a wrong file ends.
+    kept: the descriptor returned by `keep`; None at a first start, where an unreadable file is an
+    error.
     """
     try:
         return load_config(path), ""

@@ -23,11 +23,12 @@ class Beat:
 
 
 class FlightProcess:
-    """A flight process. standby: started with ``--standby``, it prepares and waits. hands_on:
+    """A flight process. standby: it is started with ``--standby``, prepares and waits. hands_on:
     inherited file descriptors.
 
-    It takes a process group of its own: the terminal's interrupt comes through the supervisor
-    alone. Not a session: Linux schedules each as one, whatever priority the supervisor was given.
+    It has its own process group, so that the terminal's interrupt reaches it through the supervisor
+    only. It has no session of its own, because Linux schedules each session as one group and would
+    ignore the supervisor's priority.
     """
 
     def __init__(

@@ -21,8 +21,8 @@ class Pulse:
     """Writes ``NAME MILLISECONDS`` lines: the component whose last cycle is oldest, and its age.
 
     beats: times of the components' last cycles, CLOCK_MONOTONIC ns; ages count from the start at
-    the earliest. descriptor: of a pipe, closed at the end. A supervisor that does not read is not
-    waited for.
+    the earliest. descriptor: of a pipe, closed at the end. Writing does not wait for a supervisor
+    that does not read.
     """
 
     def __init__(self, beats: Callable[[], Mapping[str, int]], descriptor: int) -> None:

@@ -26,9 +26,9 @@ def without_lost_disks(
     """The deployment without the files whose disk is gone, and a text on what was left out (empty:
     nothing). A full or failing disk is reported by the component that writes (`DiskFaultError`).
 
-    probe: gives the reason why a folder cannot be written to, empty if it can; called for each
-    folder on a thread of its own. Without it each folder is made if necessary, and a file is
-    written there and removed. A folder that does not answer in time counts as gone.
+    probe: returns why a folder cannot be written to, empty if it can; called for each folder on a
+    thread of its own. The default creates the folder if necessary, and writes and removes a file in
+    it. A folder that does not answer in time counts as gone.
     """
     bridge, record, state = config.bridge, config.record, config.state_folder
     beside = None if record is None else record.folder.parent

@@ -68,14 +68,18 @@ class Process(Protocol):
 
 @dataclass(frozen=True)
 class RestartPolicy:
-    """From `deaths` within `window_s` on, a cold start waits for 2 s, and twice as long each time,
-    at most `wait_s`: it takes all cores for seconds. A standby takes over at once, however often;
-    it is made once one flies for `standby_after_s`: its imports take a core for seconds.
+    """Waits and time limits of the supervisor.
 
-    A part without a turn for `part_s` hangs, and a process without a sign of life for `silent_s`:
-    beyond what an overloaded computer does, and below the autopilot's patience. Before its first
-    sign a standby that was released has `released_s`, another `cold_s`: it may compile. One that
-    ends in order by itself has `ending_s` to put its recording away.
+    If `deaths` occur within `window_s`, a cold start waits for 2 s, then twice as long each time,
+    at most `wait_s`, because it takes all cores for seconds. A standby takes over at once, however
+    often. A new standby is made after a process has flown for `standby_after_s`, because its
+    imports take a core for seconds.
+
+    A component without a cycle for `part_s` hangs, and so does a process without a sign of life for
+    `silent_s`. These limits are above the delays of an overloaded computer and below the
+    autopilot's timeouts. Before its first sign of life a released standby has `released_s` and
+    another process `cold_s`, because it may compile. A process that ends by itself has `ending_s`
+    to close its record.
     """
 
     deaths: int = 5
@@ -296,8 +300,8 @@ class Supervisor:
 
 
 def _do_in_time(name: str, do: Callable[[], None]) -> None:
-    """Run it with a time limit: a report that fails must not delay the restart. The disk or port
-    that does not respond may be what the flight process died of.
+    """Run it with a time limit: a report that fails must not delay the restart. The flight process
+    may have died of the same disk or port that blocks the report.
     """
 
     def guarded() -> None:
@@ -327,7 +331,7 @@ def mark_dead(folder: Path, pid: int, text: str) -> None:
     """Write the death into the ``health.json`` of process `pid`, in the record at `folder` or
     beside it.
 
-    Where no record has one of this process, there is nothing to say it in.
+    Without such a file nothing is written.
     """
     for path in folder.parent.glob(f"{glob.escape(folder.name)}*/health.json"):
         report = _report(path)

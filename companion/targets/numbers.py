@@ -16,7 +16,7 @@ _MOST = 256  # names; many times as many as are followed at a time
 class TargetNumbers:
     """Gives each target's name a number: the click's own, or the next one for detections.
 
-    Numbers are unique, and are not reused before a million others. The 256 newest names are
+    Numbers are unique; one is reused only after a million others. The 256 newest names are
     remembered.
     """
 

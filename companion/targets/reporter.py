@@ -32,8 +32,9 @@ class TargetReporter:
     """Pairs detections with accepted estimates and updates the targets (`TargetManager`).
 
     on_gone: called on the targets' thread with each name that ended, after the last on_target of
-    that name. report_alert: tells the operator. failed counts what raised an error, of
-    which the first is logged; unmatched detections whose frame has no accepted estimate.
+    that name. report_alert: reports an alert to the operator. failed: number of calls that raised
+    an error, of which the first is logged; unmatched: number of detections whose frame has no
+    accepted estimate.
     """
 
     def __init__(

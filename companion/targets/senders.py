@@ -27,9 +27,9 @@ class _Named:
 class Senders:
     """Gives targets of several senders different names. Not thread-safe.
 
-    Another sender of a name takes it over, as a detector that was started again does, or one that
-    opens a socket for every datagram. If the one before it is heard once more, there are two of
-    them, and the later one's targets are called after its number: "car #2".
+    A new sender takes a name over: it may be a detector that was restarted, or one that opens a
+    socket for each datagram. If the earlier sender sends this name again, there are two senders.
+    The targets of the later one then get its number: "car #2".
     """
 
     def __init__(self) -> None:

@@ -51,7 +51,9 @@ _LEFT, _LEAVES_MPS = 0.5, 5.0  # the chance that it left then, and how fast, axi
 _GROUND_EVERY = 3  # so many of the kept pictures show the ground well enough
 _LOST_S = 4.0
 _SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
-_SAID_NS = 10_000_000_000  # one of all targets in so long: a flood of texts hides the others
+_REPORT_AGAIN_NS = (
+    10_000_000_000  # one of all targets in so long: a flood of texts hides the others
+)
 _LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
 _BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
 _BACK_GAP_S = 0.5
@@ -65,9 +67,9 @@ def _off(a: Array, b: Array) -> float:
 
 @dataclass(frozen=True)
 class Click:
-    """A click of the operator. estimate: of the frame that he saw; pixel: in it; around: the
-    estimates one sigma of his delay before and after, if known; extent: width and height of his
-    rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
+    """A click of the operator. estimate: pose of the frame that was clicked; pixel: the clicked
+    point; around: poses one sigma of the operator's delay before and after the frame, if known;
+    extent: width and height of the rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
     """
 
     number: int
@@ -99,7 +101,7 @@ class TargetEstimate:
 @dataclass
 class _TargetState:
     track: TargetTrack
-    told_ns: int
+    reported_ns: int
     is_clicked: bool
     seen_ns: int
     """When it was last in the picture."""
@@ -118,7 +120,7 @@ class _TargetState:
     """Since when a standing one has not looked as it did, though nothing hides it; 0: it does."""
     changed_ns: int = 0
     """Since when it may have left, as the operator was told; 0: it has not."""
-    is_slide_said: bool = False
+    is_slide_reported: bool = False
     leaving: tuple[tuple[int, Array], ...] = ()
     """When and where (3,) it seemed to have left its place, the newest few."""
 
@@ -143,10 +145,11 @@ class TargetManager:
     """The active targets, by name. Not thread-safe.
 
     tell: takes each fix. gone: takes the name of each target that ended. report_alert: tells the
-    operator. missed counts detections that show no map: beside the picture, or in the
-    sky; doubted those whose place may not be told; refused those of targets beyond the 32nd.
+    operator. missed: number of detections without map under them: outside the frame, or in the sky;
+    doubted: of detections whose position is too uncertain to be reported; refused: of detections of
+    a 33rd target.
 
-    Above 200 lines: what is done to one target touches the others, so all live under one owner.
+    Above 200 lines: a change of one target affects the others, so one class owns all.
     """
 
     def __init__(
@@ -172,7 +175,7 @@ class TargetManager:
         self._pictures = RecentPictures[tuple[PoseEstimate, Gray]](
             _PICTURES, lambda picture: picture[1].nbytes
         )
-        self._silence_said_ns = -_SAID_NS
+        self._silence_reported_ns = -_REPORT_AGAIN_NS
         self.missed = 0
         self.doubted = 0
         self.refused = 0
@@ -220,9 +223,9 @@ class TargetManager:
             self._lives[name] = life
         life.seen_ns = time_ns
         if fix is None:
-            self._doubt(name, life, time_ns)
+            self._count_refusal(name, life, time_ns)
             return
-        life.told_ns, life.refused_ns = time_ns, 0
+        life.reported_ns, life.refused_ns = time_ns, 0
         self._report(life, fix, estimate)
 
     def look(self, estimate: PoseEstimate, gray: Gray) -> None:
@@ -240,9 +243,9 @@ class TargetManager:
             fix = life.track.hold(estimate)
             if fix is None:
                 continue
-            life.told_ns = time_ns
+            life.reported_ns = time_ns
             if life.changed_ns:
-                fix = self._doubted(life, fix, self._config.max_sigma_m)
+                fix = self._with_departure(life, fix, self._config.max_sigma_m)
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
@@ -258,8 +261,8 @@ class TargetManager:
                 self._gone(name)
 
     def _follow(self, name: str, life: _TargetState, click: Click, fix: TargetFix) -> None:
-        """Begin to follow it in the image from the click's own picture, where that is kept, and
-        through those that came since: the operator's delay is made up for.
+        """Begin to track a clicked target in the image, from the clicked frame if it is kept,
+        through the newer frames. So the operator's delay causes no error.
         """
         time_ns = click.estimate.exposure_time_ns
         kept = [p for p in self._pictures if abs(p[0].exposure_time_ns - time_ns) <= _PICTURE_NS]
@@ -307,7 +310,7 @@ class TargetManager:
         elif since_s > _MISSED_S and self._is_gone(name, life, follower, estimate, gray):
             return
         if fix is not None and self._is_due(life, time_ns):
-            life.told_ns = time_ns
+            life.reported_ns = time_ns
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
             self._report_alert(
@@ -357,9 +360,9 @@ class TargetManager:
         estimate: PoseEstimate,
         gray: Gray,
     ) -> bool:
-        """Whether a target that was never measured to move ends, for the ground is seen again where
-        it was. Of another that does not look as it did, the operator is told: if that came at once,
-        it may have left.
+        """Whether a target that was never measured to move ends, because the ground in its place is
+        visible. If the target only looks different, the operator is told: after a sudden change the
+        target may have left.
         """
         number = _number(name)
         if life.moved_at_once and follower.shows_ground(gray, estimate):
@@ -375,16 +378,17 @@ class TargetManager:
         if follower.is_changed and not life.changed_ns:
             life.changed_ns = life.found_ns
             self._report_alert(alert(AlertId.TARGET_MAY_HAVE_LEFT, number=number))
-        elif not life.is_slide_said and not life.changed_ns:
+        elif not life.is_slide_reported and not life.changed_ns:
             # The view of what is not flat changes by and by: its place is as good as before.
-            life.is_slide_said = True
+            life.is_slide_reported = True
             self._report_alert(alert(AlertId.TARGET_HELD, number=number))
         return False
 
     @staticmethod
     def _drives(life: _TargetState, left: FollowedPosition, place: Array, time_ns: int) -> bool:
-        """Whether what seems to have left its place (3,) does so at one speed, in one frame after
-        the other. Some look of a roof's corner or of a pitch's lines is elsewhere in single frames.
+        """Whether successive matches away from the target's place (3,) move at a constant speed.
+
+        A match in a single frame may be a similar corner of a roof or line of a sports field.
         """
         kept = [seen for seen in life.leaving if time_ns - seen[0] <= _DEPARTS_S * 1e9]
         life.leaving = (*kept[1 - _LEAVES_IN :], (time_ns, left.position))
@@ -409,7 +413,7 @@ class TargetManager:
             self._report_alert(alert(AlertId.TARGET_BACK, number=_number(name)))
 
     @staticmethod
-    def _doubted(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
+    def _with_departure(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
         """A held place whose target may have left it: nothing of it is seen, and it may be as far
         away as it has driven since.
         """
@@ -499,8 +503,9 @@ class TargetManager:
         gray: Gray,
         position: Array,
     ) -> FollowedPosition | None:
-        """A target that moves, though nobody has measured how: the ground that it left tells its
-        shape. A car that passes over a place takes nothing of it along.
+        """A clicked target that moves, before its motion was measured. The ground that it has left
+        shows its shape. A car that only passes over a clicked place does not take the place's
+        appearance along, so no match is found.
         """
         if (estimate.exposure_time_ns - life.found_ns) * 1e-9 > _DEPARTS_S:
             return None
@@ -523,15 +528,15 @@ class TargetManager:
         self._tell(TargetEstimate(fix, estimate))
 
     def _is_due(self, life: _TargetState, time_ns: int) -> bool:
-        return time_ns - life.told_ns >= self._period_ns(life)
+        return time_ns - life.reported_ns >= self._period_ns(life)
 
     def _period_ns(self, life: _TargetState) -> float:
         """Between two reports; at most 0.2 s until the first one is confirmed."""
         # 0.9: frames do not fall on the period exactly.
         wanted = 0.9e9 / self._config.rate_hz
-        return wanted if life.told_ns else min(wanted, _CONFIRMS_NS)
+        return wanted if life.reported_ns else min(wanted, _CONFIRMS_NS)
 
-    def _doubt(self, name: str, life: _TargetState, time_ns: int) -> None:
+    def _count_refusal(self, name: str, life: _TargetState, time_ns: int) -> None:
         """Count what is not told, and why; the operator hears of one that he was told before."""
         reason = _reason(life.track)
         if reason is RefusalReason.NO_MAP:
@@ -543,9 +548,9 @@ class TargetManager:
         if life.refusals == 1:
             _log.warning("target %s is not reported: %s", name, life.track.refusal)
         life.refused_ns = life.refused_ns or time_ns
-        is_silent = life.told_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
-        if is_silent and time_ns - self._silence_said_ns >= _SAID_NS:
-            self._silence_said_ns = time_ns
+        is_silent = life.reported_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
+        if is_silent and time_ns - self._silence_reported_ns >= _REPORT_AGAIN_NS:
+            self._silence_reported_ns = time_ns
             self._report_alert(
                 alert(AlertId.TARGET_SILENT, name=Name(name), why=Name(str(life.track.refusal)))
             )

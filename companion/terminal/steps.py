@@ -36,8 +36,8 @@ def show_steps(console: Console, clock: Callable[[], float] = time.monotonic) ->
 def show_count(
     console: Console, what: str, every_s: float = 5.0, begins: str = "begun"
 ) -> Iterator[Callable[..., None]]:
-    """Context manager: a callback (done, total) for counted work: a bar, or a line every few
-    seconds in a log. begins: shown if nothing was counted after two seconds.
+    """Context manager for counted work. Gives a callback (done, total), which shows a bar, or in a
+    log a line every few seconds. begins: text shown if nothing was counted after two seconds.
     """
     if console.is_terminal:
         from rich.progress import Progress

@@ -37,10 +37,10 @@ _LEAST_TILT_DEG = 0.5
 class Estimated:
     """Estimated errors of camera, gimbal and map.
 
-    focal_percent, focal_sigma_percent: against the camera as given, which is kept within three
-    sigmas; None where this map cannot tell it. mount_deg: (3,) about the boresight, up, right;
-    shift_m: (3,) map less GNSS, east, north, up; has_shift: whether positions were recorded to tell
-    it. poses: by frame, of those that were used.
+    focal_percent, focal_sigma_percent: against the given camera, kept within three sigmas; None if
+    this map cannot show it. mount_deg: (3,) about the boresight, up, right; shift_m: (3,) map minus
+    GNSS, east, north, up; has_shift: whether recorded positions show it. poses: of the frames used,
+    by frame.
     """
 
     camera: Camera
@@ -195,9 +195,10 @@ def _said(prior: FramePrior, pose: Pose) -> AutopilotWindow:
 
 
 def _fixed(sighted: Sequence[CalibrationFrame], has_buildings: bool) -> np.ndarray:
-    """Which numbers keep their value: all but focal length, mounting and map offset; over flat
-    ground the focal length, too, because it cannot be told from the height; nor over a map without
-    the buildings that the images show, which are nearer than it says.
+    """Which numbers keep their value: all but focal length, mounting and map offset. The focal
+    length is fixed, too, over flat ground, because it cannot be separated from the height, and over
+    a map without the buildings that the images show, because these are nearer than the map's
+    ground.
     """
     fixed = np.ones(u.COUNT, bool)
     fixed[u.MOUNT], fixed[u.SHIFT] = False, False

@@ -45,8 +45,8 @@ class Localized:
 
 
 class FrameLocalizer:
-    """Localizes recorded frames independently. camera: of the footage; told: receives each complete
-    prior by its time, for the localizer's sensors (`sensors_of`).
+    """Localizes recorded frames independently. camera: of the footage; told: called with each
+    complete prior, by its time, for the localizer's sensors (`sensors_of`).
     """
 
     def __init__(

@@ -57,6 +57,7 @@ def write_trial(
 
 def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report:
     errors, levels = trial.errors_m(), trial.levels_m()
+    is_placed = bool(np.isfinite(errors).any())
     number = np.arange(len(trial.best), dtype=np.float64)
     camera = trial.flight.camera
     return Report(
@@ -68,15 +69,15 @@ def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report
         _verdicts(trial, errors),
         _sheet(trial, pictures),
         (
-            Plot(
+            *([Plot(
                 "horizontal distance from GNSS, m, the map's offset taken off", number,
                 (Curve("distance", errors), Curve("protection level", levels)),
-            ),
+            )] if is_placed else []),
             Plot("quality of the registration, 0 to 1", number,
                  (Curve("as recorded", np.array([x.quality for x in trial.first])),
                   Curve("corrected", np.array([x.quality for x in trial.second])))),
         ),
-        Stanford(errors, levels, _ALERT_M) if np.isfinite(errors).any() else None,
+        Stanford(errors, levels, _ALERT_M) if is_placed else None,
         overlays=_overlays(trial, pictures),
         tables=(("Estimated camera and map", _estimates(trial)), *_failures(trial)),
         abscissa="frame",
@@ -84,7 +85,7 @@ def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report
         versions=made_by(),
         notes=(*trial.notes, *pictures.notes),
         verdict=judgement.sentence,
-        overlays_of="the frames, those that failed first",
+        overlays_of="Frames that failed, then localized ones, spread over the flight",
     )  # fmt: skip
 
 

@@ -254,8 +254,10 @@ def _usable(
 
 
 def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: float) -> list[str]:
-    """A note where absolute less relative heights, which is the take-off's, differ from the map's
-    ground there as feet differ from metres. takeoff_m: the map's, above the ellipsoid.
+    """A note if the heights seem to be in feet: absolute minus relative height is the height of the
+    take-off, which then differs from the map's by the ratio of feet and metres.
+
+    takeoff_m: the map's ground at the take-off, above the ellipsoid.
     """
     for datum, ground in ((Datum.ELLIPSOID, takeoff_m), (Datum.AMSL, takeoff_m - geoid_m)):
         both = [(told[datum], told[Datum.TAKEOFF]) for told in levels
@@ -303,9 +305,12 @@ def _assumptions(frames: Sequence[RecordedFrame], priors: Sequence[FramePrior]) 
             f"the camera's tilt is not measured in {assumed} of {len(priors)} frames: taken as "
             f"straight down, {priors[0].tilt_sigma_deg:.0f} degrees unsure"
         )
-    unknown = sum(p.heading_sigma_deg is None for p in priors)
-    if unknown:
-        notes.append(f"the heading is not known in {unknown} of {len(priors)} frames: searched")
+    for what, unknown in (
+        ("heading", sum(p.heading_sigma_deg is None for p in priors)),
+        ("height", sum(p.pose is not None and not p.height_known for p in priors)),
+    ):
+        if unknown:
+            notes.append(f"no usable {what} in {unknown} of {len(priors)} frames: searched")
     beside = sum(f.telemetry.position is not None for f in frames) - sum(p.over_map for p in priors)
     if beside:
         notes.append(f"{beside} frames were taken beside the map")

@@ -108,7 +108,10 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
             )
             if not known
         ]  # fmt: skip
-        return f"not found about its position: its {' and '.join(unknown)} is not recorded"
+        return (
+            f"not found about its position: {' and '.join(unknown)} unknown, or a map of another "
+            "place or date"
+        )
     if one.beside_map:
         return "no map in view: the camera's direction or height is wrong, or the map ends there"
     if one.pose is not None and prior.pose is not None and prior.is_complete:

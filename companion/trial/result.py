@@ -150,7 +150,7 @@ def _because(trial: Trial) -> str:
     if not trial.reasons:
         return ""
     common = _most_common(list(trial.reasons.values()))
-    return f"; most of the others: {common}"
+    return f"; likely reason of most failures: {common}"
 
 
 def _most_common(texts: Sequence[str]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +35,8 @@ Stage = Callable[[str], AbstractContextManager[Count]]
 # it bends the focal length of a near-nadir flight by 1 %. Pixels finer than the map's imagery err
 # more again: over a satellite mosaic the gimbal's bias is 1.5 degrees off then.
 _MEASURED_WIDTH = 640
-_MOST_PLACED = 24  # frames that are searched about their position: each takes 10 to 20 s
+_MOST_PLACED = 24  # frames that are searched about their position: each takes 10 to 40 s
+_VAIN = 6  # searches without a result, after which the others of their kind are not tried
 _AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
 
 
@@ -61,13 +63,13 @@ def run_trial(
     with ExitStack() as opened:
         stack = MapStack(map_cache, config)
         opened.callback(stack.close)
-        flight, known = sampled(flight, priors_of(flight, stack.cache))
+        known = priors_of(flight, stack.cache)
         kind = map_kind(stack.cache)
-        search = _LazyRelocalizer(stack.cache, config, opened)
+        search = _opened_once(stack.cache, config, opened)
         first_loader = FrameLocalizer(
             build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
         )
-        first = _all(flight, known.priors, first_loader, stage, "localizing")
+        flight, known, first = placed(flight, known, first_loader, stage)
         extractor = DetailExtractor(load_extractor(None, threads=2))
         width = _measured_width(flight.camera.camera, known.priors, kind, options.width)
         tools = Tools(stack.renderer, extractor, width, kind.has_buildings)
@@ -82,30 +84,69 @@ def run_trial(
             told: dict[int, Pose] = {}
             sure = build_localizer(stack, found.camera, _known_to(config, begun), sensors_of(told))
             loader = FrameLocalizer(sure, search, found.camera, told)
-            second = _all(flight, begun, loader, stage, "localizing again")
-        searched = _searched(flight, priors, loader, options.searches, stage)
+            second = tuple(
+                localize_each(
+                    range(len(begun)), (), lambda k: loader.from_prior(flight.frames[k], begun[k]),
+                    stage("localizing again"),
+                ).values()
+            )  # fmt: skip
+        searched, left = _searched(flight, priors, loader, options.searches, stage)
     why = reasons(flight.frames, priors, second, found, kind)
-    notes = (*flight.notes, *known.notes, *_map_notes(kind, flight))
+    notes = (*flight.notes, *known.notes, *left, *_map_notes(kind, flight))
     return Trial(flight, priors, first, second, searched, found, why, notes)
 
 
-def sampled(flight: RecordedFlight, known: FlightPriors) -> tuple[RecordedFlight, FlightPriors]:
-    """Of frames that a search has to place at most 24, spread over the flight; a note says so.
-    All frames of which registration can start are kept.
+def spread(items: Sequence[int], most: int) -> list[int]:
+    """At most so many of them, in an order of which every beginning is spread over all."""
+    return [items[k] for k in sorted(range(len(items)), key=lambda k: f"{k:032b}"[::-1])][:most]
+
+
+def localize_each(
+    order: Sequence[int],
+    searched: Collection[int],
+    localize: Callable[[int], Localized],
+    counter: AbstractContextManager[Count],
+) -> dict[int, Localized]:
+    """Localize frames in this order: of those in `searched` no more than 6 if none is found."""
+    done: dict[int, Localized] = {}
+    with counter as count:
+        for k in order:
+            tried = [one.accepted for j, one in done.items() if j in searched]
+            if k in searched and len(tried) >= _VAIN and not any(tried):
+                continue
+            done[k] = localize(k)
+            count(len(done), len(order))
+    return done
+
+
+def placed(
+    flight: RecordedFlight, known: FlightPriors, loader: FrameLocalizer, stage: Stage
+) -> tuple[RecordedFlight, FlightPriors, tuple[Localized, ...]]:
+    """Localize from telemetry. Of frames without heading or height, which need a search, those that
+    are not tried are left out of the flight; a note says so.
     """
-    slow = [k for k, p in enumerate(known.priors) if p.pose is not None and not p.is_complete]
-    if len(slow) <= _MOST_PLACED:
-        return flight, known
-    spread = np.linspace(0, len(slow) - 1, _MOST_PLACED).round().astype(int)
-    left_out = set(slow) - {slow[int(k)] for k in spread}
-    kept = [k for k in range(len(known.priors)) if k not in left_out]
-    note = (
-        f"{len(slow)} frames lack a heading or a usable height and would each be searched about "
-        f"their position: {_MOST_PLACED} of them, spread over the flight, stand for all"
-    )
+    frames, priors = flight.frames, known.priors
+    slow = [k for k, p in enumerate(priors) if p.pose is not None and not p.is_complete]
+    chosen = spread(slow, _MOST_PLACED)
+    done = localize_each(
+        [*chosen, *(k for k in range(len(priors)) if k not in slow)], chosen,
+        lambda k: loader.from_prior(frames[k], priors[k]), stage("localizing"),
+    )  # fmt: skip
+    kept = sorted(done)
+    left_out, notes = len(priors) - len(kept), known.notes
+    if left_out:
+        tried = len(slow) - left_out
+        vain = ", and none of them is found" if tried < len(chosen) else ""
+        notes = (
+            *notes,
+            f"{len(slow)} frames lack a heading or a usable height and would each be searched "
+            f"about their position: {tried} of them, spread over the flight, stand for all{vain}; "
+            f"{left_out} are not tried",
+        )
     return (
-        replace(flight, frames=tuple(flight.frames[k] for k in kept)),
-        replace(known, priors=tuple(known.priors[k] for k in kept), notes=(*known.notes, note)),
+        replace(flight, frames=tuple(frames[k] for k in kept)),
+        replace(known, priors=tuple(priors[k] for k in kept), notes=notes),
+        tuple(done[k] for k in kept),
     )
 
 
@@ -133,36 +174,19 @@ def _map_notes(kind: MapKind, flight: RecordedFlight) -> tuple[str, ...]:
     return (f"map: {kind.line()}", *([advice] if advice else []))
 
 
-class _LazyRelocalizer:
+def _opened_once(
+    cache: TileCache, config: LocalizerConfig, opened: ExitStack
+) -> Callable[[], Relocalizer]:
     """Opens the relocalizer when it is first needed: it computes the map's overview."""
+    relocalization = config.relocalization.model_copy(update={"threads": 2})
 
-    def __init__(self, cache: TileCache, config: LocalizerConfig, opened: ExitStack) -> None:
-        relocalization = config.relocalization.model_copy(update={"threads": 2})
-        self._config = config.model_copy(update={"relocalization": relocalization})
-        self._cache, self._opened = cache, opened
-        self._relocalizer: Relocalizer | None = None
+    @functools.cache
+    def relocalizer() -> Relocalizer:
+        made = open_relocalizer(cache, config.model_copy(update={"relocalization": relocalization}))
+        assert made is not None  # only a `should_stop` gives None
+        return opened.enter_context(made)
 
-    def __call__(self) -> Relocalizer:
-        if self._relocalizer is None:
-            made = open_relocalizer(self._cache, self._config)
-            assert made is not None  # only a `should_stop` gives None
-            self._relocalizer = self._opened.enter_context(made)
-        return self._relocalizer
-
-
-def _all(
-    flight: RecordedFlight,
-    priors: tuple[FramePrior, ...],
-    loader: FrameLocalizer,
-    stage: Stage,
-    what: str,
-) -> tuple[Localized, ...]:
-    done = []
-    with stage(what) as count:
-        for recorded, prior in zip(flight.frames, priors, strict=True):
-            done.append(loader.from_prior(recorded, prior))
-            count(len(done), len(priors))
-    return tuple(done)
+    return relocalizer
 
 
 def _begun(prior: FramePrior, first: Localized) -> FramePrior:
@@ -182,14 +206,15 @@ def _searched(
     loader: FrameLocalizer,
     most: int,
     stage: Stage,
-) -> dict[int, Localized]:
-    """Frames without their positions, spread over the flight."""
-    chosen = np.unique(np.linspace(0, len(priors) - 1, min(most, len(priors))).round().astype(int))
-    found: dict[int, Localized] = {}
-    if not len(chosen):
-        return found
-    with stage("searching without positions") as count:
-        for k in map(int, chosen):
-            found[k] = loader.anywhere(flight.frames[k], priors[k])
-            count(len(found), len(chosen))
-    return found
+) -> tuple[dict[int, Localized], tuple[str, ...]]:
+    """Frames without their positions, spread over the flight, and a note if some were left out."""
+    chosen = spread(range(len(priors)), most)
+    if not chosen:
+        return {}, ()
+    found = localize_each(
+        chosen, chosen, lambda k: loader.anywhere(flight.frames[k], priors[k]),
+        stage("searching without positions"),
+    )  # fmt: skip
+    left_out = len(chosen) - len(found)
+    note = f"without positions none of {len(found)} frames is found; {left_out} are not tried"
+    return found, (note,) if left_out else ()

@@ -20,10 +20,11 @@ _LEAST_SIGMA = np.array([1.0, 1.0, 1.0, *np.radians([1.0, 1.0, 1.0])])
 
 @dataclass(frozen=True)
 class KnownOfPlace:
-    """Drawn data of other sensors for a lost camera: true values with seeded errors.
+    """Simulated data of other sensors for a lost camera: true values with seeded errors.
 
-    prior: a position 100 to 500 m off is known; else none. heading: known to 15 degrees; else not
-    at all. tilt_sigma_deg, height_sigma_m: of the autopilot's roll and pitch, and of the barometer.
+    prior: whether a position with an error of 100 to 500 m is known. heading: whether the heading
+    is known to 15 degrees. tilt_sigma_deg, height_sigma_m: of the autopilot's roll and pitch, and
+    of the barometer.
     """
 
     prior: bool

@@ -32,8 +32,8 @@ CSV_COLUMNS = (
 
 @dataclass(frozen=True)
 class Sequence:
-    """A recorded sequence: image paths in order, and the true pose of each. is_timed: whether the
-    exposure times were given; else 30 frames a second are assumed.
+    """A recorded sequence: image paths in order, and the true pose of each. is_timed: whether
+    exposure times were given; if not, 30 frames a second are assumed.
     """
 
     images: tuple[Path, ...]
@@ -66,8 +66,8 @@ class Sequence:
 class EvaluatedFrame:
     """Result of one frame. Errors are None if no estimate was accepted.
 
-    estimate: None for an image that cannot be used (`problem` says why), or where no place is known
-    (`searching`).
+    estimate: None for an image that cannot be used (`problem` says why), or while the position is
+    unknown (`searching`).
     """
 
     name: str

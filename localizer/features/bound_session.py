@@ -24,9 +24,9 @@ class BoundSession:
         self._shape: tuple[int, ...] = ()
 
     def run(self, image: NDArray[np.uint8]) -> list[DeviceArray]:
-        """Outputs for an (1, H, W, 3) uint8 image; the image's copy to the device is the only one.
+        """Outputs for an (1, H, W, 3) uint8 image. The image is copied once, to the device.
 
-        The work is finished when this returns, so that any stream may read the outputs.
+        The computation is complete when this returns, so that any stream may read the outputs.
         """
         first = image.shape != self._shape
         if first:

@@ -32,7 +32,7 @@ class DetailExtractor:
         return f"{self._base.name} + detail"
 
     def extract_on_device(self, rgb: Image) -> FeaturePyramid:
-        """As `extract`; the other extractor's levels stay on the GPU where it can leave them there.
+        """As `extract`; the levels of the other extractor stay on the GPU if it computes there.
 
         The detail level is computed on the CPU and is in host memory.
         """
@@ -52,7 +52,8 @@ class DetailExtractor:
 def detail_level(rgb: Image) -> FeatureLevel:
     """Contrast-normalised brightness and derivatives (H, W, 4) of an (H, W, 3) uint8 RGB image.
 
-    Not of unit length. The fourth channel is zero: four floats are one SIMD register.
+    The vectors do not have unit length. The fourth channel is zero, so that a pixel fills one SIMD
+    register of four floats.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
     smooth = cv2.GaussianBlur(gray, (0, 0), _SMOOTH_PX)

@@ -13,10 +13,11 @@ _STRIDES = (8, 4, 2)
 
 
 class GradientExtractor:
-    """Orientation energy at three scales, blind to contrast sign and locally normalised.
+    """Orientation energy at three scales, independent of the contrast's sign and locally
+    normalised.
 
-    C = 8: seven orientation bins and one channel that is large where the image is flat, so that
-    unit length does not turn sensor noise into structure.
+    C = 8: seven orientation bins, and one channel that is large where the image is flat. Because of
+    this channel, normalisation to unit length does not amplify sensor noise.
     """
 
     name = "gradient (fallback: no model file)"

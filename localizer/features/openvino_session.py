@@ -29,10 +29,11 @@ class _Output(NamedTuple):
 
 
 class OpenVinoSession:
-    """A network with the part of `onnxruntime.InferenceSession` that an extractor uses.
+    """A network with the part of the interface of `onnxruntime.InferenceSession` that an extractor
+    uses.
 
-    It is compiled for each size of image: a network for any size takes twice the time. Several
-    threads may call `run`. threads: of one call.
+    It is compiled for each image size, because a network for any size takes twice the time. Several
+    threads may call `run`. threads: number used by one call.
     """
 
     def __init__(self, model: Path, threads: int) -> None:

@@ -67,9 +67,9 @@ def start_session(
     """Start a session on the best installed provider that works. check: runs the model once, so
     that engines are built and algorithms chosen before the first frame.
 
-    only: short name of the provider to use instead of the best. Each provider that does not run the
-    model is one warning; TensorRT is tried again without what it kept, which may be damaged. Raises
-    `ModelError` when none does.
+    only: short name of the only provider to use. A provider that cannot run the model is reported
+    by one warning. TensorRT is tried a second time without its cached engines, which may be
+    damaged. Raises `ModelError` if no provider works.
     """
     available = available_providers()
     names = [name for name in SHORT_NAMES if name in available]

@@ -32,10 +32,10 @@ tracker's after a short gap."""
 class ViewForecast:
     """Forecast of the registration at a pose under one condition.
 
-    figures: of the draws; sigma_m: position error to be expected of what is accepted, one axis;
-    risk: probability that a picture is refused or more than 1 m off; ground_m: median distance to
-    the map along the optical axis, 0 without a map; texture: standard deviation of the grey value
-    within 16 px, median, 0 to 255; rival: the likest other place in reach.
+    figures: statistics of the draws; sigma_m: expected position error of accepted registrations,
+    one axis; risk: probability that a frame is rejected or more than 1 m off; ground_m: median
+    distance to the map along the optical axis, 0 without a map; texture: standard deviation of the
+    grey value within 16 px, median, 0 to 255; rival: the most similar other position in reach.
     """
 
     condition: str

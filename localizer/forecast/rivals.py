@@ -11,7 +11,7 @@ from localizer.registration.backend import LevelProblem, camera_from_local, worl
 from localizer.registration.covariance import apart_px, mean_motion, pose_differences
 from localizer.registration.cpu.reference import in_view, project, projection_jacobian
 from localizer.registration.jngo import JNGO
-from localizer.registration.selection import quality, thinned
+from localizer.registration.selection import quality, subsample_anchors
 
 _RINGS = (0.08, 0.16, 0.3, 0.45)  # of the ground's width in view
 _BEARINGS = 12
@@ -35,8 +35,8 @@ def most_similar_rival(
     """The other position that matches the view best: poses on rings about the true one are refined,
     and the best optimum away from it is taken.
 
-    levels: of the query, coarse to fine, the network's; origin: (3,) of their local frame;
-    width_m: of the ground in view.
+    levels: the query's levels, coarse to fine; origin: (3,) origin of their local frame; width_m:
+    width of the ground in view.
     """
     angles = np.arange(_BEARINGS) * 2 * np.pi / _BEARINGS
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(_BEARINGS)], axis=1)
@@ -46,13 +46,17 @@ def most_similar_rival(
     )
     settings = optimizer.config.settings
     for level, iterations in zip((levels[0], levels[-1]), _ITERATIONS, strict=True):
-        found = optimizer.backend.refine(thinned(level, _ANCHORS), R, t, iterations, settings)
+        found = optimizer.backend.refine(
+            subsample_anchors(level, _ANCHORS), R, t, iterations, settings
+        )
         R, t = found.rotations, found.translations
     rotation, translation = camera_from_local(truth.rotation[None], truth.translation[None], origin)
     here, there = rotation[0], translation[0]
     fine = levels[-1]
     differences = pose_differences(*world_from_camera(R, t, origin), truth)
-    apart = apart_px(differences, here, there, _motion(thinned(fine, _ANCHORS), here, there))
+    apart = apart_px(
+        differences, here, there, _motion(subsample_anchors(fine, _ANCHORS), here, there)
+    )
     scores = np.where(apart > optimizer.config.mode_px, found.scores, np.inf)
     best = int(np.argmin(scores))
     own = quality(fine, here, there, settings)

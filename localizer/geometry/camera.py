@@ -29,9 +29,9 @@ _EDGE = 33  # points along each side
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels. distortion: of the model ``opencv`` Brown's (k1, k2, p1, p2, k3), all 0
-    for a pinhole, or 8, 12 or 14 of OpenCV's; of ``fisheye`` its (k1, k2, k3, k4). readout_ms: from
-    the first row's exposure to the last one's, 0 of a global shutter.
+    """Intrinsics in pixels. distortion: for the model ``opencv`` Brown's (k1, k2, p1, p2, k3), all
+    0 for a pinhole, or 8, 12 or 14 of OpenCV's parameters; for ``fisheye`` (k1, k2, k3, k4).
+    readout_ms: time between the exposures of the first and the last row, 0 for a global shutter.
     """
 
     width: int
@@ -72,7 +72,7 @@ class Camera:
         """Camera of width, height, fx, fy, cx, cy and optional ``distortion``, ``distortion_model``
         and ``readout_ms``, or of other programs' keys (`localizer.geometry.camera_file`).
 
-        `CameraError` for a lens that is not read, and for one that cannot be.
+        `CameraError` for a distortion model that is not supported, and for impossible values.
         """
         try:
             camera = cls(**camera_numbers(data))
@@ -183,7 +183,8 @@ class Camera:
     def undistortion_maps(self, target: Camera) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
         """Fixed-point maps for ``cv2.remap`` from this camera's image to the pinhole `target`.
 
-        They undo the distortion and resize in one pass. What the lens does not show stays black.
+        They undo the distortion and resize in one pass. Pixels outside the lens's field of view
+        point outside the image, so that they become black.
         """
         if self.distortion_model == "opencv":
             maps = cv2.initUndistortRectifyMap(
@@ -230,7 +231,7 @@ def lens_fault(camera: Camera) -> str:
     return lens.fault(size, camera.rays, camera.project) if camera.is_distorted else ""
 
 
-def followed(pinhole: Camera, camera: Camera) -> Camera:
+def with_field_of_view(pinhole: Camera, camera: Camera) -> Camera:
     """The pinhole with the field of view of a (distorted, possibly zoomed) camera, at the pinhole's
     size; unchanged if the camera is the one it was made for.
     """

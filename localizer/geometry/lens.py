@@ -110,8 +110,9 @@ def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Proje
     """Why a lens model is impossible; "" if it is possible. size: of the image, px; rays, project:
     the camera's functions.
 
-    Every pixel of a grid up to the picture's edges must have a ray that projects back onto it, and
-    a straight line between two corners must not bow by more than a lens makes it.
+    Two conditions hold for a possible lens. Every pixel of a grid up to the image's edges has a ray
+    that projects back onto this pixel. A straight line between two corners is not bent more than by
+    any real lens.
     """
     u, v = np.meshgrid(*(np.linspace(0.0, side, _GRID) for side in size))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)

@@ -19,9 +19,10 @@ _LEAST_PX = 0.02  # a sweep that moves nothing by more is none
 
 @dataclass(frozen=True)
 class Sweep:
-    """The camera's motion from its first row's exposure to its last one's, world axes.
+    """The camera's motion between the exposures of its first and last row, world axes.
 
-    turn: (3,) rad, as a left rotation vector. way: (3,) metres. Both are steady over the readout.
+    turn: (3,) rad, as a left rotation vector. way: (3,) metres. Both rates are constant during the
+    readout.
     """
 
     turn: Array
@@ -39,10 +40,11 @@ class Sweep:
         return 0.5 * angle * max(camera.fx, camera.fy) > _LEAST_PX
 
     def seen(self, points: Array, world_from_camera: Pose, camera: Camera) -> Array:
-        """World points (N, 3), moved so that a camera at rest at `world_from_camera`, the pose in
-        the middle of the readout, sees each in the pixel in which the moving camera does.
+        """World points (N, 3), moved so that a camera at rest sees each in the same pixel as the
+        moving camera. The camera at rest is at `world_from_camera`, the pose in the middle of the
+        readout.
 
-        To second order in the turn: 6 mm at 120 m and 60 degrees a second.
+        Exact to second order in the rotation: 6 mm at 120 m and 60 degrees a second.
         """
         away = points - world_from_camera.translation
         moved = away

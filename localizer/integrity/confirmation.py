@@ -37,8 +37,8 @@ class Consistency(Enum):
 class TentativeTrack:
     """The first accepted pose after a search. covariance: (6, 6); time_ns: its exposure.
 
-    independent_prior: the proposal does not derive from our own fixes, such as an autopilot with
-    healthy GNSS; agreement with it is evidence enough.
+    independent_prior: whether the proposed position does not derive from our own fixes, for example
+    that of an autopilot with healthy GNSS. Agreement with such a position confirms the track.
     """
 
     world_from_camera: Pose

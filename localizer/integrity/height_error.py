@@ -32,9 +32,9 @@ def height_likelihood(
 ) -> Array | None:
     """Log likelihood (K,) of each of `CANDIDATES_M` for one registered image, up to a constant.
 
-    The pose is marginalised (restricted maximum likelihood), the patches' noise is profiled. pose:
-    at which the patches were measured; constraint: what other sensors know of it. None where the
-    patches are too few.
+    The pose is marginalised (restricted maximum likelihood), and the patches' noise is profiled.
+    pose: at which the patches were measured; constraint: what other sensors measured of it. None if
+    there are too few patches.
     """
     if len(patches.shift) < LEAST_PATCHES:
         return None
@@ -52,10 +52,11 @@ def height_likelihood(
 
 
 def _decorrelated(patches: PatchDisplacements) -> tuple[Array, Array, Array]:
-    """Variances (2 P,) that heights of spread one give to as many uncorrelated combinations of the
-    displacements, these (2 P,), and their motion (2 P, 6).
+    """Uncorrelated combinations of the displacements (2 P,), their motion (2 P, 6), and the
+    variances (2 P,) that heights of unit sigma cause in them.
 
-    A height moves its patch along one line. So only the parts along these lines are correlated.
+    A height moves its patch along one line, so only the components along these lines are
+    correlated.
     """
     length = np.hypot(patches.rise[:, 0], patches.rise[:, 1])
     along = np.where(length[:, None] > 0, patches.rise, (1.0, 0.0))

@@ -27,8 +27,8 @@ _SINGULAR = 1e-9
 def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Array | None:
     """Covariance (6, 6), as `PosePrior`'s, of the pose at which the patches were measured.
 
-    height_sigma_m: spread of the heights that the map does not have; 0 for a surface model. None
-    where the patches do not determine a pose.
+    height_sigma_m: RMS of the heights that the map lacks; 0 for a surface model. None if the
+    patches do not determine a pose.
     """
     if len(patches.shift) < LEAST_PATCHES:
         return None

@@ -54,9 +54,9 @@ def place_model(path: Path = MODEL) -> PlaceModel:
 def place_features(result: Registration) -> Array | None:
     """Evidence (4,) of a registration, in the order of `FEATURES`; None without patches.
 
-    Quality of the fit; how many patches match where they lie, beyond chance, in their sigmas; the
-    whole image's match there over its matches beside, likewise; lead over the best other mode of
-    the swarm.
+    The four values are: quality of the fit; number of patches that match at their own position,
+    beyond chance, in sigmas; match of the whole image at its position against the matches beside
+    it, in sigmas; lead over the best other mode of the swarm.
     """
     votes = result.agreement
     if result.status is not RegistrationStatus.OK or votes is None or votes.patches == 0:
@@ -66,7 +66,7 @@ def place_features(result: Registration) -> Array | None:
 
 def evidence(quality: float, patches: int, share: float, peak: float, lead: float) -> Array:
     """Evidence (4,) from the values of a `Registration` and its `PatchAgreement`. quality: 0 to 1;
-    patches: their number; share: of agreeing ones, 0 to 1; peak: in standard deviations; lead:
+    patches: number of patches; share: of agreeing ones, 0 to 1; peak: in standard deviations; lead:
     relative cost margin over the second-best mode.
     """
     return np.array(
@@ -80,6 +80,12 @@ def evidence(quality: float, patches: int, share: float, peak: float, lead: floa
 
 
 def log_odds(result: Registration) -> float:
-    """Natural log odds that a registration shows the right position; -inf without evidence."""
+    """Natural log odds that a registration shows the right position; -inf without evidence.
+
+    Of several passes over one image the least counts: a later pass searches a smaller space about
+    the result before, so it finds no rival position, at a wrong one as well.
+    """
     features = place_features(result)
-    return -np.inf if features is None else place_model().log_odds(features)
+    if features is None:
+        return -np.inf
+    return float(np.minimum(place_model().log_odds(features), result.earlier_log_odds))

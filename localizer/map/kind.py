@@ -39,14 +39,12 @@ HEIGHTS_HOLD = {
 class MapKind:
     """Properties of a map that determine the accuracy.
 
-    heights: "surface" (buildings and trees stand in them), "terrain" (bare ground, or a surface so
-    coarse that no building stands in it) or "flat" (one plane).
-    unknown_height_sigma_m: root mean square of the heights above the map that the map does not
-    hold, over the whole ground; the same for all of one roof or one block.
-    effective_resolution_m: side of the smallest square that the imagery resolves, by its spectrum;
-    at least the size of a texel.
-    imagery_date: as 2024, 2024-06 or 2024-06-30; sensor: as the source names it, with "?" for what
-    cannot be printed. None: not known. ValueError for what is no such value.
+    heights: "surface" (with buildings and trees), "terrain" (bare ground, or a surface too coarse
+    for buildings) or "flat" (one plane). unknown_height_sigma_m: RMS over the whole ground of the
+    object heights that the map lacks; a roof or a block has one height. effective_resolution_m:
+    side of the smallest square that the imagery resolves, by its spectrum; at least the size of a
+    texel. imagery_date: as 2024, 2024-06 or 2024-06-30; sensor: as the source names it, with "?"
+    for unprintable characters. None: not known. ValueError for an invalid value.
     """
 
     heights: Heights
@@ -99,7 +97,7 @@ class MapKind:
     def imagery_age(self, today: date, max_days: int) -> tuple[str, bool]:
         """Age of the imagery in words, and whether it is known and within a limit.
 
-        A year or a month stands for its first day, so that the age is the oldest possible one.
+        A year or a month counts as its first day, so that the age is the largest possible one.
         """
         if not self.imagery_date:
             return "date not known", False
@@ -116,9 +114,9 @@ class MapKind:
         """Horizontal error (1 sigma) of one registration that looks about straight down.
 
         height_m: above the ground; half_view_deg: half of the field of view; attitude_sigma_deg: of
-        roll and pitch. The image alone does not separate a tilt from a shift where the parallax of
-        buildings is unknown, so the attitude's error moves the position, and a roof of unknown
-        height h at an angle a from nadir moves by h tan a.
+        roll and pitch. Without the parallax of buildings an image does not separate a tilt from a
+        shift, so the attitude's error shifts the position. A roof of unknown height h at an angle a
+        from nadir shifts it by h tan a.
         """
         lean = math.tan(math.radians(half_view_deg)) / math.sqrt(3)  # its rms over the image
         if self.has_buildings:

@@ -75,11 +75,11 @@ class SourceTree:
     """A map source.
 
     centre: (3,) ECEF metres; geoid_separation_m, attribution, vertical_datum: as far as the source
-    tells; files: everything it is made of, so that a change of the source can be seen; options:
-    what else decided the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
-    where that only follows from the format; warnings: doubts that did not stop the import;
-    imagery_date, sensor: of its images, as far as the source tells; up_axis: by which its meshes
-    were read, None where it has none.
+    states them; files: all files of the source, so that a change of it can be detected; options:
+    further inputs of the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
+    if it only follows from the format; warnings: doubts that did not stop the import; imagery_date,
+    sensor: of its images, as far as the source states them; up_axis: by which its meshes were read,
+    None without one.
     """
 
     root: SourceNode

@@ -69,7 +69,7 @@ class TerrainGrid:
 def open_terrain(path: Path, frame: LocalFrame) -> TerrainGrid:
     """Read the part of a height GeoTIFF within 20 km of a map's origin.
 
-    MapSourceError: no such raster, no coordinate system, nothing known there, or no heights.
+    MapSourceError if there is no such raster, no coordinate system, or no height there.
     """
     with offline():
         try:

@@ -11,8 +11,8 @@ from localizer.sensors.error_model import SENSORS
 class GrowthModel:
     """Growth of the error with distance, beyond each registration's covariance.
 
-    Fitted by ``python -m benchmarks.odometry`` (odometry.md). A walk is a sigma per square
-    root of a metre flown, from keyframe to keyframe; scale is an error that stays.
+    Fitted by ``python -m benchmarks.odometry`` (odometry.md). A random walk is a sigma per square
+    root of a metre flown, from keyframe to keyframe; scale is a constant relative error.
     """
 
     scale: float  # scale sigma over ground of known height, as a share of the distance

@@ -26,10 +26,10 @@ class OdometryStatus(Enum):
 class OdometryFrame:
     """Data of one frame for the odometry.
 
-    features: of the undistorted picture, in host memory, as for the map registration. time_ns: the
-    exposure's. usability: `usability.examine`'s verdict on the picture, None if nobody looked.
-    sweep: the camera's motion while its rows were read out; None: they were all at once.
-    camera: the pinhole of the features; None: the odometry's, of a lens that does not zoom.
+    features: of the undistorted image, in host memory, as for the map registration. time_ns: the
+    exposure's. usability: result of `usability.examine`, None if the frame was not examined. sweep:
+    the camera's motion during the readout; None for a global shutter. camera: the pinhole of the
+    features; None: the odometry's, for a lens that does not zoom.
     """
 
     features: FeaturePyramid
@@ -43,13 +43,13 @@ class OdometryFrame:
 class OdometryEstimate:
     """The odometry's result for one frame.
 
-    world_from_camera: the camera's pose; what is predicted, if the status is not OK. covariance:
-    (6, 6) as `PosePrior`'s, the beginning's included. quality: 0 to 1, of the registration against
-    the keyframe. reason: of a status that is not OK, for people. bridged_s, way_m: time and way
-    since the pose was last known otherwise (`begin`). drift_m: radius that the horizontal error
-    added since then stays within in 95 % of cases. keyframe_age_s: since the keyframe's exposure.
-    source: of the keyframe's depth. scale_sigma: share by which way and velocity may be too long or
-    too short, as the height above the ground is.
+    world_from_camera: the camera's pose; the predicted pose if the status is not OK. covariance:
+    (6, 6) as `PosePrior`'s, including that of the start. quality: 0 to 1, of the registration
+    against the keyframe. reason: of a status that is not OK, as text. bridged_s, way_m: time and
+    distance since the pose was last known from elsewhere (`begin`). drift_m: 95 % bound of the
+    horizontal error added since then. keyframe_age_s: since the keyframe's exposure. source: of the
+    keyframe's depth. scale_sigma: relative sigma of distance and velocity, equal to that of the
+    height above the ground.
     """
 
     world_from_camera: Pose

@@ -24,9 +24,10 @@ _LEAST_ABOVE_M = 1.0
 class GroundUncertainty:
     """Uncertainty of the ground height that odometry assumes, 1 sigma.
 
-    grade: m for each metre from where the ground was last known (`localizer.map.relief`); of hills,
-    where nothing is known. missing_m: mean height of what the map lacks. model_m: a terrain model's
-    own error: Copernicus states 2 m between neighbouring places in 90 % of cases.
+    grade: growth of the height error, m per metre of distance from known ground
+    (`localizer.map.relief`); the default is that of hills. missing_m: mean height of objects that
+    the map lacks. model_m: a terrain model's own error: Copernicus states 2 m between neighbouring
+    places in 90 % of cases.
     """
 
     grade: float = 0.1
@@ -80,8 +81,8 @@ class RaisedGround:
 class RangefinderGround:
     """Ground height by a rangefinder: a plane at the height of the lowest recent surface.
 
-    One beam meets roofs and crowns, too, and a picture's depth from a roof would be short by it; so
-    of the last readings those count that are as low as what counts as ground elsewhere.
+    The beam also hits roofs and crowns, and with a roof's height the depth of the image would be
+    too short. So only the lowest of the recent readings are used.
     """
 
     def __init__(self) -> None:
@@ -106,8 +107,8 @@ def height_above_ground(
 ) -> tuple[float, float]:
     """Mean and sigma (m) of a camera's height at `place` (3,) above ground points (N, 3).
 
-    covariance: (3, 3) of the place. Beside its mean place the ground is taken to go on
-    with the slope that it has in view.
+    covariance: (3, 3) of the place. Around it the ground is assumed to continue with the slope of
+    the visible ground.
     """
     centred = points_world - points_world.mean(axis=0)
     slope = np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)[0]

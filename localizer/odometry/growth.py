@@ -17,8 +17,8 @@ from localizer.types import PosePrior
 def carried(covariance: Array, lever: Array) -> Array:
     """Covariance (6, 6) of a pose that is known exactly relative to another with `covariance`.
 
-    lever: (3,) position relative to the other's, world axes. A small turn of the other one moves
-    this one by ``turn x lever``.
+    lever: (3,) position relative to the other's, world axes. A small rotation of the other pose
+    moves this one by ``turn x lever``.
     """
     J = np.eye(6)
     J[:3, 3:] = -hat(lever)
@@ -26,19 +26,19 @@ def carried(covariance: Array, lever: Array) -> Array:
     return moved
 
 
-def walked(model: GrowthModel, way_m: float) -> Array:
+def distance_covariance(model: GrowthModel, way_m: float) -> Array:
     """Covariance (6, 6) that `way_m` metres of flight add beyond the registrations'."""
     rates = np.array([model.horizontal, model.horizontal, model.vertical,
                       model.tilt, model.tilt, model.heading])  # fmt: skip
     return np.diag(rates**2 * max(way_m, 0.0))
 
 
-def stretched(known: Array, scale: float, displacement: Array) -> Array:
+def add_scale_error(known: Array, scale: float, displacement: Array) -> Array:
     """Covariance (3, 3) of position from scale errors, after another displacement (3,).
 
-    scale: relative sigma. The correlation between two stretches of ground is unknown, so the sum is
-    bounded for any correlation (covariance intersection); it is exact for one scale along a
-    straight line.
+    scale: relative sigma. The correlation between the scale errors of two displacements is unknown,
+    so the sum is bounded for any correlation (covariance intersection). It is exact for one scale
+    along a straight line.
     """
     added = scale * displacement
     before, size = float(np.sqrt(np.trace(known))), float(np.linalg.norm(added))
@@ -49,7 +49,7 @@ def stretched(known: Array, scale: float, displacement: Array) -> Array:
     return total
 
 
-def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
+def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
     """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis.
 
     The sensor's error is constant over frames and does not average out. So a variance P larger than
@@ -75,7 +75,7 @@ def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> t
     return Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]), covariance
 
 
-def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
+def kalman_update(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
     """The pose after an independent measurement of single axes: a Kalman update.
 
     Correlated axes are corrected, too: a better rotation also corrects the position. covariance:
@@ -100,8 +100,8 @@ def since(
 ) -> PoseConstraint | None:
     """Constraint on a later pose from the change between two sensor constraints.
 
-    pose: the earlier one, taken as exact. turn_sigma: (3,) rad, rise_sigma: m. None where they
-    have nothing in common.
+    pose: the earlier one, taken as exact. turn_sigma: (3,) rad, rise_sigma: m. None if both
+    constraints have no component in common.
     """
     information, rotation, height = np.zeros(6), pose.rotation, pose.translation[2]
     if _knows_rotation(then) and _knows_rotation(now):
@@ -127,8 +127,8 @@ def without_constant_error(
     """A constraint corrected by the error that the same sensor had at constraint `then`, where the
     true pose was `pose`.
 
-    Of the height; of the heading, about the vertical (compass); and of the rest of the rotation, in
-    the camera's axes (mounting of autopilot and gimbal).
+    It corrects the height, the heading about the vertical (compass), and the rest of the rotation
+    in the camera's axes (mounting of autopilot and gimbal).
     """
     now, before = constraint.world_from_camera, then.world_from_camera
     rotation, translation = now.rotation, now.translation
@@ -161,7 +161,7 @@ def distance_squared(prior: PosePrior, pose: Pose, covariance: Array) -> float:
 def tilt_and_heading(turn: Array) -> Array:
     """Split a rotation (3, 3) into a small rotation vector (x, y) and one about the vertical (z).
 
-    A compass may be far off: the difference in tilt must not be told in its axes.
+    The heading error of a compass may be large, so the tilt difference is computed without it.
     """
     w, _, _, z = quaternion_from_matrix(turn)
     heading = np.array([0.0, 0.0, 2.0 * np.arctan2(z, w)])

@@ -13,7 +13,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry.ground import TerrainModel, ground_points
-from localizer.odometry.growth import stretched
+from localizer.odometry.growth import add_scale_error
 from localizer.registration.anchors import anchors_at
 from localizer.registration.priors import PoseConstraint
 from localizer.types import Anchors, FeaturePyramid
@@ -37,10 +37,11 @@ class Keyframe:
     """A frame that later frames are registered against.
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
-    pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
-    sensors said of its pose. features, camera, surface: what it was made of. scale: sigma of the
-    height above its points as a share of it. stretched: (3, 3) covariance of the place, up to it,
-    by errors of scale. unmatched_m2: likewise by what did not match (`GrowthModel.unmatched`).
+    pose, as `PosePrior`'s. source: source of its depth. way_m: distance flown up to it. constraint:
+    other sensors' measurement of its pose. features, camera, surface: the inputs of its anchors.
+    scale: relative sigma of the height above its points. scale_covariance: (3, 3) covariance of the
+    position from all scale errors so far. unmatched_m2: variance from frames that did not match so
+    far (`GrowthModel.unmatched`).
     """
 
     anchors: Anchors
@@ -54,13 +55,13 @@ class Keyframe:
     surface: Array | None = None
     constraint: PoseConstraint | None = None
     scale: float = 0.0
-    stretched: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    scale_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     unmatched_m2: float = 0.0
 
-    def stretched_to(self, pose: Pose) -> Array:
-        """`stretched` of a pose that was measured against this one."""
+    def scale_covariance_at(self, pose: Pose) -> Array:
+        """`scale_covariance` of a pose that was measured against this one."""
         hop = pose.translation - self.world_from_camera.translation
-        return stretched(self.stretched, self.scale, hop)
+        return add_scale_error(self.scale_covariance, self.scale, hop)
 
 
 def keyframe_anchors(
@@ -75,10 +76,9 @@ def keyframe_anchors(
 ) -> tuple[Anchors, DepthSource]:
     """Anchors of an earlier frame, at most about `count`.
 
-    surface: points (N, 3) on the map's surfaces, off their edges, as seen from about here: the
-    anchors of the map view that was rendered for this frame. Nothing is rendered again, and their
-    picture plays no part. ground: gives points where the map has none. Without either there are
-    no anchors. sweep: of the picture, see `OdometryFrame`.
+    surface: points (N, 3) on the map's surfaces, away from edges: the anchors of the map view that
+    was rendered for this frame. ground: gives points where the map has none. Without both there
+    are no anchors. sweep: the camera's motion during the exposure, see `OdometryFrame`.
     """
     _require_host(features)
     rng = np.random.default_rng(seed)

@@ -28,9 +28,9 @@ from localizer.odometry.track import (
     OdometryTrack,
     aided_rotation,
     fault,
-    followed,
     growth_of,
     seconds,
+    track_after,
 )
 from localizer.registration.anchors import swept
 from localizer.registration.jngo import JNGO
@@ -44,18 +44,18 @@ _CHI2_95 = 5.991  # two degrees of freedom
 class VisualOdometry:
     """Registers each frame against a keyframe, by the map registration's features and optimizer.
 
-    While the map matches, call `begin` with every accepted frame: it only keeps what it is given.
-    When the map does not match, call `step` with every frame; it takes one registration, and a few
-    milliseconds more where a new keyframe begins. Both belong to one thread (the localization
-    thread); nothing is rendered here, and no thread is started.
+    While the map matches, call `begin` with every accepted frame; it only stores its arguments.
+    When the map does not match, call `step` with every frame. It takes one registration, and a few
+    milliseconds more for a new keyframe. Both belong to the localization thread. The odometry
+    renders nothing and starts no thread.
 
     camera: the working pinhole of features whose frame names none. optimizer: see
-    `odometry_optimizer`. ground: a terrain model for where the map has no geometry, of which the
-    shape counts: it is raised or lowered to the ground where the map was last seen; None: a plane
-    at the height that a rangefinder meets on the way, else at that of the ground where the map was
-    last seen. uncertainty: of that ground.
+    `odometry_optimizer`. ground: a terrain model for where the map has no geometry. Only its shape
+    is used: it is shifted vertically to the ground where the map was last seen. None: a plane at
+    the height measured by a rangefinder, else at the ground height where the map was last seen.
+    uncertainty: of that ground.
 
-    Above 200 lines: one frame's way, from keyframe to estimate, over one state.
+    Above 200 lines: the path of one frame, from keyframe to estimate, over one state.
     """
 
     def __init__(
@@ -100,9 +100,9 @@ class VisualOdometry:
         pose: world_from_camera, with its covariance (6, 6) as `PosePrior`'s. velocity: (3,) m/s,
         world axes. surface: (N, 3) world points of the map's surfaces there, the anchors of the
         reference that it was registered against. constraint: as for `step`, at this frame's time;
-        what it contradicts the pose by is taken for the sensors' constant error, and made up for
-        in every step. Costs nothing; the first `step` makes a keyframe of it. Whatever was bridged
-        before is forgotten.
+        its difference from the pose is taken as the sensors' constant error and corrected in every
+        step. It takes no time; the first `step` makes a keyframe of the frame. Earlier odometry is
+        discarded.
         """
         self._beginning = OdometryStart(frame, pose, covariance, surface, constraint)
         self._keyframe = None
@@ -131,16 +131,16 @@ class VisualOdometry:
     ) -> OdometryEstimate:
         """Estimate the pose of the next frame.
 
-        prediction: of the motion model, at the frame's time, that was fed with the last estimates
-        of this odometry; None: constant velocity, turned by the constraint's turn. surface: (N, 3)
-        world points of the map's surfaces as seen from about here: the anchors of the reference
-        that was rendered for this frame, or None where the map has no geometry; or what gives
-        them, asked where a keyframe begins. constraint: what the autopilot knows at the frame's
-        time (`registration.priors`): height by the barometer, roll and pitch, heading with the
-        compass's real error; `combine` them. clearance_m: the height above what lies below, by a
+        prediction: of the motion model at the frame's time, updated with the last estimates of this
+        odometry; None: constant velocity, with the rotation of the constraint. surface: (N, 3)
+        world points of the map's surfaces in view: the anchors of the reference that was rendered
+        for this frame, None where the map has no geometry, or a function that returns them, called
+        for a new keyframe. constraint: the autopilot's data at the frame's time
+        (`registration.priors`): height by the barometer, roll and pitch, heading with the compass's
+        real error; `combine` them. clearance_m: the height above the surface below, by a
         rangefinder.
 
-        A status that is not OK means: do not use the pose; once it is LOST, only `begin` helps.
+        If the status is not OK, do not use the pose. Once it is LOST, only `begin` helps.
         """
         beginning, track = self._beginning, self._track
         if beginning is None or track is None:
@@ -167,7 +167,7 @@ class VisualOdometry:
         if reason := fault(self.config, result, prior):
             return self._failed(OdometryStatus.NOT_REGISTERED, reason, frame, prior, keyframe)
         sensed = (constraint, beginning.corrected(constraint))
-        after = followed(self.config, track, keyframe, result, frame.time_ns, sensed)
+        after = track_after(self.config, track, keyframe, result, frame.time_ns, sensed)
         if clearance_m is not None:
             self._sounded.add(frame.time_ns, float(after.pose.translation[2]) - clearance_m)
         spent = self._is_spent(keyframe, result, after)
@@ -208,7 +208,9 @@ class VisualOdometry:
         source = below if source is DepthSource.GROUND else source
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None
-        before = np.zeros((3, 3)) if self._keyframe is None else self._keyframe.stretched_to(pose)
+        before = (
+            np.zeros((3, 3)) if self._keyframe is None else self._keyframe.scale_covariance_at(pose)
+        )
         place = covariance[:3, :3] + before
         scale = self._scale_sigma(source, anchors.points_world, pose.translation, place)
         return Keyframe(
@@ -312,7 +314,7 @@ class VisualOdometry:
         assert self._beginning is not None
         begun = self._beginning
         covariance = track.covariance + np.diag([track.unmatched_m2] * 2 + [0.0] * 4)
-        covariance[:3, :3] += keyframe.stretched_to(pose)
+        covariance[:3, :3] += keyframe.scale_covariance_at(pose)
         known = carried(begun.covariance, pose.translation - begun.pose.translation)
         added = np.linalg.eigvalsh((covariance - known)[:2, :2])[-1]
         return OdometryEstimate(
@@ -329,8 +331,7 @@ class VisualOdometry:
 def odometry_optimizer(optimizer: JNGO, threads: int = 2) -> JNGO:
     """The map registration's optimizer, set up for odometry; it shares the backend.
 
-    Two pictures of one flight see the same things, so the map's own error is no part of the
-    covariance.
+    Two frames of one flight show the same objects, so the covariance contains no error of the map.
     """
     config = replace(optimizer.config, map_error_m2=0.0)
     return JNGO(config, optimizer.backend, threads)

@@ -66,9 +66,9 @@ def align(
     """Estimate both frames' poses on surface points (N, 3) of the map; None if they cannot be
     determined.
 
-    second: registered against the first, so that the two are one rigid body but for what the shape
-    changes. prior: (6, 6) covariance of the first's pose. noise: sigma of a sample of the cost, as
-    a share of it. It takes 29 scores of 1,500 points.
+    second: registered against the first. Both move as one rigid body, apart from the effect of the
+    map's shape. prior: (6, 6) covariance of the first's pose. noise: relative sigma of a sample of
+    the cost. It takes 29 evaluations of the cost at 1,500 points.
     """
     cost = _Cost(backend, first, second, points)
     axes = _axes(prior)
@@ -130,9 +130,9 @@ class _Cost:
         self._scale: float | None = None
 
     def __call__(self, step: Array) -> tuple[float, Pose]:
-        """The score, inf where too little is in view, and the second's pose that it is reached at.
+        """The cost, inf if too little is in view, and the second pose at which it is reached.
 
-        step: (6,) of the first's pose; the second begins where it moves along as one body.
+        step: (6,) of the first pose; the second starts at its pose in the same rigid motion.
         """
         first = _moved(self._first, step)
         turn = first.rotation @ self._first.rotation.T

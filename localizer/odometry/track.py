@@ -11,11 +11,11 @@ from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.growth import (
     carried,
+    distance_covariance,
     distance_squared,
-    fused,
+    fuse,
+    kalman_update,
     since,
-    walked,
-    weighed,
     without_constant_error,
 )
 from localizer.odometry.keyframe import DepthSource, Keyframe
@@ -46,7 +46,7 @@ class OdometryStart:
 @dataclass(frozen=True)
 class OdometryTrack:
     """The last usable estimate. covariance: without the error of scale. constraint: the other
-    sensors' measurements less their constant error. relative: (6, 6) the covariance beyond the
+    sensors' measurements minus their constant error. relative: (6, 6) the covariance beyond the
     keyframe's own. best: quality of the keyframe's first registration. unmatched_m2: variance of
     east and north beyond the covariance, which no measurement reduces.
     """
@@ -102,7 +102,7 @@ def fault(config: OdometryConfig, result: Registration, prior: PosePrior) -> str
     return ""
 
 
-def followed(
+def track_after(
     config: OdometryConfig,
     track: OdometryTrack,
     keyframe: Keyframe,
@@ -117,16 +117,16 @@ def followed(
     constraint, corrected = sensed
     model, begun = growth_of(config, keyframe.source), keyframe.world_from_camera
     hop = float(np.linalg.norm(result.world_from_camera.translation - begun.translation))
-    relative = model.registration * result.covariance + walked(model, hop)
+    relative = model.registration * result.covariance + distance_covariance(model, hop)
     pose = result.world_from_camera
     if keyframe.constraint is not None and corrected is not None:
         turn = np.radians(
             [config.turn_sigma_deg, config.turn_sigma_deg, config.heading_turn_sigma_deg]
         )
         if known := since(keyframe.constraint, corrected, begun, turn, config.rise_sigma_m):
-            pose, relative = weighed(pose, relative, known)
+            pose, relative = kalman_update(pose, relative, known)
     lever = pose.translation - begun.translation
-    pose, covariance = fused(pose, carried(keyframe.covariance, lever) + relative, corrected)
+    pose, covariance = fuse(pose, carried(keyframe.covariance, lever) + relative, corrected)
     dt = seconds(track.time_ns, time_ns)
     velocity = (pose.translation - track.pose.translation) / dt if dt > 0 else track.velocity
     unmatched = (model.unmatched * (1.0 - result.quality)) ** 2 * hop

@@ -115,9 +115,11 @@ def _block_contrast(grey: Float32) -> Float32:
 
 
 def _sharpness(grey: Float32, seen: NDArray[np.bool_]) -> float:
-    """Contrast that an average over three pixels takes away, over contrast, in the blocks seen.
+    """Contrast that an average over three pixels removes, divided by the contrast, in the visible
+    blocks.
 
-    Along rows or columns, whichever has less: motion blurs in one direction.
+    It is measured along rows and along columns, and the smaller value counts, because motion blurs
+    in one direction.
     """
     if not seen.any():
         return 0.0

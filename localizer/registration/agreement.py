@@ -39,10 +39,10 @@ _RAYLEIGH = 1.1774  # median length of a vector of two independent errors, in th
 class PatchDisplacements:
     """Shifts under which the P patches of an image match best at a registered pose.
 
-    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) level px by a pose
-    difference (position and left rotation vector, world axes, as `PosePrior`). rise: (P, 2) level
-    px by a metre that the patch's ground is higher than the map says. ground: (P, 2) east and north
-    of the patch, m.
+    shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) derivative of the shift
+    by the pose (position and left rotation vector, world axes, as `PosePrior`), level px. rise: (P,
+    2) derivative of the shift by the height of the patch's ground above the map, level px per
+    metre. ground: (P, 2) east and north of the patch, m.
     """
 
     shift: Array
@@ -52,8 +52,8 @@ class PatchDisplacements:
 
     @property
     def scatter_px(self) -> float:
-        """Sigma of the shifts per axis, level px, by their median: what has changed since the
-        survey has a shift of its own, and the optimizer's loss leaves it out.
+        """Sigma of the shifts per axis, level px, by their median. Patches that have changed since
+        the survey have shifts of their own, and the optimizer's loss ignores them.
         """
         if len(self.shift) == 0:
             return np.inf
@@ -62,9 +62,10 @@ class PatchDisplacements:
 
 @dataclass(frozen=True)
 class PatchAgreement:
-    """parts: of the image that could vote; votes: of those that match best where they lie; peak:
-    the whole image's match there over its matches under other shifts, in their standard deviations.
-    displacements: where the patches match best; those without a peak are left out.
+    """How the image's patches agree with a registration. parts: number of patches that can be
+    compared; votes: number of those that match best at their own position; peak: match of the whole
+    image at its position against its matches at other shifts, in their standard deviations.
+    displacements: shifts of the best matches; patches without a peak are left out.
     """
 
     patches: int
@@ -100,9 +101,10 @@ def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> Pat
 class _PatchGrid:
     """Patches of the image with the anchors in each. sums: (P, 2 r + 1, 2 r + 1) correlation of a
     patch's anchors with the query under shifts (rows, then columns) of up to r = `_REACH` level px;
-    anchors: (P,) how many it has; motion: (P, 2, 6) level px by a pose difference (position and
-    left rotation vector, world axes), mean of its anchors; rise: (P, 2) level px by a metre that
-    its ground lies higher; ground: (P, 2) east and north of it, m.
+    anchors: (P,) number of anchors; motion: (P, 2, 6) derivative of the position by the pose
+    (position and left rotation vector, world axes), level px, mean of its anchors; rise: (P, 2)
+    derivative by the ground height, level px per metre; ground: (P, 2) east and north of the
+    ground, m.
     """
 
     sums: Float32

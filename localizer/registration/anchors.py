@@ -25,10 +25,10 @@ def select_anchors(
 ) -> Anchors:
     """At most `count` anchors: spread evenly over the image, off depth edges and holes.
 
-    They are drawn at random within equal cells, so that every part of the view is represented, and
-    come in Morton order, so that neighbours in the list are neighbours in every feature map. The
+    They are drawn at random within equal cells, so that every part of the view is represented. They
+    are in Morton order, so that neighbours in the list are neighbours in every feature map. The
     same seed gives the same anchors. A view without usable depth gives fewer or none; `JNGO` then
-    says TOO_FEW_ANCHORS.
+    returns TOO_FEW_ANCHORS.
     """
     rng = np.random.default_rng(seed)
     rows, columns = _candidates(view.depth, rng)
@@ -68,9 +68,9 @@ def _candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of one pixel per block, where the surface is smooth and present.
 
-    Which pixel of a block is random: were it always the same, every anchor would lie at the same
-    fraction of a feature cell, and the phase error of bilinear interpolation, which is odd about
-    the cell's middle, would shift the pose (measured: 0.02 px of the finest level).
+    The pixel of a block is random. A fixed pixel would put every anchor at the same fraction of a
+    feature cell. The phase error of bilinear interpolation, which is odd about the cell's middle,
+    would then shift the pose (measured: 0.02 px of the finest level).
     """
     hole = ~(np.isfinite(depth) & (depth > 0))
     # 0 in holes, whatever stands there: no arithmetic touches it.
@@ -124,8 +124,9 @@ def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
 def swept(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> Anchors:
     """The anchors, displaced as a rolling shutter shows them.
 
-    pose: where the camera is thought to be (in the middle of the readout); some degrees beside it
-    change the rows, and so the places, by centimetres. None: all rows at once, nothing moves.
+    pose: the camera's approximate pose in the middle of the readout. An error of some degrees
+    changes the anchors by centimetres only. sweep None: all rows are exposed at once, so no anchor
+    is displaced.
     """
     if sweep is None or len(anchors.points_world) == 0:
         return anchors

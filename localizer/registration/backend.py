@@ -22,11 +22,11 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32
 class LMSettings:
     """Levenberg-Marquardt and robust-loss settings (registration.md, sections 3 and 5).
 
-    scale: of the residual norm of one anchor, where the loss leaves the square: Huber's threshold,
-    or Geman and McClure's scale if `redescending`. Unit features differ by at most 2.
-    damping: first factor of the diagonal that is added to it (Marquardt's scaling, per axis);
-    it is multiplied by damping_down after an accepted and by damping_up after a rejected step.
-    min_overlap: share of the anchors that must project into the image.
+    scale: residual norm at which the loss is no longer quadratic: Huber's threshold, or Geman and
+    McClure's scale if `redescending`. Unit features differ by at most 2. damping: first factor of
+    the diagonal that is added to it (Marquardt's scaling, per axis); it is multiplied by
+    damping_down after an accepted step and by damping_up after a rejected one. min_overlap: share
+    of the anchors that must project into the image.
     """
 
     scale: float = 0.5
@@ -39,11 +39,11 @@ class LMSettings:
 
 @dataclass(frozen=True)
 class QuadraticPrior:
-    """Knowledge about the pose from elsewhere, added to the cost as ``weight * d' L d``.
+    """Knowledge of the pose from other sensors, added to the cost as ``weight * d' L d``.
 
-    d: difference (6,) of a pose to `camera_from_local`, as `PosePrior`'s covariance orders it
-    (camera position and left rotation vector, world axes). information: L (6, 6), 0 on axes
-    about which nothing is known.
+    d: difference (6,) of a pose from `camera_from_local`, in the order of `PosePrior`'s covariance
+    (camera position and left rotation vector, world axes). information: L (6, 6), 0 on unknown
+    axes.
     """
 
     camera_from_local: Pose
@@ -112,8 +112,8 @@ def level_intrinsics(
 def local_origin(anchors: Anchors, world_from_camera: Pose) -> Array:
     """Origin (3,) of the local frame: the anchors' centroid, each weighted by 1 / depth².
 
-    That is the weight of an anchor's translation information, so that about this point translation
-    and rotation are nearly uncorrelated (docs/explanation/registration.md, section 4).
+    An anchor's information about translation has this weight. So translation and rotation are
+    nearly uncorrelated about this point (docs/explanation/registration.md, section 4).
     """
     depth = world_from_camera.inverse.apply(anchors.points_world)[:, 2]
     weight = 1.0 / np.maximum(np.abs(depth), 1.0) ** 2

@@ -49,13 +49,14 @@ def calibration_covariance(
 ) -> Array:  # fmt: skip
     """Covariance (6, 6), as `PosePrior`'s, of a registered pose from camera and map errors.
 
-    Each number that is off by a sigma moves every point's pixel; the pose gives way by least
-    squares over the points in view, ``(sum J'J)^-1 sum J'c``, and the numbers fail independently.
-    A late stamp moves the pose along its motion. Patches of the map are displaced independently.
+    An error of one sigma in a camera parameter moves the pixel of every point by c. The pose
+    changes by the least-squares solution over the points in view, ``(sum J'J)^-1 sum J'c``. The
+    parameters' errors are independent. A late timestamp moves the pose along its motion. Patches of
+    the map are displaced independently.
 
-    points_world: (N, 3), what was registered against. camera: the pinhole of the registration;
-    sweep: see `Sweep`, with the readout of `camera`; moving: velocity (3,), m/s, and angular rate
-    (3,), rad/s, world axes.
+    points_world: (N, 3), the registered points. camera: the pinhole of the registration; sweep: see
+    `Sweep`, with the readout of `camera`; moving: velocity (3,), m/s, and angular rate (3,), rad/s,
+    world axes.
     """
     stamped = 1e-3 * sigmas.stamp_ms * np.concatenate(moving)
     late = np.outer(stamped, stamped)
@@ -81,10 +82,10 @@ def calibration_covariance(
 
 
 def _displacement(sigmas: CalibrationSigmas, J: Array, camera: Camera) -> Array:
-    """(6, 6): variance of ``sum J'c`` where the surface is displaced patch by patch.
+    """(6, 6): variance of ``sum J'c`` for a surface that is displaced patch by patch.
 
-    J: (N, 2, 6) of `_pixel_motion`, spread evenly over the picture; a patch is a square of
-    `map_length_m` on the ground and its points are displaced alike.
+    J: (N, 2, 6) of `_pixel_motion`, spread evenly over the image. A patch is a square of
+    `map_length_m` on the ground, whose points have the same displacement.
     """
     by_place = J[:, :, :3]
     px_per_m2 = 0.5 * np.einsum("nai,nai->n", by_place, by_place)

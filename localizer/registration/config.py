@@ -27,13 +27,13 @@ class JNGOConfig:
     iterations: tuple[int, ...] = (2, 3, 4)  # LM steps per level, coarse to fine
     # anchors used per level, spread evenly; all by the winner, on the last level
     swarm_anchors: tuple[int, ...] = (250, 500, 500)
-    keep: tuple[int, ...] = (64, 16)  # survivors after each level but the last
+    survivors: tuple[int, ...] = (64, 16)  # survivors after each level but the last
     sharpen: int = 6  # the winner's last LM steps, each
     sharpen_damping: float = 0.003  # their first Marquardt factor
     # Geman-McClure scales of these steps, in median residual norms
     sharpen_scales: tuple[float, ...] = (2.0, 1.0, 0.7)
     detail_scales: tuple[float, ...] = (1.0, 0.7)  # likewise on the detail level
-    distinct_px: float = 0.25  # least rms distance of survivors, level px
+    duplicate_px: float = 0.25  # least rms distance of survivors, level px
     huber: float = 0.5  # Huber threshold on the residual norm
     damping: float = 0.03  # first Marquardt factor
     min_overlap: float = 0.25  # least share of anchors in view

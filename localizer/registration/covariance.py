@@ -25,12 +25,12 @@ _LEAST_CURVATURE = 0.03
 
 @dataclass(frozen=True)
 class AnchorModel:
-    """Per anchor in view, what the covariance needs of its residual (equations 2 to 7).
+    """Inputs of the covariance from the residual of each anchor in view (equations 2 to 7).
 
-    projection: (N, 2, 6) of equation 6; structure: (N, 2, 2) and slope: (N, 2), S and b of
-    equation 7; squares: (N,) squared residual norms; weights: (N,) joint confidences; robust: (N,)
-    the loss's weights; cell: (N,) number, from 0 on, of the image cell in which it lies; cell_px:
-    side of a cell in level px; channels: C; prior_hessian: (6, 6).
+    projection: (N, 2, 6) of equation 6; structure: (N, 2, 2) and slope: (N, 2), S and b of equation
+    7; squares: (N,) squared residual norms; weights: (N,) joint confidences; robust: (N,) the
+    loss's weights; cell: (N,) number of its image cell, from 0 on; cell_px: side of a cell in level
+    px; channels: C; prior_hessian: (6, 6).
     """
 
     projection: Array
@@ -88,11 +88,11 @@ def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class CovarianceSums:
-    """What equation 11 adds up over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior;
-    meat: Σ_cells F Fᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
-    cell_px: their side in level px; prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi
-    moves the image by sqrt(xi' motion xi) level px, rms; anchors: how many are in view, of all that
-    the pose was fitted to; share: of those, that were added up; curvature: equation 11a.
+    """Sums of equation 11 over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior; meat:
+    Σ_cells F Fᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: number of occupied cells; cell_px:
+    their side in level px; prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi moves the
+    image by sqrt(xi' motion xi) level px, rms; anchors: number in view, of all that the pose was
+    fitted to; share: share of these that the sums contain; curvature: equation 11a.
     """
 
     hessian: Array
@@ -146,10 +146,10 @@ def curvature_steps(motion: Array, distance_px: float) -> Array:
 
 
 def curvature_ratio(scores: Array, steps: Array, hessian: Array) -> float:
-    """Curvature of the cost over what H says of it, mean over the axes (equation 11a).
+    """Measured curvature of the cost divided by that of H, mean over the axes (equation 11a).
 
     scores: (13,) at `curvature_steps`, without a prior; axes along which the overlap ends are left
-    out. At least `_LEAST_CURVATURE`: where the cost is flat its noise alone is measured.
+    out. At least `_LEAST_CURVATURE`, because on a flat cost only noise is measured.
     """
     if not np.isfinite(scores[0]):
         return _LEAST_CURVATURE
@@ -161,11 +161,12 @@ def curvature_ratio(scores: Array, steps: Array, hessian: Array) -> float:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """What the covariance assumes of the noise. correlation: variance factor for what the sums
-    cannot see (11b); floor: least share of the isotropic model, so that a perfect fit does not
-    claim perfect knowledge; few_anchors: anchors in view with which the noise counts twice (11b);
-    shape_cells: cells that the isotropic model's shape counts for (11c); map_error: standard
-    deviation of the map's displacement times the length over which it is the same, m² (11d).
+    """Assumptions of the covariance about the noise. correlation: variance factor for correlations
+    that the sums do not contain (11b); floor: smallest share of the isotropic model, so that a
+    perfect fit does not give a zero covariance; few_anchors: number of anchors in view at which the
+    noise is doubled (11b); shape_cells: number of cells that the isotropic model's shape is
+    weighted with (11c); map_error: standard deviation of the map's displacement times its
+    correlation length, m² (11d).
     """
 
     correlation: float
@@ -180,9 +181,9 @@ def sandwich_covariance(
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
-    The sandwich of equation 11 takes the residuals' variance, and their correlation between
-    channels and within a cell of the image, from the data. A prior of weight `prior_weight` adds
-    its own noise.
+    It is the sandwich estimator of equation 11. Variance and correlation of the residuals, between
+    channels and within an image cell, come from the data. A prior adds noise of its own, by its
+    weight `prior_weight`.
     """
     inverse = _inverse(sums.curvature * sums.hessian + sums.prior_hessian)
     if inverse is None or sums.cells <= 6:
@@ -255,8 +256,8 @@ def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:
 
 
 def apart_px(differences: Array, rotation: Array, translation: Array, motion: Array) -> Array:
-    """(M,) rms distances, in px of the level of `motion`, at which the image lies for poses that
-    differ by `differences` (M, 6) from the pose camera_from_local, to first order.
+    """RMS image displacements (M,), in px of the level of `motion`, of poses that differ by
+    `differences` (M, 6) from the pose camera_from_local, to first order.
     """
     steps = np.linalg.solve(pose_tangent_map(rotation, translation), differences.T)
     distances: Array = np.sqrt(np.einsum("im,ij,jm->m", steps, motion, steps))

@@ -23,15 +23,15 @@ _TRIAL_CHANNELS = 32  # the networks'
 def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
     """Open the backend for a choice of device; falls back to the CPU.
 
-    A GPU is tried: driver, run-time compiler, and a small problem. Where anything of that fails the
-    CPU takes over, and one log line says why: a warning if the GPU was asked for or is there but
-    does not work, else an information.
+    A GPU is tested: driver, run-time compiler, and a small problem. If a test fails, the CPU is
+    used, and one log line gives the reason. It is a warning if the GPU was asked for or is present
+    but does not work, otherwise an information.
     """
     if device == "cpu":
         return NumbaBackend(threads)
     try:
         backend = CudaBackend(Device())
-        trial(backend, _TRIAL_CHANNELS)
+        warm_up(backend, _TRIAL_CHANNELS)
     except CudaUnavailableError as error:
         return _on_the_cpu(error, logging.INFO if device == "auto" else logging.WARNING, threads)
     except BackendError as error:
@@ -45,7 +45,7 @@ def _on_the_cpu(error: BackendError, level: int, threads: int) -> Backend:
     return NumbaBackend(threads)
 
 
-def trial(backend: Backend, channels: int) -> None:
+def warm_up(backend: Backend, channels: int) -> None:
     """Run one step on a small random problem, to compile or load the kernels."""
     rng = np.random.default_rng(0)
     problem = LevelProblem(

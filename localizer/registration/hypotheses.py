@@ -24,13 +24,13 @@ def generate_hypotheses(
 ) -> tuple[Array, Array]:
     """Rotations (M, 3, 3) and centres (M, 3) of M <= `count` poses world_from_camera.
 
-    The unperturbed prior is the first. Rotation: a grid over the two axes that move the whole
-    image, the camera's x (pitch) and y (yaw). Its half-width per axis is `reach` standard
-    deviations of the prior and at most `box_deg`; its step is at most `step_deg` as long as
-    `count` allows. The paper's 144, 11 and 2 degrees make a 12 x 12 grid; a prior that is known
-    better makes a smaller one. Rotation about the optical axis, and translation: normal with the
-    prior's covariance, the deviation cut to ``box_deg / reach`` and `translation_limit_m` per
-    axis. The grid's farthest corner gives its place to the zero perturbation.
+    The unperturbed prior is the first one. Rotation about the camera's x axis (pitch) and y axis
+    (yaw), which move the whole image: a grid. Its half-width per axis is `reach` standard
+    deviations of the prior, at most `box_deg`; its step is at most `step_deg` as long as `count`
+    allows. The paper's 144, 11 and 2 degrees give a 12 x 12 grid; a more certain prior gives a
+    smaller one. Rotation about the optical axis, and translation: normal with the prior's
+    covariance, cut to ``box_deg / reach`` and to `translation_limit_m` per axis. The unperturbed
+    prior replaces the grid's farthest corner.
     """
     R = prior.world_from_camera.rotation
     sigma = np.sqrt(np.maximum(np.diag(R.T @ prior.covariance[3:, 3:] @ R), 0.0))
@@ -50,7 +50,8 @@ def generate_hypotheses(
 
 def draw_hypotheses(prior: PosePrior, count: int, seed: int = 0) -> tuple[Array, Array]:
     """Rotations (count, 3, 3) and centres (count, 3) of poses world_from_camera, normal with the
-    prior's whole covariance: a scrambled Sobol sequence, which leaves no gaps and no clusters.
+    prior's whole covariance. They come from a scrambled Sobol sequence, which leaves no gaps and
+    clusters.
     """
     root = _limited_square_root(prior.covariance, np.inf)
     balanced = 1 << max(count - 1, 0).bit_length()  # the sequence covers evenly in powers of two

@@ -41,16 +41,16 @@ from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.registration import CudaRegistration
-from localizer.registration.devices import trial
+from localizer.registration.devices import warm_up
 from localizer.registration.hypotheses import draw_hypotheses
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Registration, SearchSurvivors, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,
-    distinct,
     median_residual,
     quality,
-    thinned,
+    subsample_anchors,
+    suppress_duplicates,
 )
 from localizer.registration.zoom import FocalTest
 from localizer.types import Anchors, FeaturePyramid, FocalFit, PosePrior, RegistrationStatus
@@ -69,7 +69,7 @@ _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 class JNGO:
     """The optimizer. Keeps its worker threads and scratch memory between frames.
 
-    Above 200 lines: search, sharpening and evidence share the problems of one frame.
+    Above 200 lines: search, final refinement and evidence use the same problems of one frame.
     """
 
     def __init__(
@@ -151,7 +151,9 @@ class JNGO:
         finest = level_problems(query, camera, anchors, origin)[len(self.config.iterations) - 1]
         pose = found.world_from_camera
         R, t = camera_from_local(pose.rotation[None], pose.translation[None], origin)
-        return replace(found, agreement=agreement(thinned(finest, _VOTING_ANCHORS), R[0], t[0]))
+        return replace(
+            found, agreement=agreement(subsample_anchors(finest, _VOTING_ANCHORS), R[0], t[0])
+        )
 
     def focal_tested(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
@@ -178,19 +180,19 @@ class JNGO:
     ) -> _Swarm:
         c = self.config
         R, t, drawn = _beginning(self.backend, c, problems[0], origin, prior, seed)
-        keep = (*c.keep[: len(problems) - 1], c.hypotheses)
+        keep = (*c.survivors[: len(problems) - 1], c.hypotheses)
         evaluations = 0
         for level, iterations, survivors, anchors in zip(
             problems, c.iterations, keep, c.swarm_anchors, strict=True
         ):
-            problem = self._constrained(thinned(level, anchors), constraint, R, t, origin)
+            problem = self._constrained(subsample_anchors(level, anchors), constraint, R, t, origin)
             found = self.backend.refine(problem, R, t, iterations, c.settings)
             evaluations += found.evaluations
             R, t, totals = found.rotations, found.translations, found.scores
             if level is problems[-1]:
                 totals = _totals(c.motion_weight, R, t, totals, origin, motion)
                 drawn = np.zeros(len(R), bool)
-            order = _survivors(problem, R, t, totals, drawn, c.distinct_px, survivors)
+            order = _survivors(problem, R, t, totals, drawn, c.duplicate_px, survivors)
             R, t, drawn = R[order], t[order], drawn[order]
             scores, overlaps = found.scores[order], found.overlaps[order]
             if not np.isfinite(scores).any():
@@ -212,9 +214,13 @@ class JNGO:
         for k, level in enumerate(problems if c.sharpen else ()):
             last = k == len(problems) - 1
             problem = self._constrained(
-                level if last else thinned(level, c.swarm_anchors[-1]), constraint, R, t, origin
+                level if last else subsample_anchors(level, c.swarm_anchors[-1]),
+                constraint,
+                R,
+                t,
+                origin,
             )
-            median = median_residual(thinned(problem, c.swarm_anchors[-1]), R[0], t[0])
+            median = median_residual(subsample_anchors(problem, c.swarm_anchors[-1]), R[0], t[0])
             for factor in scales[k]:
                 scale = max(factor * median, _LEAST_SCALE)
                 settings = replace(
@@ -263,13 +269,13 @@ class JNGO:
             0.0 if problem.prior is None else problem.prior.weight,
             quality(swarm.problem, R, t, c.settings),
             swarm.evaluations + winner.evaluations,
-            agreement(thinned(level, _VOTING_ANCHORS), R, t),
+            agreement(subsample_anchors(level, _VOTING_ANCHORS), R, t),
         )
 
     def _sums(self, winner: _Winner, cell_px: float) -> CovarianceSums | None:
         """Equation 11's sums, of some of the anchors, and 11a's curvature, of all."""
         R, t, settings = winner.rotation, winner.translation, winner.settings
-        few = thinned(winner.problem, _COVARIANCE_ANCHORS)
+        few = subsample_anchors(winner.problem, _COVARIANCE_ANCHORS)
         sums = covariance_sums(anchor_model(few, R, t, settings, cell_px))
         if sums is None:
             return None
@@ -286,7 +292,7 @@ class JNGO:
 
     def warm_up(self, channels: int) -> None:
         """Compile (or load from the cache) the kernel for feature maps of `channels`."""
-        trial(self.backend, channels)
+        warm_up(self.backend, channels)
 
 
 @dataclass(frozen=True)
@@ -321,8 +327,8 @@ def _beginning(
     prior: PosePrior,
     seed: int,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The swarm, camera_from_local, and after it the best of many draws of a wide prior, by the
-    coarsest level's cost where they are; which are drawn (registration.md, section 6).
+    """The swarm, camera_from_local. For a wide prior it is followed by the best of many draws, by
+    the coarsest level's cost. Also returns which hypotheses are draws (registration.md, section 6).
     """
     R, t = camera_from_local(*c.swarm(prior, seed), origin)
     variance = float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1])
@@ -332,11 +338,11 @@ def _beginning(
     if count == 0 or not wide:
         return R, t, np.zeros(len(R), bool)
     Rd, td = camera_from_local(*draw_hypotheses(prior, count, seed), origin)
-    few = thinned(problem, _PRESELECTING_ANCHORS)
+    few = subsample_anchors(problem, _PRESELECTING_ANCHORS)
     scores = backend.refine(few, Rd, td, 0, c.settings).scores
     wanted = c.hypotheses // 2
     best = np.argsort(scores, kind="stable")[: _ALIKE * wanted]
-    chosen = best[distinct(few, Rd[best], td[best], scores[best], _APART_PX)][:wanted]
+    chosen = best[suppress_duplicates(few, Rd[best], td[best], scores[best], _APART_PX)][:wanted]
     drawn = np.arange(len(R) + len(chosen)) >= len(R)
     return np.concatenate([R, Rd[chosen]]), np.concatenate([t, td[chosen]]), drawn
 
@@ -350,16 +356,19 @@ def _survivors(
     distance_px: float,
     count: int,
 ) -> NDArray[np.int64]:
-    """Indices of the best distinct ones: `count` of the swarm, half as many of the draws.
+    """Indices of the best distinct hypotheses: `count` of the swarm, half as many of the draws.
 
-    Draws were chosen by their cost, so on a dark coarse level they would crowd out what is right.
+    The draws were selected by their cost, so on a dark coarse level they would displace the right
+    hypotheses of the swarm.
     """
     order = np.flatnonzero(~drawn)
-    order = order[distinct(problem, R[order], t[order], totals[order], distance_px)][:count]
+    order = order[suppress_duplicates(problem, R[order], t[order], totals[order], distance_px)][
+        :count
+    ]
     others = np.flatnonzero(drawn)
     if len(others) == 0:
         return order
-    best = distinct(problem, R[others], t[others], totals[others], distance_px)
+    best = suppress_duplicates(problem, R[others], t[others], totals[others], distance_px)
     return np.concatenate([order, others[best][: count // 2]])
 
 

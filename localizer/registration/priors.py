@@ -19,7 +19,7 @@ class PoseConstraint:
     """A quadratic cost ``d' L d`` about a pose.
 
     d: (6,) difference to `world_from_camera` (position, left rotation vector; world axes).
-    information: L (6, 6), zero along what is not known.
+    information: L (6, 6), zero along unknown directions.
     """
 
     world_from_camera: Pose
@@ -31,8 +31,8 @@ def attitude_constraint(
 ) -> PoseConstraint:
     """The camera's rotation (3, 3) world_from_camera from the autopilot and the gimbal.
 
-    tilt_sigma_rad: of roll and pitch, which gravity shows well; heading_sigma_rad: about the
-    vertical, which the compass shows badly.
+    tilt_sigma_rad: of roll and pitch, small because of gravity; heading_sigma_rad: about the
+    vertical, large because of the compass.
     """
     information = np.zeros((6, 6))
     information[3, 3] = information[4, 4] = tilt_sigma_rad**-2
@@ -80,9 +80,9 @@ def combine(*constraints: PoseConstraint) -> PoseConstraint:
 
 @dataclass(frozen=True)
 class FusedPose:
-    """A pose after a constraint was taken into it. covariance: (6, 6) as `PosePrior`'s;
-    innovation_squared: squared Mahalanobis distance of the constraint from the pose before, of
-    `dof` degrees of freedom.
+    """A pose after a constraint was fused. covariance: (6, 6) as `PosePrior`'s; innovation_squared:
+    squared Mahalanobis distance of the constraint from the pose before, with `dof` degrees of
+    freedom.
     """
 
     world_from_camera: Pose
@@ -93,7 +93,7 @@ class FusedPose:
 
 def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Array]:
     """(K, 6) rows F and (K,) values z of unit variance, so that ``F d = z`` for the difference d
-    (6,) by which `pose` should move: what the constraint knows, in its own sigmas.
+    (6,) by which `pose` should move: the constraint in units of its own sigmas.
     """
     scale = np.sqrt(np.maximum(np.diag(constraint.information), 1e-300))
     values, vectors = np.linalg.eigh(constraint.information / np.outer(scale, scale))
@@ -107,13 +107,13 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
     return rows, rows @ difference
 
 
-def fused(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
+def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
     """The pose after a constraint of another sensor was applied.
 
     covariance: (6, 6). The sensor's error (mounting, gimbal, air pressure) is constant over frames
     and does not average out. So along each principal direction a variance P larger than the
     sensor's R becomes R, by an update with the noise ``R P / (P - R)``; a smaller one is unchanged.
-    `odometry.growth.fused` follows the same rule.
+    `odometry.growth.fuse` follows the same rule.
     """
     rows, values = constraint_rows(constraint, pose)
     known = rows @ covariance @ rows.T

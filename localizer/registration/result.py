@@ -27,15 +27,15 @@ from localizer.types import PosePrior, RegistrationStatus
 class Registration:
     """A registered pose; after a failure the prior's, with the reason in `status`.
 
-    covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
-    better, inf on failure.
-    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1.
-    evaluations: cost evaluations spent. agreement: of the image's parts, None where it is not
-    known (a registration on a GPU, or one that failed). lead: by how much the best other mode of
-    the swarm is worse, as a share of the score, inf without another. focal_gain: how much better
-    another focal length fits (`zoom.FocalTest`), -inf where that was not tested. mode_covariance:
-    (6, 6), what of the covariance stems from other modes (equation 14). noise: (6, 6), what is new
-    in each frame, for a filter over frames; None: the covariance.
+    covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is better, inf on failure.
+    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. evaluations:
+    number of cost evaluations. agreement: of the image's patches, None if unknown (a registration
+    on a GPU, or one that failed). lead: relative difference of the score of the best other mode,
+    inf without another. focal_gain: relative improvement with another focal length
+    (`zoom.FocalTest`), -inf if not tested. mode_covariance: (6, 6), part of the covariance that
+    stems from other modes (equation 14). noise: (6, 6), the part that is independent in each frame,
+    for a filter over frames; None: the whole covariance. earlier_log_odds: smallest log odds of the
+    image's earlier passes (`localizer.integrity.probability`), inf without any.
     """
 
     world_from_camera: Pose
@@ -50,13 +50,14 @@ class Registration:
     focal_gain: float = -np.inf
     mode_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     noise: Array | None = None
+    earlier_log_odds: float = np.inf
 
 
 @dataclass(frozen=True)
 class SearchSurvivors:
-    """What a search ends with. rotations (K, 3, 3), translations (K, 3): the survivors,
-    camera_from_local, best first, the first one sharpened; scores and overlaps (K,): as the search
-    left them; sums: of equation 11 at the first one, None where no anchor has weight;
+    """Result of a search. rotations (K, 3, 3), translations (K, 3): the survivors,
+    camera_from_local, best first, the first one refined further; scores and overlaps (K,): at the
+    end of the search; sums: of equation 11 at the first one, None if no anchor has weight;
     prior_weight: of a constraint, 0 without; agreement: as `Registration`'s.
     """
 

@@ -20,9 +20,9 @@ _PROBES = 12  # anchors whose projections tell hypotheses apart
 
 
 def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> Array:
-    """Posterior weight (M,) of each surviving mode, seen in so many image cells (equation 14).
+    """Posterior weight (M,) of each surviving mode (equation 14). cells: number of image cells.
 
-    other: (M,) which of them are other modes than the first, and not on the way to it.
+    other: (M,) whether it is another mode than the first, and not on the way to it.
     """
     excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], LEAST_SCORE)
     likelihood = np.exp(-0.5 * cells * excess) * other
@@ -31,7 +31,7 @@ def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> A
     return probabilities
 
 
-def thinned(problem: LevelProblem, count: int) -> LevelProblem:
+def subsample_anchors(problem: LevelProblem, count: int) -> LevelProblem:
     """The problem with about `count` of its anchors, evenly spread (every k-th in Morton order)."""
     step = problem.points.shape[1] // max(count, 1)
     if step < 2:
@@ -44,7 +44,7 @@ def thinned(problem: LevelProblem, count: int) -> LevelProblem:
     )
 
 
-def distinct(
+def suppress_duplicates(
     problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
 ) -> NDArray[np.int64]:
     """Indices of finite hypotheses, best first, without near copies of better ones.

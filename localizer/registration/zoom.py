@@ -26,7 +26,7 @@ from localizer.registration.backend import (
 )
 from localizer.registration.config import JNGOConfig
 from localizer.registration.result import Registration
-from localizer.registration.selection import median_residual, thinned
+from localizer.registration.selection import median_residual, subsample_anchors
 from localizer.types import Anchors, FeaturePyramid, FocalFit, RegistrationStatus
 
 FOCAL_STEP = 0.05
@@ -56,15 +56,15 @@ class FocalTest:
         """Relative decrease of a registration's cost with a focal length `FOCAL_STEP` longer or
         shorter, with the pose refined; the larger of both.
 
-        Negative where the camera's own fits best; -inf where that cannot be tested (a registration
-        that failed, features on a GPU).
+        Negative if the camera's own focal length fits best; -inf if it cannot be tested (a
+        registration that failed, features on a GPU).
         """
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:
             return -np.inf
-        trial = self._trial(query, camera, anchors, found.world_from_camera)
+        problem = self._focal_problem(query, camera, anchors, found.world_from_camera)
         factors = (1.0 - FOCAL_STEP, 1.0, 1.0 + FOCAL_STEP)
-        return focal_gain({factor: self._cost(trial, factor) for factor in factors})
+        return focal_gain({factor: self._cost(problem, factor) for factor in factors})
 
     def fit(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
@@ -76,10 +76,10 @@ class FocalTest:
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:
             return None
-        trial = self._trial(query, camera, anchors, found.world_from_camera)
+        problem = self._focal_problem(query, camera, anchors, found.world_from_camera)
         best, curvature = 1.0, 0.0
         for step in (FOCAL_REACH, _FINER):
-            costs = [self._cost(trial, best + k * step) for k in (-1, 0, 1)]
+            costs = [self._cost(problem, best + k * step) for k in (-1, 0, 1)]
             bend = 0.5 * (costs[0] + costs[2]) - costs[1]
             curvature = bend / (max(costs[1], _NO_COST) * step**2)
             if not np.isfinite(curvature) or curvature < _LEAST_CURVATURE:
@@ -90,29 +90,34 @@ class FocalTest:
             best += step * away
         return FocalFit(best, _SIGMA / float(np.sqrt(curvature)))
 
-    def _trial(self, query: FeaturePyramid, camera: Camera, anchors: Anchors, pose: Pose) -> _Trial:
+    def _focal_problem(
+        self, query: FeaturePyramid, camera: Camera, anchors: Anchors, pose: Pose
+    ) -> _FocalProblem:
         origin = local_origin(anchors, pose)
         problems = level_problems(query, camera, anchors, origin)
         searched = len(self.config.iterations)
-        fine, last = thinned(problems[searched - 1], _FINE_ANCHORS), thinned(problems[-1], _ANCHORS)
+        fine, last = (
+            subsample_anchors(problems[searched - 1], _FINE_ANCHORS),
+            subsample_anchors(problems[-1], _ANCHORS),
+        )
         R, t = camera_from_local(pose.rotation[None], pose.translation[None], origin)
         depth = float((R[0] @ fine.points + t[0][:, None])[2].mean())
-        return _Trial((fine, last), R, t, depth)
+        return _FocalProblem((fine, last), R, t, depth)
 
-    def _cost(self, trial: _Trial, factor: float) -> float:
+    def _cost(self, problem: _FocalProblem, factor: float) -> float:
         """The last level's under that multiple of the focal length."""
         # The camera drawn back as far as the longer focal length seems to bring it on.
-        R, t = trial.rotations, trial.translations
-        rotations, translations = R, t + np.array([0.0, 0.0, trial.depth_m * (factor - 1.0)])
+        R, t = problem.rotations, problem.translations
+        rotations, translations = R, t + np.array([0.0, 0.0, problem.depth_m * (factor - 1.0)])
         score = np.inf
-        for problem in trial.problems:
-            scale = max(median_residual(problem, R[0], t[0]), _LEAST_SCALE)
+        for level in problem.levels:
+            scale = max(median_residual(level, R[0], t[0]), _LEAST_SCALE)
             settings = replace(
                 self.config.settings, scale=scale, redescending=True,
                 damping=self.config.sharpen_damping,
             )  # fmt: skip
             refined = self.backend.refine(
-                _zoomed(problem, factor), rotations, translations, _ITERATIONS, settings
+                _zoomed(level, factor), rotations, translations, _ITERATIONS, settings
             )
             rotations, translations = refined.rotations, refined.translations
             score = float(refined.scores[0])
@@ -120,12 +125,12 @@ class FocalTest:
 
 
 @dataclass(frozen=True)
-class _Trial:
+class _FocalProblem:
     """What is refined under one focal length after the other: rotations (1, 3, 3) and translations
     (1, 3) of the pose found, camera from local.
     """
 
-    problems: tuple[LevelProblem, LevelProblem]
+    levels: tuple[LevelProblem, LevelProblem]
     rotations: Array
     translations: Array
     depth_m: float

@@ -41,9 +41,9 @@ def compared(
 class Confirmation:
     """The candidates of one query during confirmation. Use it once.
 
-    sight: the frame as the tracker sees it; small: at the size of the screening. places: of the
-    candidates screened so far; judged: of those registered, by rank; surrounded, finished: ranks of
-    those that were registered from all sides, and to the end.
+    sight: the frame as the tracker uses it; small: the frame at the size of the screening. places:
+    candidates screened so far; judged: candidates registered so far, by rank; surrounded, finished:
+    ranks of the candidates that were registered from all sides, and in all passes.
     """
 
     verifier: Verifier
@@ -136,9 +136,9 @@ class Confirmation:
                 self.judged[rank] = better
 
     def _settle_alike(self, best: VerifiedCandidate) -> None:
-        """The others whose ground looks nearly as much like the frame, so that it is known whether
-        the best stands out: registered where their rendering looks nearly as much like it, too, and
-        not the place where it does not.
+        """Register the other candidates whose ground looks nearly as much like the frame, so that
+        it is known whether the best one is unique. A candidate is registered if its rendering looks
+        like the frame, too; otherwise it counts as different.
         """
         for rank, place in enumerate(self.places):
             if self.candidates[rank].score < NEARLY * best.candidate.score:
@@ -177,8 +177,8 @@ class Confirmation:
         return any(j.credible for j in self.judged.values())
 
     def _is_settled(self, left: list[PlaceCandidate]) -> bool:
-        """Whether the rest need not be looked at: one of the first few is decisive, and nowhere
-        else does the ground look nearly as much like the frame, as among equal roofs it does.
+        """Whether the other candidates need not be examined: one of the first few is decisive, and
+        no other ground looks nearly as much like the frame, as equal roofs would.
         """
         decisive = [j.candidate.score for j in self._decisive()]
         return bool(decisive) and all(c.score < NEARLY * max(decisive) for c in left)

@@ -55,7 +55,7 @@ class _Spectra:
 @dataclass(frozen=True)
 class PatchSpectra:
     """A patch's Fourier transform. features: (K, SIZE, SIZE/2+1); mask: as `_Spectra.energy`; norm:
-    root of its energy; cells: its side; weight: share of cells in view.
+    root of its energy; cells: side of the patch; weight: share of cells in view.
     """
 
     features: Complex64

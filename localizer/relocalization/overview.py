@@ -151,9 +151,9 @@ def open_overview(
     """Read the map's overview from disk, or compute and store it; None if cancelled by
     `should_stop`.
 
-    progress: called with the number of squares that are done and of all. A damaged file is named in
-    the log and computed again. If the folder cannot be written, the log says so, and the overview
-    is computed again at every start. A new overview removes the longest unused ones.
+    progress: called with the number of finished squares and of all squares. A damaged file is named
+    in the log and computed again. If the folder cannot be written, the log says so, and the
+    overview is computed again at every start. A new overview removes the longest unused ones.
     `MapCacheError` if a search would need more than half of the free memory, or if the network has
     no comparable level.
     """

@@ -22,7 +22,7 @@ _EDGE_RAYS = 9  # per side of the image, to outline what is seen
 class CameraFootprint:
     """The ground that a camera sees at heading 0, relative to the point below it.
 
-    centre: (2,) m; side_m: of a square about it that holds the footprint at every heading.
+    centre: (2,) m; side_m: side of a square about it that contains the footprint at every heading.
     """
 
     centre: Array
@@ -87,8 +87,8 @@ def rectify(
 ) -> Patch:
     """Rectify a pinhole image (H, W, 3) to the square of ground about `centre` (2,).
 
-    rotation: (3, 3) world_from_camera; height_m: above the ground, which is taken as flat. What is
-    not seen has the image's mean colour.
+    rotation: (3, 3) world_from_camera; height_m: above the ground, which is assumed to be flat.
+    Ground outside the image gets the image's mean colour.
     """
     a = (np.arange(side_px) + 0.5 - side_px / 2) * gsd_m
     # A plane's image is a homography: rows east, north, 1 of the ground's coordinates.

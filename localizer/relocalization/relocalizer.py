@@ -45,9 +45,8 @@ _MOST_UNDISTORTERS = 8
 class Relocalizer:
     """Finds a camera on a map from one frame. One thread uses it at a time.
 
-    extractor: the network without the detail level. Everything that is handed in stays the
-    caller's; the renderer must be no other thread's. height_sigma_m: spread of the heights that
-    the map does not have.
+    extractor: the network without the detail level. The caller closes all arguments; no other
+    thread may use the renderer. height_sigma_m: RMS of the object heights that the map lacks.
     """
 
     def __init__(

@@ -145,10 +145,10 @@ def search(
     pool: ThreadPoolExecutor | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> list[PlaceCandidate] | None:
-    """The positions that look most like `view` from above, the most distinct first.
+    """The positions that look most like `view` from above, the best score first.
 
     Up to `candidates` + 1; none if the map has no ground heights there; None if stopped.
-    correlators: of the levels, finest first. A place's height is the query's.
+    correlators: of the levels, finest first. A position's height is the query's.
     """
     heights = scales(query, ground_of(correlators[0].level, query), config)
     if len(heights) == 0:
@@ -191,10 +191,11 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class BlockScores:
-    """Scores (STEP, STEP) of one trial at the origins of each block that it can lie in.
+    """Scores (STEP, STEP) of one trial (heading and height) at the origins of each block that it
+    can lie in.
 
-    noise: root mean square of the trial's scores. A score over it is what competes: on a hill close
-    below the camera few cells are seen, of which some place or other always looks the same.
+    noise: root mean square of the trial's scores. Trials are compared by score divided by noise:
+    close above a hill few cells are seen, and some position always looks similar.
     """
 
     trial: Rectification

@@ -47,9 +47,9 @@ class SearchRegion:
 class PlaceQuery:
     """One frame with the other sensors' data of its camera.
 
-    rotation: (3, 3) world_from_camera by autopilot and gimbal, of which roll and pitch are known to
-    tilt_sigma_rad, and the heading to heading_sigma_rad, or not at all where that is None.
-    height_m: the camera's world z (barometer, m). region: where it can be, None for the whole map.
+    rotation: (3, 3) world_from_camera by autopilot and gimbal. tilt_sigma_rad: sigma of its roll
+    and pitch; heading_sigma_rad: of its heading, None if the heading is unknown. height_m: the
+    camera's world z (barometer, m). region: contains the camera, None for the whole map.
     """
 
     frame: Frame
@@ -74,9 +74,8 @@ class Relocalization:
     """A position that was found and confirmed by registration.
 
     covariance: (6, 6) as `PosePrior`'s. quality, overlap: of the registration; score: correlation
-    of the candidate it came from, runner_up: of the best candidate elsewhere; rank: of the
-    candidate, from 0; rival_quality: of the best registration elsewhere, 0 without;
-    stage_s: seconds by stage.
+    of its candidate, runner_up: of the best candidate elsewhere; rank: of the candidate, from 0;
+    rival_quality: of the best registration elsewhere, 0 without; stage_s: seconds by stage.
     """
 
     world_from_camera: Pose

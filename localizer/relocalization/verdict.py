@@ -20,7 +20,8 @@ SAME_PLACE_M = 5.0  # answers that are closer are one
 @dataclass(frozen=True)
 class VerifiedCandidate:
     """A candidate after registration. result: fused with attitude and height; prior: for the next
-    pass; log_odds: of the right position, by the image; credible: the other sensors agree, too.
+    pass; log_odds: that the position is right, by the image; credible: whether the other sensors
+    agree, too.
     """
 
     candidate: PlaceCandidate

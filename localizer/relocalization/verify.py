@@ -86,8 +86,8 @@ class QueryFeatures:
 class Verifier:
     """Renders the map at a candidate and registers the frame to it.
 
-    extractor: with the detail level, as the tracker's; coarse: without. height_sigma_m: spread of
-    the heights that the map does not have.
+    extractor: with the detail level, as the tracker's; coarse: without. height_sigma_m: RMS of the
+    object heights that the map lacks.
     """
 
     renderer: MapRenderer

@@ -179,7 +179,8 @@ def are_visible(
 def clip_from_camera(camera: Camera) -> Array:
     """Projection (4, 4) from OpenCV camera axes to OpenGL clip coordinates.
 
-    Image row 0 becomes the framebuffer's row 0, which is read first: nothing is flipped afterwards.
+    Image row 0 is the framebuffer's row 0, which is read first, so that the image need not be
+    flipped.
     """
     w, h = camera.width, camera.height
     depth = FAR_M - NEAR_M

@@ -12,10 +12,10 @@ from localizer.types import Image, RenderedView
 def fill_holes(view: RenderedView) -> Image:
     """The view's image (H, W, 3) uint8 with the map's holes filled from their surroundings.
 
-    No flight sees the edge of a hole, but the features of everything near would. What is above the
-    horizon stays: there the sky may be seen. By averages from fine to coarse and back: Gortler et
-    al., The Lumigraph (SIGGRAPH 1996), section 3.4.3, "pull-push". Without any surface in view the
-    picture stays as it is.
+    In flight there is no edge of a hole, but it would change all features near it. Pixels above the
+    horizon are not filled, because the sky may be seen there. The method is "pull-push", averages
+    from fine to coarse and back (Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.3).
+    Without any surface in view the image is unchanged.
     """
     known = view.depth > 0
     holes = ~known & ~_above_horizon(view)

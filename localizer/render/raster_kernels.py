@@ -56,9 +56,9 @@ def project(positions, T, intrinsics, near, screen):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True, fastmath=True)
 def list_faces(screen, faces, width, strip_of_row, listed, counts):  # type: ignore[no-untyped-def]
-    """Faces that may cover a pixel centre, in the row of `listed` (S, F) of every strip that they
-    reach, and how many those are in `counts` (S,). Returns the number of faces that cross the near
-    plane, which stand at the back of row 0.
+    """List the faces that may cover a pixel centre, in the row of `listed` (S, F) of every strip
+    that they reach, with their numbers in `counts` (S,). Returns the number of faces that cross the
+    near plane; they are at the end of row 0.
     """
     half = np.float32(0.5)
     height = strip_of_row.shape[0]

@@ -26,8 +26,8 @@ def open_renderer(
 ) -> MapRenderer:
     """A renderer that any thread may use, one at a time; see `make_renderer`.
 
-    An OpenGL context belongs to the thread that made it: it is given one, which makes it, draws
-    with it and releases it.
+    An OpenGL context belongs to the thread that made it. So an OpenGL renderer has a thread of its
+    own, which makes it, draws with it and releases it.
     """
     owner = ThreadPoolExecutor(1, "opengl")
     try:
@@ -50,8 +50,8 @@ def make_renderer(
 ) -> MapRenderer:
     """A renderer that one thread makes and uses.
 
-    auto: OpenGL where a GPU drives it, else numba (a software OpenGL is slower than numba).
-    Raises `RenderError` when the asked backend is not available.
+    auto: OpenGL if a GPU runs it, else numba, because a software OpenGL is slower than numba.
+    Raises `RenderError` if the asked backend is not available.
     """
     if backend == "numba":
         return NumbaRenderer(streamer, threads, sky)

@@ -23,7 +23,7 @@ TERRAIN_SPACING_M = 5.0
 class WorldConfig:
     """A world's geometry. `relief_m` and `town_radius_m` follow from size and seed when None.
 
-    character: what nearly every cell is used for; mixed has a town in the country.
+    character: use of nearly all cells; mixed: a town surrounded by open country.
     """
 
     seed: int

@@ -135,10 +135,10 @@ def _met(
 ) -> list[_TrackHypothesis]:
     """Every track with every surface within its gate; empty if there is no such pair.
 
-    What is measured is a pixel, whichever surface it shows: the likelihood is a Gaussian of the
-    same height for all, taken over the track's own spread. The surfaces' probabilities count only
-    between those that a track cannot tell apart. Counted in every frame, what is wrong with the
-    map's edge or with the aim in all of them would be taken for evidence.
+    The measurement is a pixel, whichever surface it shows. So the likelihood is a Gaussian of the
+    same height for all surfaces, taken over the track's own spread. The surfaces' probabilities
+    count only between surfaces that a track cannot separate. If they counted in every frame, a
+    constant error of the map's edge or of the aim would be taken for evidence.
     """
     met, lonely = [], []
     for track in tracks:

@@ -20,7 +20,7 @@ from localizer.targets.foreground import (
     AppearanceCoverage,
     TargetAppearance,
     covered,
-    is_distinct,
+    is_detectable,
     is_ground,
 )
 from localizer.targets.standing import StaticAppearance
@@ -71,11 +71,11 @@ class FollowedPosition:
 class ImageFollower:
     """Tracks one target from a frame with a known position. Not thread-safe.
 
-    half_m: half the side of what is followed; None around a point. Use `ready` first: plain ground
-    has no look that could be followed.
+    half_m: half the side of the target; None for a point. Check `ready` first: plain ground cannot
+    be tracked.
 
-    Above 200 lines: both ways to find it, by its look alone and before known ground, share what is
-    learned of the look.
+    Above 200 lines: both methods, by appearance alone and against known ground, share the learned
+    appearance.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class ImageFollower:
     ) -> FollowedPosition | None:
         """Find the target within `reach_m` of the expected position (3,); None if it is not seen.
 
-        was_hidden: it comes out of an occlusion, so nearer to there is likelier.
+        was_hidden: after an occlusion; positions near the expected one are then more likely.
         """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)
@@ -151,10 +151,11 @@ class ImageFollower:
         *,
         was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:
-        """Returns (whether these images can decide, the target). As `find`, for an isolated target,
-        compared with `pictures` of the same ground without it, so that road markings and shadows
-        are not mistaken for it. They cannot decide if it looks like the ground or is in all of
-        them.
+        """As `find`, for an isolated target: compares it with `pictures` of the same ground without
+        it, so that road markings and shadows are not mistaken for it.
+
+        Returns whether the images can decide, and the target. They cannot decide if the target
+        looks like the ground, or is in all images.
         """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)
@@ -170,7 +171,7 @@ class ImageFollower:
                 look = self._look(template, -angle)
                 if (best is not None and best.share >= _SURE) or look is None:
                     break
-                can_tell = can_tell or is_distinct(ground, look)
+                can_tell = can_tell or is_detectable(ground, look)
                 one = covered(chart, ground, look, _ASIDE if was_hidden else 0.0)
                 if one is not None and _is_better(one, best):
                     best, turn = one, angle
@@ -216,8 +217,9 @@ class ImageFollower:
         """Separate the target from the ground, by images of its first position without it; False if
         that is impossible because it does not move or the images do not show it.
 
-        In charts the ground stands still, so what differs from their median is what has moved. A
-        grey car on a grey road differs in parts: all of them about its middle are taken for it.
+        In rectified images the ground is fixed, so a difference from their median is a moving
+        object. A grey car on a grey road differs in several parts; all parts about its middle count
+        as the car.
         """
         charts = [
             self._chart(gray, estimate, self._origin, self._half, course=0.0)
@@ -354,9 +356,10 @@ def _match(
     reach: int,
     aside: float = 0.0,
 ) -> tuple[float, Array]:
-    """(correlation, offset in cells (2,), x then y) of the best place; 0 where a second rivals.
+    """(correlation, offset in cells (2,), x then y) of the best position; 0 if a second one is as
+    good.
 
-    aside: by how much a look at the end of the reach counts less.
+    aside: by how much a match at the end of the search range counts less.
     """
     scores = cv2.matchTemplate(chart, template, cv2.TM_CCOEFF_NORMED, mask=mask)
     scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)

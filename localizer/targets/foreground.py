@@ -69,7 +69,7 @@ class AppearanceCoverage:
     evidence: float
 
 
-def is_distinct(ground: Grey, look: TargetAppearance) -> bool:
+def is_detectable(ground: Grey, look: TargetAppearance) -> bool:
     """Whether the target differs enough from the ground (both square) to be detected."""
     side, size = len(look.grey), len(ground)
     k = (size - side) // 2
@@ -81,7 +81,7 @@ def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
     """Whether a chart shows the ground and nothing of the target, although the two differ. All are
     of one size.
     """
-    if not is_distinct(ground, look):
+    if not is_detectable(ground, look):
         return False
     level = np.float32(np.median(chart - ground))
     share, _, whole = _evidence(chart, ground + level, look.grey, look.inside)
@@ -93,12 +93,12 @@ def covered(
     chart: Grey, ground: Grey, look: TargetAppearance, aside: float = 0.0
 ) -> AppearanceCoverage | None:
     """Position at which the target covers the ground; None without one, if it is half hidden, or if
-    a second position is as likely. chart, ground: squares of the same size. aside: by how much less
-    evidence counts at the end of the search range.
+    a second position is as likely. chart, ground: squares of the same size. aside: by how much
+    evidence at the end of the search range counts less.
 
-    Of Gaussian noise, the log-likelihood ratio of look against ground goes with ``sum (I - G)² -
-    (I - L)²``; a picture ``G + a (L - G)`` has ``(2 a - 1)`` of what the whole look would have,
-    ``sum (L - G)²``.
+    With Gaussian noise the log-likelihood ratio of target against ground is proportional to ``sum
+    (I - G)² - (I - L)²``. An image ``G + a (L - G)`` gives ``(2 a - 1)`` times the ratio of the
+    whole target, ``sum (L - G)²``.
     """
     reach = (len(chart) - len(look.grey)) // 2
     share, evidence, whole = _evidence(chart, ground, look.grey, look.inside)

@@ -76,8 +76,8 @@ class LastPlace:
     def objection(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
         """Why a position is rejected; None if it is accepted, which makes it the last position.
 
-        A detector may give its name to another object: then the new place is told once it has been
-        seen for as long as the old one was, 3 s at the most.
+        A detector may give the same name to another object. The new position is reported once it
+        was seen as long as the old one, at most 3 s.
         """
         last, time_ns = self.fix, fix.exposure_time_ns
         if last is None:
@@ -117,10 +117,10 @@ class LastPlace:
 
 
 def is_near_map_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
-    """Whether a ray passes through or near a hole of the map or its edge, so that it hits ground
+    """Whether a ray passes through or near a hole or the edge of the map, so that it hits ground
     behind. eye, direction: (3,); distance: metres to its hit.
 
-    A hole shows as nothing at all, or as a place much farther away than all that is about it.
+    A ray in a hole hits nothing, or hits at a much larger distance than its neighbours.
     """
     sideways = np.linalg.svd(direction[None, :])[2][1:]
     rings = np.concatenate([_NEAR_M * _RING, _ABOUT_M * _RING])

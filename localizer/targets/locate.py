@@ -65,10 +65,10 @@ def ray_spread(
 ) -> RaySpread:
     """Uncertainty of a pixel's ray, first order.
 
-    A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel's error
-    turns the ray by the camera model's own derivative. drift: one sigma of an error (pixels) along
-    a line, as of a click whose frame is not quite known. pixel_sigma: of the pixel, px, per axis.
-    distance: along the ray, m.
+    A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel error
+    rotates the ray by the derivative of the camera model. drift: one sigma of an error (pixels)
+    along a line, for example of a click whose frame is uncertain. pixel_sigma: of the pixel, px,
+    per axis. distance: along the ray, m.
     """
     _, d = ray_in_world(estimate, pixel)
     sideways = np.linalg.svd(d[None, :])[2][1:]
@@ -110,11 +110,11 @@ def locate(
 ) -> tuple[TargetSurface, ...]:
     """The surfaces that a pixel may show, most probable first; empty if it shows no map.
 
-    Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
-    a surface's is the mean of its own hits. drift: as of `ray_spread`. outline_sigma_m: how far the
-    map's outlines (roofs, crowns) lie beside today's; it decides which surfaces are met, and is no
-    error of a place on one. pixel_sigma: of the pixel, px, per axis. map_sigma_m: of the map's
-    surface.
+    If the whole ray bundle hits one surface, its position is the exact hit of the pixel's ray.
+    Otherwise a surface's position is the mean of its own hits. drift: as of `ray_spread`.
+    outline_sigma_m: error of the map's outlines (roofs, crowns) against today's; it decides which
+    surfaces are hit, and is no error of a position on a surface. pixel_sigma: of the pixel, px, per
+    axis. map_sigma_m: of the map's surface.
     """
     eye, d = ray_in_world(estimate, pixel)
     distance = float(cast(eye, d[None, :]).distances[0])

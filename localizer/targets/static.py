@@ -173,13 +173,14 @@ class StaticTarget:
                 return
         self._views.append(view)
         if len(self._views) > _MOST_VIEWS:
-            self._views = thinned(self._views)
+            self._views = every_second(self._views)
 
     def _meet(self, surfaces: tuple[TargetSurface, ...]) -> None:
-        """Each surface on which a hypothesis lies is its plane from now on, or begins another.
+        """Assign each surface on which a hypothesis lies to it as its plane, or begin another
+        hypothesis.
 
-        A hypothesis never changes to a plane that it is not on: at a ridge or a wall's foot the
-        bundle's mean plane swings with the pixel, and would carry it about.
+        A hypothesis never changes to a plane that it is not on. At a ridge or the foot of a wall
+        the bundle's mean plane changes with the pixel and would move the hypothesis.
         """
         for surface in surfaces:
             sigma = float(np.hypot(self._map_sigma_m, surface.roughness_m))
@@ -220,7 +221,7 @@ class StaticTarget:
         self._hypotheses = kept
 
 
-def thinned(views: Sequence[_Item]) -> list[_Item]:
+def every_second(views: Sequence[_Item]) -> list[_Item]:
     """Every second item, always with the newest and the first."""
     return [views[0], *views[:0:-2][::-1]]
 

@@ -44,10 +44,10 @@ _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
 
 @dataclass(frozen=True)
 class TargetSettings:
-    """pixel_sigma: of an observation, pixels; map_sigma_m: of the map's surface; max_sigma_m,
-    max_range_m: limits of reported positions; outline_sigma_m: of the map's outlines, across the
-    ray; confirm_s: time over which observations must agree before the first report, 0 for single
-    ones.
+    """Settings of a target's track. pixel_sigma: of an observation, pixels; map_sigma_m: of the
+    map's surface; max_sigma_m, max_range_m: limits of reported positions; outline_sigma_m: of the
+    map's outlines, across the ray; confirm_s: time over which observations must agree before the
+    first report, 0 for single ones.
     """
 
     pixel_sigma: float = 1.5
@@ -233,11 +233,11 @@ class TargetTrack:
     def _objection(
         self, fix: TargetFix, ray: SightedRay, surfaces: tuple[TargetSurface, ...]
     ) -> TargetRefusal | None:
-        """Why this may not be reported; None if it may.
+        """Why this position may not be reported; None if it may.
 
-        A fix lies under the pixel that it was seen at, at a depth that its frame shows, on the map,
-        is known to some metres, and is no farther from the last one than both errors and a
-        vehicle's speed allow.
+        A position may be reported if it lies under the observed pixel, at a depth that its frame
+        shows, on the map, is known to some metres, and is no farther from the last one than both
+        errors and a vehicle's speed allow.
         """
         P, sigma = fix.covariance, float(np.sqrt(np.trace(fix.covariance)))
         if not np.isfinite(sigma) or sigma > self._settings.max_sigma_m:
@@ -267,9 +267,8 @@ def _aim(
     drift: tuple[float, float],
     surface: TargetSurface,
 ) -> Array:
-    """(3, 3) m²: by how much another place was meant than the one that is followed: the hand's, the
-    delay's and the pose's error in the frame that was clicked at. To follow that place takes
-    nothing away from it.
+    """(3, 3) m²: uncertainty of the clicked position itself, from the errors of hand, delay and
+    pose in the clicked frame. Tracking this position in later frames does not reduce it.
     """
     offset = surface.position - estimate.world_from_camera.translation
     spread = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)), drift)
@@ -280,8 +279,8 @@ def _aim(
 def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
     """Pixel of a world point (3,) in a frame; None outside the image.
 
-    The lens model folds what is far beside the picture back into it: what does not come back to
-    itself as a ray is not in view.
+    A lens model may project a point far outside the view into the image. So the pixel counts only
+    if its ray leads back to the point.
     """
     at = estimate.world_from_camera.inverse.apply(point)
     pixel, inside = estimate.camera.project(at)

@@ -57,9 +57,10 @@ class AttitudePrior:
 class AttitudeBias:
     """Estimated bias of the other sensors' roll and pitch.
 
-    mean: (2,) rad about the two axes: true = turned by it from reported; covariance: (2, 2);
-    spread: variance of what is no constant (rad²), a mean over `count` measurements; place: (2,)
-    east and north (m) of the last one, at `time_ns`; refused: measurements in a row.
+    mean: (2,) rad about the two axes; the reported attitude rotated by it is the true one.
+    covariance: (2, 2) of the mean. spread: variance (rad²) of the varying part, averaged over
+    `count` measurements. place: (2,) east and north (m) of the last measurement, made at
+    `time_ns`. refused: number of measurements refused in a row.
     """
 
     covariance: Array
@@ -183,8 +184,8 @@ def measured(
 class AttitudeBiasEstimator:
     """Estimates the attitude bias of one camera; use it on the localization thread.
 
-    config: None constrains nothing. rotation_at: (3, 3) world_from_camera as reported of a time in
-    ns, or None.
+    config: None constrains nothing. rotation_at: reported (3, 3) world_from_camera at a time in ns,
+    or None.
     """
 
     def __init__(self, config: AttitudePrior | None, rotation_at: RotationAt) -> None:

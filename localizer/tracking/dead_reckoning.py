@@ -13,7 +13,7 @@ from enum import Enum
 import numpy as np
 
 from localizer.errors import OdometryError
-from localizer.geometry.camera import Camera, followed
+from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
@@ -79,8 +79,8 @@ _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 class DeadReckoning:
     """Odometry beside the map's registration; use it on the localization thread.
 
-    camera: the working pinhole, which follows a lens that zooms. sensors: other sensors' accounts
-    of the camera, terrain: the ground's shape, ground: what is not known of it, see `Localizer`.
+    camera: the working pinhole, adapted to a lens that zooms. sensors: other sensors' data of the
+    camera; terrain: the shape of the ground; ground: uncertainty of the ground, see `Localizer`.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class DeadReckoning:
         sweep: Sweep | None = None,
     ) -> None:  # fmt: skip
         """The map located this frame: end earlier dead reckoning and start here."""
-        camera = followed(self._pinhole, estimate.camera)
+        camera = with_field_of_view(self._pinhole, estimate.camera)
         frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
         self._odometry.begin(
             frame,
@@ -123,7 +123,7 @@ class DeadReckoning:
         """Propagate the pose to a frame. anchors: of the reference at the prediction, if any."""
         if not self._odometry.ready:
             return _NOTHING
-        camera = followed(self._pinhole, frame.camera)
+        camera = with_field_of_view(self._pinhole, frame.camera)
         seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep, camera)
         surface = anchors.points_world if anchors is not None else None
         constraint = self._constraint(frame.exposure_time_ns, prediction.world_from_camera)

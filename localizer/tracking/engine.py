@@ -56,12 +56,12 @@ _FIX_STOP_S = 20.0  # for a frame that is at work to be done, on a slow computer
 class DualThreadEngine:
     """Runs a `Localizer` on a render, an extraction and a localization thread.
 
-    Above 200 lines: each thread's turn is a few lines here, and they share one state.
+    Above 200 lines: a few lines for each cycle of each thread, and all share one state.
 
     subscribers: called on the localization thread with every estimate; they must not block.
     prior_provider: called with a time in ns for an external pose if there is none or tracking is
-    LOST. searcher: finds a position without a prior, on its own thread. If it is silent for two
-    minutes, the hang is reported and frames are tried without it. clock: CLOCK_MONOTONIC, ns.
+    LOST. searcher: finds a position without a prior, on its own thread. If it shows no progress for
+    two minutes, the hang is reported and frames no longer wait for it. clock: CLOCK_MONOTONIC, ns.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class DualThreadEngine:
         self._reference_ms: dict[str, float] = {}
         self._book = HealthCounters(localizer.renderer_name, localizer.features_name)
         self._stop = threading.Event()
-        self._turns: dict[str, int] = {}
+        self._last_ticks: dict[str, int] = {}
         self._threads = [
             self._thread("render", self._render_once),
             self._thread("extract", self._extract_once),
@@ -136,7 +136,7 @@ class DualThreadEngine:
 
     def last_ticks_ns(self) -> dict[str, int]:
         """Start of each thread's newest cycle, CLOCK_MONOTONIC ns, by name."""
-        return {n: self._turns[n] for n in _FIX_THREADS if n in self._turns}
+        return {n: self._last_ticks[n] for n in _FIX_THREADS if n in self._last_ticks}
 
     def _thread(self, name: str, once: Callable[[], None]) -> threading.Thread:
         # A daemon: one that hangs must not keep the process from ending. All, the search too, are
@@ -148,7 +148,7 @@ class DualThreadEngine:
     def _run(self, once: Callable[[], None]) -> None:
         name = threading.current_thread().name
         while not self._stop.is_set():
-            self._turns[name] = time.monotonic_ns()
+            self._last_ticks[name] = time.monotonic_ns()
             try:
                 once()
             except LocalizerError as error:
@@ -258,9 +258,9 @@ class DualThreadEngine:
     def _has_prior(self, time_ns: int) -> bool:
         """Whether there is a prediction to start from.
 
-        Until the first acceptance, and again when LOST, a place that was found or the pose known
-        outside is the better one. Only the latter, where it owes our own fixes nothing, begins
-        again at once; anything else is on trial until it is confirmed.
+        Until the first acceptance, and when LOST, a found position or an external pose replaces the
+        prediction. An external pose that does not derive from our own fixes starts at once. Any
+        other one is tentative until it is confirmed.
         """
         tracker = self._localizer.tracker
         known = tracker.motion is not None
@@ -297,9 +297,11 @@ class DualThreadEngine:
         return self._left_frames != 0
 
     def _is_stale(self, bundle: ReferenceBundle, frame: Frame) -> bool:
-        """Whether the reference is of long ago; a render thread that fails for good is no secret.
+        """Whether the reference is too old. A render thread that fails permanently is not hidden by
+        an old reference.
 
-        Its error stands. Without one the reference of the place that is tried now is under way.
+        If the thread has an error, the reference is stale. Otherwise a reference of the position
+        that is tried now is being rendered.
         """
         age_s = (frame.exposure_time_ns - bundle.time_ns) * 1e-9
         return abs(age_s) > self._localizer.reference_age_s

@@ -17,10 +17,10 @@ _REPORT_EVERY_S = 5.0
 @dataclass(frozen=True)
 class EngineHealth:
     """Counters since the start, text of the present error ("" without one), and names of renderer,
-    features and optimizer. map_loading: the error is that tiles are being read. searches, found:
-    numbers of searches and results; searching: one is running; search_hangs: it no longer responds.
-    horizon_off_deg: attitude bias in pitch and roll, and the sigma after correction; None if not
-    used.
+    features and optimizer. map_loading: whether the error is that tiles are being read. searches,
+    found: numbers of searches and results; searching: whether one is running; search_hangs: whether
+    it no longer responds. horizon_off_deg: attitude bias in pitch and roll, and the sigma after
+    correction; None if not used.
     """
 
     frames_in: int = 0

@@ -35,7 +35,7 @@ _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 class MotionConfig:
     """Process noise of the constant-velocity model, as white accelerations.
 
-    The limits are those of flight, and of what double precision can add and invert.
+    The limits are those of flight, and of double precision for adding and inverting.
     """
 
     acceleration_sigma: float = 3.0  # m/s²
@@ -128,9 +128,9 @@ def update(ahead: MotionState, pose: Pose, covariance: Array) -> MotionState:
 
 
 def inflated(state: MotionState, config: MotionConfig) -> MotionState:
-    """The state with doubled sigmas, after a good measurement contradicted it: the vehicle
-    manoeuvred, or the measurement is wrong. A manoeuvre is then accepted after a frame or two; a
-    wrong measurement would have to repeat itself.
+    """The state with up to doubled sigmas, after a good registration contradicted it: the vehicle
+    manoeuvred, or the registration is wrong. After a manoeuvre a frame or two later is accepted. A
+    wrong registration would have to be wrong in the same way again.
     """
     sigma = np.sqrt(state.covariance.diagonal())
     scale = np.clip(_limits(config) / sigma, 1.0, 2.0)
@@ -166,8 +166,8 @@ def pose_difference(a: Pose, b: Pose) -> Array:
 def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None) -> MotionState:
     """The state's pose at another time with the sigmas of a search and unknown motion.
 
-    For a camera whose clock jumped: pictures still follow each other, times do not. turn: as in
-    `predict`.
+    It is used for a camera whose clock jumped: the frames are consecutive, their times are not.
+    turn: as in `predict`.
     """
     mean = np.concatenate([state.mean[:3], np.zeros(9)])
     rotation = state.rotation if turn is None else turn @ state.rotation
@@ -213,8 +213,8 @@ class MeasuredMotion:
         """The camera's motion during the readout of a frame at the state's time; None for a global
         shutter.
 
-        Its turn by the other sensor, whose report reaches to both sides of the exposure; without
-        one, by the motion model.
+        The rotation comes from the other sensor, if its data surround the exposure; otherwise from
+        the motion model.
         """
         if readout_ms <= 0:
             return None

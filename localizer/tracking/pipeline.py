@@ -24,18 +24,20 @@ from localizer.errors import (
     OutsideMapError,
 )
 from localizer.features.extractor import FeatureExtractor
-from localizer.geometry.camera import Camera, followed
+from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import LocalFrame
+from localizer.integrity.probability import log_odds
 from localizer.map.kind import MapKind
 from localizer.odometry import GroundUncertainty, TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
+from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking.attitude_bias import AttitudeBias
 from localizer.tracking.dead_reckoning import DeadReckoning
-from localizer.tracking.motion import AuxiliarySensors
+from localizer.tracking.motion import AuxiliarySensors, MotionState
 from localizer.tracking.reference import is_still_valid, lead_share
 from localizer.tracking.sensor_fusion import SensorFusion, distance_m
 from localizer.tracking.tracker import Tracker, TrackerState
@@ -154,12 +156,12 @@ class Localizer:
     Above 200 lines and 15 public methods: it is the library's whole interface for one camera.
     Motion, acceptance and dead reckoning are `Tracker`'s.
 
-    sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
-    rate of the motion model. Their roll, pitch and height are fused with each registration
+    sensors: attitude and motion of autopilot and gimbal. Their rotations replace the constant
+    angular rate of the motion model. Their roll, pitch and height are fused with each registration
     (`tracking.sensor_fusion`). With the displacement they confirm or refute a tentative track.
-    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: what is not
-    known of the ground, hills where nobody says. on_close: releases what was opened for this
-    localizer. is_loading: whether requested tiles are still loading.
+    map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: uncertainty of
+    the ground, that of hills by default. on_close: releases what was opened for this localizer.
+    is_loading: whether requested tiles are still loading.
     """
 
     def __init__(
@@ -304,7 +306,8 @@ class Localizer:
         """
         stage_ms: dict[str, float] = {}
         features: FeaturePyramid | None = None
-        self.camera = followed(self._pinhole, frame.camera)
+        least_odds = np.inf
+        self.camera = with_field_of_view(self._pinhole, frame.camera)
         for remaining in range(passes - 1, -1, -1):
             prior = self.predict(frame.exposure_time_ns)
             if prior is None:
@@ -315,13 +318,26 @@ class Localizer:
             if features is None:
                 with stopwatch(stage_ms, "extract"):
                     features = query() if query is not None else self.extract_query(frame)
-            estimate = self.localize(frame, features, bundle.anchors)
-            if remaining and estimate.status is RegistrationStatus.OK:
-                # The same image is no new evidence: start again from its result, halving sigma
-                self.set_prior(
-                    PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
-                )
+            if remaining:
+                found = self._register_again(frame, features, bundle.anchors, prior)
+                least_odds = float(np.minimum(least_odds, log_odds(found)))  # keeps a NaN
+                continue
+            estimate = self.localize(frame, features, bundle.anchors, earlier_log_odds=least_odds)
         return replace(estimate, stage_ms=stage_ms | estimate.stage_ms)
+
+    def _register_again(
+        self, frame: Frame, features: FeaturePyramid, anchors: Anchors, prior: PosePrior
+    ) -> Registration:
+        """Register, and start from the result. The same image is no new evidence: sigma is only
+        halved.
+        """
+        seen = self.tracker
+        ahead = self._ahead(seen, frame)
+        image = self._register(frame, features, self._swept(anchors, frame, ahead), seen, ahead)
+        found = self._fusion.fuse(image, frame.exposure_time_ns).registration
+        if found.status is RegistrationStatus.OK:
+            self.set_prior(PosePrior(found.world_from_camera, prior.covariance / 4, prior.time_ns))
+        return found
 
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction at `time_ns`; None before the first prior."""
@@ -353,8 +369,8 @@ class Localizer:
     ) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2).
 
-        at: where the camera will be soon, if the view is to be rendered from there.
-        `OutsideMapError` if the view shows no map, `MapLoadingError` while tiles are being read.
+        at: a later pose of the camera, if the view is to be rendered there. `OutsideMapError` if
+        the view shows no map, `MapLoadingError` while tiles are being read.
         """
         pose = (at or prior).world_from_camera
         view = self._renderer.render(pose, self.camera, wait=wait)
@@ -378,43 +394,65 @@ class Localizer:
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
         """Features of the frame. They do not need the reference, so this may run in parallel."""
-        undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
+        undistorter, camera = self._undistorter, with_field_of_view(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
         return mask_unseen_features(self._extractor.extract(undistorter(frame)), undistorter.seen)
 
-    def localize(
-        self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None
-    ) -> PoseEstimate:
-        """Register the frame against the anchors, test the result and update the filter.
-
-        anchors: None where no reference can be had: the odometry answers, if it can.
-        `OutsideMapError` before there is a prior.
-        """
-        seen = self.tracker
+    def _ahead(self, seen: TrackerState, frame: Frame) -> MotionState:
         ahead = self._tracker.at_frame(seen, frame.exposure_time_ns)
         if ahead is None:
             raise OutsideMapError(_NO_PRIOR)
+        return ahead
+
+    def _swept(self, anchors: Anchors, frame: Frame, ahead: MotionState) -> Anchors:
+        """The anchors as the rows of a rolling shutter see them."""
+        about = ahead.prior.world_from_camera
+        return swept(anchors, self._tracker.sweep(frame, ahead), about, frame.camera)
+
+    def _register(
+        self, frame: Frame, query: FeaturePyramid, anchors: Anchors, seen: TrackerState,
+        ahead: MotionState,
+    ) -> Registration:  # fmt: skip
+        camera = with_field_of_view(self._pinhole, frame.camera)
+        image = self._optimizer.register(
+            query,
+            camera,
+            anchors,
+            ahead.prior,
+            motion=ahead.prior if seen.track_status.trusts_prediction else None,
+            seed=self._config.seed + frame.sequence,
+        )
+        if seen.track_status.tentative and not seen.track_status.independent:
+            image = self._optimizer.focal_tested(query, camera, anchors, image)
+        return image
+
+    def localize(
+        self,
+        frame: Frame,
+        query: FeaturePyramid,
+        anchors: Anchors | None,
+        *,
+        earlier_log_odds: float = np.inf,
+    ) -> PoseEstimate:
+        """Register the frame against the anchors, test the result and update the filter.
+
+        anchors: None without a reference; the odometry then estimates the pose, if it can.
+        earlier_log_odds: as `Registration`'s. `OutsideMapError` before there is a prior.
+        """
+        seen = self.tracker
+        ahead = self._ahead(seen, frame)
         stage_ms: dict[str, float] = {}
-        camera = followed(self._pinhole, frame.camera)
+        camera = with_field_of_view(self._pinhole, frame.camera)
         result, image, sweep = None, None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
-                about = ahead.prior.world_from_camera
-                seen_anchors = swept(anchors, sweep, about, frame.camera)
-                image = self._optimizer.register(
-                    query,
-                    camera,
-                    seen_anchors,
-                    ahead.prior,
-                    motion=ahead.prior if seen.track_status.trusts_prediction else None,
-                    seed=self._config.seed + frame.sequence,
-                )
-                if seen.track_status.tentative and not seen.track_status.independent:
-                    image = self._optimizer.focal_tested(query, camera, seen_anchors, image)
+                seen_anchors = self._swept(anchors, frame, ahead)
+                image = self._register(frame, query, seen_anchors, seen, ahead)
+                image = replace(image, earlier_log_odds=earlier_log_odds)
                 result = self._fusion.fuse(image, frame.exposure_time_ns)
-        estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
+        estimate = self._tracker.update(seen, ahead, frame, query, anchors, result)
         if anchors is not None and image is not None and estimate.status is RegistrationStatus.OK:
             # Added to what is reported, not to what is filtered: the next frame has the same error.
             moving = (ahead.velocity, ahead.rate)

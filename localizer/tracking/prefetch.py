@@ -52,8 +52,8 @@ class ProcessingTimes:
 class FeaturePrefetcher:
     """Passes on the newest frame with its features; replaced frames are counted.
 
-    extract: a frame's features. may: whether features may be extracted ahead now; where not, the
-    newest frame is handed over without, once the taker waits for it.
+    extract: computes a frame's features. may: whether features may be extracted ahead now; if not,
+    the newest frame is passed on without them when the receiver waits for it.
     """
 
     def __init__(self, extract: Callable[[Frame], FeaturePyramid], may: Callable[[], bool]) -> None:
@@ -83,7 +83,7 @@ class FeaturePrefetcher:
     def prepare(self, timeout_s: float) -> None:
         """Prepare the newest frame when it is due; return after the timeout without one.
 
-        An extraction that fails is left to the taker, who meets its error with the frame.
+        If the extraction fails, the receiver extracts again and gets the error with the frame.
         """
         if not self._wanted.wait(timeout_s):
             return

@@ -21,7 +21,7 @@ def is_still_valid(
     pixels in the reference.
 
     camera: the present pinhole, which may have zoomed. Anchors are map points, so the registration
-    works from any viewpoint at which they look alike and are in view.
+    works from any viewpoint from which they look similar and are in view.
     """
     if most_px <= 0 or not 0 <= time_ns - bundle.time_ns <= _LONGEST_NS:
         return False
@@ -34,8 +34,8 @@ def lead_share(
 ) -> float:
     """Share (0 to 1) of the path from `pose` to `later` at which to render the next reference.
 
-    A reference rendered ahead, but still valid now with a margin, is valid nearly twice as long. If
-    it would then serve a single frame only, it is rendered at that frame's pose. frame: share of
+    A reference that is rendered ahead, and is already valid now, is valid nearly twice as long. If
+    it would be valid for a single frame only, it is rendered at that frame's pose. frame: share of
     the path between two frames.
     """
     camera = bundle.view.camera

@@ -31,7 +31,7 @@ class Rejoining:
     """Rejected registrations compared with the propagated pose; immutable, `with_answer` returns
     the next state.
 
-    begun: the run's first answer; carried: the odometry's position (3,) then.
+    begun: the first registration of the series; carried: the odometry's position (3,) at its time.
     """
 
     begun: TentativeTrack | None = None

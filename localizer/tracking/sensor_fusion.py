@@ -20,7 +20,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.integrity.height_error import MapHeightError, height_likelihood
 from localizer.integrity.patch_covariance import patch_covariance
 from localizer.map.kind import MapKind
-from localizer.registration.priors import PoseConstraint, combine, fused, height_constraint
+from localizer.registration.priors import PoseConstraint, combine, fuse, height_constraint
 from localizer.registration.result import Registration
 from localizer.tracking.attitude_bias import (
     AttitudeBiasEstimator,
@@ -71,7 +71,7 @@ def fused_registration(
         return FusedRegistration(result)
     pose, covariance, contradicted = result.world_from_camera, result.covariance, False
     for known in constraints:
-        found = fused(pose, covariance, known)
+        found = fuse(pose, covariance, known)
         if found.innovation_squared > CONTRADICTS**2:
             contradicted = True
             continue
@@ -83,8 +83,8 @@ def fused_registration(
 class SensorFusion:
     """Fuses registrations with attitude and height; use it on the localization thread.
 
-    attitude, height_sigma_m: how well roll and pitch, and the height, are known; None: not used.
-    map_kind: None where it is not known.
+    attitude, height_sigma_m: accuracy of roll and pitch, and of the height; None: not used.
+    map_kind: None if unknown.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class SensorFusion:
     ) -> None:
         """Update attitude bias and height error with an accepted frame, if it shows new ground.
 
-        result: its registration before `fuse`; place: the pose that was accepted; unknown: (6, 6)
-        covariance of what map and camera model err by; distance_m: of what is seen.
+        result: its registration before `fuse`; place: the accepted pose; unknown: (6, 6) covariance
+        of the errors of map and camera model; distance_m: to the ground in view.
         """
         if not self.attitude_bias.is_due(place.translation, distance_m):
             return

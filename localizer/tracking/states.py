@@ -25,11 +25,11 @@ _SEES = (TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.BRIDGING)
 
 @dataclass(frozen=True)
 class TrackStatus:
-    """State of the machine: immutable, `judge` returns the next one.
+    """State of the machine: immutable, `next_status` returns the next one.
 
-    tentative: the position was proposed, and counts only once it is confirmed. tentative_track: the
-    acceptances there. independent: of the newest proposal, see `TentativeTrack`. last_fix_ns:
-    exposure of the newest fix that was given out, None before the first.
+    tentative: whether the position was proposed and is not confirmed yet. tentative_track: the
+    acceptances since the proposal. independent: of the newest proposal, see `TentativeTrack`.
+    last_fix_ns: exposure of the newest fix that was passed on, None before the first.
     """
 
     state: TrackingState = TrackingState.INITIALIZING
@@ -82,7 +82,7 @@ class RegistrationOutcome:
 _NO_EVIDENCE = IndependentEvidence()
 
 
-def judge(
+def next_status(
     track_status: TrackStatus,
     config: IntegrityConfig,
     outcome: RegistrationOutcome,

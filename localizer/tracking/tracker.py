@@ -16,7 +16,7 @@ from localizer.tracking.dead_reckoning import DeadReckoning, PropagatedPose, Pro
 from localizer.tracking.motion import AuxiliarySensors, MeasuredMotion, MotionState
 from localizer.tracking.rejoining import Rejoining
 from localizer.tracking.sensor_fusion import FusedRegistration
-from localizer.tracking.states import RegistrationOutcome, TrackStatus, judge
+from localizer.tracking.states import RegistrationOutcome, TrackStatus, next_status
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -50,8 +50,8 @@ class _Pose:
 class Tracker:
     """Tests registrations, filters the motion, and propagates the pose without the map.
 
-    `judge` belongs to the localization thread; the rest may be called from any. bridging: None
-    where features are not in host memory.
+    `update` belongs to the localization thread; other methods may be called from any thread.
+    bridging: None if features are not in host memory.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Tracker:
         """The camera's motion while the frame is read out. ahead: the motion at its exposure."""
         return self._motion.sweep(ahead, frame.camera.readout_ms)
 
-    def judge(
+    def update(
         self,
         seen: TrackerState,
         ahead: MotionState,
@@ -110,8 +110,8 @@ class Tracker:
     ) -> PoseEstimate:
         """Test a registration, and update motion and track status.
 
-        seen, ahead: the state and its motion at the frame that the registration began from.
-        anchors, fused: None where there is no reference view to register against.
+        seen, ahead: the state and its motion at the frame, from which the registration started.
+        anchors, fused: None without a reference view.
         """
         result = None if fused is None else fused.registration
         acceptable = result is not None and self._is_acceptable(result, ahead.prior)
@@ -130,7 +130,7 @@ class Tracker:
             result is not None or carried.status is not PropagationResult.NONE,
         )  # fmt: skip
         evidence = self._evidence(seen.track_status, outcome)
-        track_status = judge(seen.track_status, self._config.integrity, outcome, evidence)
+        track_status = next_status(seen.track_status, self._config.integrity, outcome, evidence)
         bridges = track_status.state is TrackingState.BRIDGING
         lost = track_status.state is TrackingState.LOST
         moved = self._next_motion(ahead, result, acceptable and not bridges, carried, lost)

@@ -62,8 +62,8 @@ class DataSection(_PlacesSection):
 
 class LiveSection(_PlacesSection):
     """Pairs rendered while training (`training.data.live`). image: width, height of a view;
-    cells: side of a place; active: places that a step draws from, of which one is replaced every
-    `steps_per_scene` steps; flight_days: that each place is seen on.
+    cells: side of a place; active: number of places that a step draws from; one of them is replaced
+    every `steps_per_scene` steps; flight_days: number of days on which each place is seen.
     """
 
     live: Literal[True]
@@ -92,10 +92,10 @@ Data = Annotated[
 
 
 class OptimizerSection(_Frozen):
-    """Steps and step sizes. The rate warms up, stays, and falls to zero as a cosine over the last
-    `decay_steps`, so that a run can be made longer or shorter until its decay begins. Eq. 3 comes
-    in at `alignment_first_step`. Levels of at most `whole_map_cells` are searched whole by the
-    contrast.
+    """Steps and step sizes. The rate warms up, stays constant, and falls to zero as a cosine over
+    the last `decay_steps`, so that the length of a run can be changed until its decay begins. Eq. 3
+    is used from `alignment_first_step` on. The contrast searches levels of at most
+    `whole_map_cells` completely.
     """
 
     steps: int = Field(gt=0, le=_MOST_STEPS)

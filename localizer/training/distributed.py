@@ -37,8 +37,8 @@ class TrainingProcess:
     def average_gradients(self, parameters: Sequence[nn.Parameter]) -> None:
         """Give every process the mean gradient, so that all take the same step.
 
-        One flat message: the networks here are small, so that overlapping it with the backward pass
-        would gain nothing.
+        All gradients are sent as one message. The networks are small, so overlapping it with the
+        backward pass would gain nothing.
         """
         if self.count == 1:
             return

@@ -48,11 +48,11 @@ def contrast_loss(
     count: int,
     whole_map_cells: int,
 ) -> Tensor:
-    """Cross entropy of finding each anchor's true place (B, N, 2, level pixels) in the query.
+    """Cross entropy of finding each anchor's true position (B, N, 2, level pixels) in the query.
 
-    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched whole;
-    on finer ones the negatives are the neighbourhood, which decides the basin, for `count` of the
-    anchors.
+    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched
+    completely. On finer ones the negatives are the neighbourhood, which decides the basin of
+    convergence, for `count` of the anchors.
     """
     if query.shape[2] * query.shape[3] <= whole_map_cells:
         loss = _whole_map(reference, query, truth, scale)
@@ -221,11 +221,11 @@ def _neighbourhood(reference: Tensor, query: Tensor, truth: Tensor, scale: Tenso
 
 
 def window_similarity(reference: Tensor, query: Tensor, truth: Tensor) -> Tensor:
-    """Products (B, N, k) of anchor features (B, N, C) with the map (B, C, h, w) at the places of a
-    square window about `truth` (B, N, 2, level pixels), row by row.
+    """Dot products (B, N, k) of anchor features (B, N, C) with the feature map (B, C, h, w), at the
+    points of a square window about `truth` (B, N, 2, level pixels), row by row.
 
-    All places of a window have the same fraction of a cell, and the similarity is linear in the
-    features, so that it is taken at whole cells and interpolated afterwards.
+    All points of a window have the same sub-cell offset, and the product is linear in the features.
+    So it is computed at whole cells and then interpolated.
     """
     h, w = query.shape[2:]
     side = 2 * _WINDOW + 1

@@ -11,7 +11,7 @@ WARNING, NOTICE, INFO = Severity.WARNING, Severity.NOTICE, Severity.INFO
 _BY_HAND = "without GNSS fly in STABILIZE or ALT_HOLD"
 _WAIT = "wait; " + _BY_HAND
 _VIDEO = "check the camera and its link; " + _BY_HAND
-_SENT = "fixes are still sent"
+_SENT = "fixes are sent"
 _NO_FIX = "no fix is sent"
 _LOAD = "check the computer's load and temperature"
 _RECORD = "check the disk after landing"
@@ -31,24 +31,25 @@ HEALTH: tuple[AlertSpec, ...] = (
               "another status follows", "fixes are made, and sent if injection runs", _NONE),
     condition(A.DEGRADED, WARNING, "localization degraded", {},
               "three frames in a row are rejected, and odometry cannot bridge",
-              "a frame is accepted", _NO_FIX,
-              _WAIT),
+              "a frame is accepted; after ten rejected frames `lost` follows", _NO_FIX, _WAIT),
     condition(A.BRIDGING, WARNING, "bridging {seconds:.0f} s, {metres:.0f} m",
               {"seconds": "s", "metres": "m"},
               "no frame matches the map for 2 s; odometry continues",
-              "frames match the map again, or odometry fails (then `lost`)",
+              "three frames in a row match the map, or odometry fails (then `lost`)",
               f"{_SENT}, with a covariance that grows; metres: 95 % bound of the error",
               "fly back over mapped ground with buildings and roads"),
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
               "10 frames in a row are rejected, the prediction is too old, or odometry fails",
-              "a position is found and confirmed", f"{_NO_FIX}; seconds: since the last one",
+              "a position is found and confirmed", f"{_NO_FIX}; seconds: since the last fix",
               _WAIT),
     condition(A.EKF_UNCERTAIN, WARNING, "autopilot position +-{metres:.0f} m", {"metres": "m"},
-              "localization is lost", "localization is no longer lost",
-              f"{_NO_FIX}; metres: 95 % bound of the error of the autopilot's own position",
+              "localization is lost, and the autopilot has a position",
+              "localization is no longer lost",
+              f"{_NO_FIX}; metres: 95 % bound of the error of the autopilot's own position, "
+              "estimated from the time since its last GNSS or vision fix",
               "keep this distance to obstacles; " + _BY_HAND),
     condition(A.NO_FRAME, WARNING, "no frame is being localized", {},
-              "no frame was processed for 2 s",
+              "no frame was processed for 2 s, and there was no error",
               "a frame is processed", _NO_FIX, _VIDEO),
     condition(A.LOCALIZATION_FAILED, WARNING, "localization failed, see the log", {},
               "no frame was processed for 2 s, because of an error", "a frame is processed",
@@ -119,12 +120,13 @@ HEALTH: tuple[AlertSpec, ...] = (
           "a second address sends video", f"{_SENT}; the second video is ignored",
           "if it is your camera, set camera.settings.sender"),
     condition(A.ZOOM_UNKNOWN, WARNING, "zoom unknown, no fixes: no CAMERA_SETTINGS", {},
-              "a frame has no recent CAMERA_SETTINGS; again every 10 s",
+              "no CAMERA_SETTINGS in the 2 s before a frame; again every 10 s",
               "CAMERA_SETTINGS is received",
               f"the focal length is unknown, so {_NO_FIX}",
               "check the camera's MAVLink connection; " + _BY_HAND),
     condition(A.ZOOM_NOT_IN_TABLE, WARNING, "zoom {level:.0f} not in table, no fixes",
-              {"level": "%"}, "the zoom level is outside camera.zoom.points; again every 10 s",
+              {"level": "%"}, "the zoom level (0 to 100 %) is outside camera.zoom.points; again "
+              "every 10 s",
               "it is inside", f"the focal length is unknown, so {_NO_FIX}",
               "set a zoom level inside the table; " + _BY_HAND),
     event(A.MAP_OFFSET, NOTICE, "map {metres:.1f} m {direction} of GNSS{applied}",
@@ -140,7 +142,7 @@ HEALTH: tuple[AlertSpec, ...] = (
 TARGETS: tuple[AlertSpec, ...] = (
     event(A.TARGET_FOUND, INFO, "target {number}: +-{metres:.1f} m", {"number": "", "metres": "m"},
           "the position of a click is found",
-          "metres: horizontal sigma of the position (both axes)", _NONE),
+          "a target was made; metres: horizontal sigma of its position (both axes)", _NONE),
     event(A.TARGET_REFUSED, WARNING, "target {number} refused: {why}", _NUMBER_WHY,
           "the position of a click cannot be found", "no target was made", _CLICK),
     event(A.TARGET_UNREADABLE, WARNING, "target {number} refused: map unreadable?", _NUMBER,
@@ -173,13 +175,15 @@ TARGETS: tuple[AlertSpec, ...] = (
           "the image at the target looks as before", "the target has not moved", _NONE),
     condition(A.TARGET_SILENT, WARNING, "{name} not reported: {why}",
               {"name": "name", "why": "name"},
-              "the position of a detected target is rejected for 2 s; one target in 10 s",
+              "the position of a detected target, reported before, is rejected for 2 s; at most "
+              "one such text in 10 s",
               "its position is reported", "the target is not sent or shown", _NONE),
 )  # fmt: skip
 CONSOLE: tuple[AlertSpec, ...] = (
     event(A.CONSOLE_STOP, NOTICE, "targets ended", {},
-          "the console's command that ends the targets",
-          "all clicked targets were deleted, those of ground stations too", _NONE, lead=_CONSOLE),
+          "the operator ends the targets in the console",
+          "all clicked targets were deleted, those of ground stations too; targets of the detector "
+          "stay", "if this was a mistake, click again", lead=_CONSOLE),
     event(A.CONSOLE_TARGET, NOTICE, "target at {x:.2f} {y:.2f}", {"x": "", "y": ""},
           "the operator clicks a point in the console's picture",
           "a target is requested at this share of width and height; it may be refused", _NONE,
@@ -189,6 +193,8 @@ CONSOLE: tuple[AlertSpec, ...] = (
           "a target is requested in a box with this corner (shares of width and height)", _NONE,
           lead=_CONSOLE),
     event(A.CONSOLE_HINT, NOTICE, "hint {latitude:.4f} {longitude:.4f} +-{metres:.0f} m",
-          {"latitude": "deg", "longitude": "deg", "metres": "m"}, "a command from the console",
-          "the map is searched there", _NONE, lead=_CONSOLE),
+          {"latitude": "deg", "longitude": "deg", "metres": "m"},
+          "the operator sends *I am here* in the console",
+          "until the position is found, at most for 2 min, the map is searched within these metres",
+          _NONE, lead=_CONSOLE),
 )  # fmt: skip

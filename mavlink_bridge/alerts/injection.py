@@ -12,10 +12,10 @@ _BY_HAND = "without GNSS fly in STABILIZE or ALT_HOLD"
 _WAIT = "wait; " + _BY_HAND
 _PARAMETERS = "check the parameters with `companion doctor`"
 _LANDMARKS = "compare the position with landmarks"
-_UNVERIFIED = "fixes are sent although map and calibration were not verified against GNSS"
+_UNVERIFIED = "fixes are sent although map and calibration are not verified against GNSS"
 _MAP = "do not fly on vision: check map, calibration and datum"
 _NONE = "nothing"
-_SENT = "fixes are still sent"
+_SENT = "fixes are sent"
 _NOT_VERIFIED = "vision is not verified against GNSS; nothing is sent"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
@@ -34,11 +34,14 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the EKF receives no position", "check cable and baud rate; " + _BY_HAND,
               lead=_NOT_SENT),
     condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
-              "mode inject, message external_position_estimate: no fix is sent for 2 s, because "
-              "the autopilot did not accept the command while its EKF used GNSS",
+              "mode inject, bridge.injection.message external_position_estimate: no fix is sent "
+              "for 2 s, because "
+              "the autopilot has not accepted the command; it is tested while the EKF uses GNSS",
               "the autopilot accepts the command",
-              "this firmware cannot use the command; the EKF receives no position",
-              "set another bridge.injection.message; " + _BY_HAND, lead=_NOT_SENT),
+              "the EKF receives no position; *not asked*: not tested yet; any other answer: this "
+              "firmware cannot use the command",
+              "*not asked*: wait for GNSS; else set another bridge.injection.message; "
+              + _BY_HAND, lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {},
               "a fix is due, the message is relative to the EKF origin, and no GPS_GLOBAL_ORIGIN "
               "was received", "GPS_GLOBAL_ORIGIN is received", "the EKF receives no position",
@@ -49,21 +52,25 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the origin or the map is wrong; the EKF receives no position",
               "check the map and the EKF's origin", lead=_NOT_SENT),
     condition(A.NO_ATTITUDE, WARNING, "no attitude for ODOMETRY", {},
-              "message odometry: no ATTITUDE for the time of a fix", "ATTITUDE is received",
+              "bridge.injection.message odometry: no ATTITUDE for the time of a fix", "ATTITUDE "
+              "is received",
               "ODOMETRY needs the attitude; the EKF receives no position",
               "check the rate of ATTITUDE; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
               "the horizontal sigma of a fix is above 10 m", "it is 10 m or less",
               "the position is too uncertain; the EKF receives none", _WAIT, lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
-              {"degrees": "deg"}, "modes shadow and inject: three of five fixes fail the yaw check",
-              "five fixes in a row pass, within 70 % of the limit",
+              {"degrees": "deg"},
+              "three of five fixes fail the yaw guard: vision's yaw is 3.5 deg off the "
+              "autopilot's, or off the gyros since earlier fixes",
+              "five fixes in a row are within 70 % of the limit",
               "compass, camera mounting or map is rotated; the EKF receives no position",
               "check compass and camera mounting; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.INHIBITED, WARNING, "{alert}", {"alert": A},
               "mode inject: injection has not started, fixes come, and for 10 s an alert that "
               "inhibits is active", "no such alert is active",
-              "injection does not start; the pilot (mode rc) and `force` override this",
+              "injection does not start; the text names the alert; the pilot (mode rc) and "
+              "`force` override it",
               "act on that alert; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.SHADOW_NOT_COMPARED, WARNING, "no fix compared with GNSS", {},
               "no fix of the last two minutes could be compared with GNSS", "a fix is compared",
@@ -95,8 +102,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "geoid, vertical datum or barometer is wrong; nothing is sent", _MAP,
               lead=_NOT_READY),
     condition(A.SHADOW_YAW, WARNING, "yaw differs by {degrees:+.1f} deg", {"degrees": "deg"},
-              "the yaw check blocks (`yaw_mismatch`); only in the shadow check and health.json",
-              "the yaw check no longer blocks",
+              "the yaw guard blocks (`yaw_mismatch`); only in the shadow check and health.json",
+              "the yaw guard no longer blocks",
               "compass or camera mounting is wrong; nothing is sent",
               "check compass and camera mounting", lead=_NOT_READY),
     condition(A.SHADOW_RESTORED, WARNING, "failed before the restart", {},
@@ -104,8 +111,10 @@ INJECTION: tuple[AlertSpec, ...] = (
               "check had failed, at most 10 min ago", "the shadow check passes",
               "the failure is still valid; nothing is sent", _MAP, lead=_NOT_READY),
     event(A.INJECTION_FORCED, WARNING, "injection forced, no shadow check", {},
-          "mode inject: injection starts with bridge.injection.force set, and the shadow check "
-          "has not passed", _UNVERIFIED, "use it in tests only"),
+          "modes inject and rc: injection starts because bridge.injection.force is set; the "
+          "shadow check has not passed in the last 10 min, or an alert inhibits", _UNVERIFIED,
+          f"land if this flight is no test of `force`; else {_LANDMARKS}; remove `force` "
+          "afterwards"),
     event(A.INJECTION_NOT_READY, WARNING, "injecting although not ready", {},
           "mode rc: the pilot enables injection, but the shadow check has not passed in the last "
           "10 min, or an alert inhibits", _UNVERIFIED, _LANDMARKS),
@@ -133,38 +142,41 @@ INJECTION: tuple[AlertSpec, ...] = (
           "the EKF uses vision", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
-              "fixes are sent for 3 s, and the rate over 3 s is below the shown minimum",
+              "after at least 3 s of sent fixes: the rate over 3 s is below the shown minimum",
               "the rate is above it", f"{_SENT}; the EKF may stop using them",
               "check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
-              "fixes are sent for 3 s, and EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED",
+              "after at least 3 s of sent fixes: EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED",
               "the flag is cleared", f"{_SENT}; the EKF uses none yet", "wait"),
     condition(A.EKF_NO_SOURCE, WARNING, "the EKF has no position source", {},
-              "fixes are sent for 3 s, and EKF_STATUS_REPORT has the flag EKF_CONST_POS_MODE",
+              "after at least 3 s of sent fixes: EKF_STATUS_REPORT has the flag EKF_CONST_POS_MODE",
               "the flag is cleared", f"{_SENT}; the EKF uses none",
               f"{_PARAMETERS}; {_BY_HAND}"),
     condition(A.EKF_NO_POSITION, WARNING, "the EKF reports no local position", {},
-              "fixes are sent for 3 s, and no LOCAL_POSITION_NED is received for them",
+              "after at least 3 s of sent fixes: no LOCAL_POSITION_NED is received for them",
               "LOCAL_POSITION_NED is received",
               f"{_SENT}; whether the EKF uses them is unknown", _PARAMETERS),
     condition(A.EKF_OFF_FIXES, WARNING, "the EKF is {metres:.1f} m from what is sent",
               {"metres": "m"},
-              "fixes are sent for 3 s, and the median of the EKF's differences from them over 3 s "
+              "after at least 3 s of sent fixes: the median of the EKF's differences from them "
+              "over 3 s "
               "is above 2 m + 5 sigma", "the difference is smaller",
               f"{_SENT}; source set, EKF origin or yaw is wrong", f"{_PARAMETERS}; {_BY_HAND}"),
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
-              "fixes are sent for 3 s, and the horizontal test ratio in EKF_STATUS_REPORT is "
+              "after at least 3 s of sent fixes: the horizontal test ratio in EKF_STATUS_REPORT is "
               "above 1", "it is 1 or less", f"{_SENT}; the EKF does not use them",
               "act as for `ekf_rejects_vision`; later check VISO_POS_M_NSE and the delay"),
     condition(A.FIXES_LATE, WARNING, "fixes {age_ms:.0f} ms old, delay_ms {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
-              "each of the last 50 fixes (PX4: their median) is over 10 ms older than delay_ms",
+              "each of the last 50 fixes (PX4, unknown firmware: their median) arrived over 10 ms "
+              "older than delay_ms",
               "that age is below 90 % of delay_ms + 10 ms for 15 s",
               f"{_SENT}; the EKF assumes that they are newer than they are",
               "raise delay_ms and the autopilot's delay parameter"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
-              "the median age of the last 50 fixes is above what the firmware can use",
+              "the median age of the last 50 fixes is above what the firmware can use (ArduPilot "
+              "250 ms, PX4 300 ms)",
               "it is below 90 % of the limit for 15 s",
               "fixes are extrapolated by at most 0.5 s and sent; what is older is not sent",
               "use a faster computer or a smaller localizer.width"),
@@ -177,7 +189,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "check the rates of ATTITUDE and the gimbal messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
-              "message gps_input: the companion's clock is before 2023", "the clock is set",
+              "bridge.injection.message gps_input: the companion's clock is before 2023", "the "
+              "clock is set",
               f"{_SENT}, without a time", "set the companion's clock, for example by NTP"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": "name"},
           "the .tlog cannot be written", f"{_SENT}; MAVLink messages are not recorded",

@@ -18,22 +18,24 @@ from mavlink_bridge.alerts.words import (
 WARNING, NOTICE, INFO = Severity.WARNING, Severity.NOTICE, Severity.INFO
 _SIGN = "check the wiring; if it is right, sign the link"
 _NONE = "nothing"
-_SENT = "fixes are still sent"
+_SENT = "fixes are sent"
 _BY_HAND = "without GNSS fly in STABILIZE or ALT_HOLD"
-_CHECK_ARMING = "check the link between computer and flight controller"
+_CHECK_LINK = "check the link between computer and flight controller"
+_WHERE = "a ground station sees this only over bridge.ground_connection"
 
 VEHICLE: tuple[AlertSpec, ...] = (
     event(A.FC_FOUND, INFO, "flight controller found", {}, "the first heartbeat of the autopilot",
           "the MAVLink link works",
           _NONE),
     condition(A.FC_LOST, WARNING, "flight controller lost: no heartbeat 3 s", {},
-              "no heartbeat for 3 s", "a heartbeat is received",
-              "no fix is sent", _CHECK_ARMING),
+              "no heartbeat for 3 s, after there were some", "a heartbeat is received (`fc_back`)",
+              f"no fix is sent; {_WHERE}", f"{_BY_HAND}; {_CHECK_LINK}"),
     event(A.FC_BACK, INFO, "flight controller is back", {}, "a heartbeat after the loss",
           "the MAVLink link works again", _NONE),
     condition(A.FC_SILENT, WARNING, "no heartbeat from the flight controller", {},
-              "no heartbeat for 5 s since the start", "the first heartbeat", "no fix is sent",
-              _CHECK_ARMING),
+              "sent once: no heartbeat in the first 5 s after the start; in health.json: no "
+              "heartbeat for 3 s, also later in the flight", "a heartbeat is received",
+              "no fix is sent", f"before take-off: {_CHECK_LINK}; in flight act as for `fc_lost`"),
     event(A.FC_REBOOTED, WARNING, "flight controller rebooted", {},
           "the boot time in its messages ran back",
           "the EKF has restarted with its first source set; fixes relative to its origin are sent "
@@ -41,10 +43,11 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "check the EKF source set"),
     condition(A.GNSS_LOST, WARNING, "GNSS lost, {output}", {"output": Output},
               "no 3D fix for 1 s, or no report for 2.5 s; a short recovery is ignored",
-              "a 3D fix for 5 s",
+              "a 3D fix for 5 s, and no `gnss_refused`",
               "*injecting*: fixes are sent; *nothing is injected*: the EKF has no position",
               "without injection fly in STABILIZE or ALT_HOLD"),
-    event(A.GNSS_BACK, INFO, "GNSS is back", {}, "a 3D fix for 5 s", "GNSS can be used again",
+    event(A.GNSS_BACK, INFO, "GNSS is back", {},
+          "after `gnss_lost`: a 3D fix for 5 s, and no `gnss_refused`", "GNSS can be used again",
           "select the GNSS source set if you want it"),
     event(A.ARMED_WITHOUT_GNSS, WARNING, "armed without GNSS, {output}", {"output": Output},
           "the vehicle is armed without a 3D fix",
@@ -59,7 +62,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "set bridge.camera.gimbal_component"),
     event(A.SECOND_COMPANION, WARNING, "another companion is component {component}",
           {"component": "id"}, "a heartbeat with this program's own ids is received",
-          f"{_SENT}, by two programs", "stop one of them"),
+          f"{_SENT}; another program uses the same ids and may send fixes too",
+          "stop one of them"),
     event(A.DUPLICATE_SYSTEM_ID, WARNING, "two autopilots have system id {system}",
           {"system": "id"},
           "heartbeats of a second autopilot, or boot times that run back 40 times in 5 s",
@@ -70,13 +74,13 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "set bridge.system_id"),
     event(A.ARMING_ALTERNATES, WARNING, "system {system} armed, disarmed in turn", {"system": "id"},
           "heartbeats alternate between armed and disarmed three times in 10 s",
-          f"{_SENT}; heartbeats may be forged; settings that are locked while armed stay locked",
+          f"{_SENT}; another sender may forge heartbeats",
           _SIGN),
     event(A.TIMESYNC_CONTRADICTS, WARNING, "TIMESYNC contradicts time stamps", {},
           "three answers in 10 s do not fit the timestamps of the autopilot",
           f"{_SENT}; two systems may answer", _SIGN),
     condition(A.TIMESYNC_UNANSWERED, WARNING, "TIMESYNC unanswered: stamps may drift", {},
-              "no answer for 15 s, although other messages are received",
+              "after earlier answers: none for 15 s, although other messages are received",
               "an answer is received",
               f"{_SENT}; their times drift by up to 0.2 ms a second",
               "check the link",
@@ -87,14 +91,15 @@ VEHICLE: tuple[AlertSpec, ...] = (
     event(A.ORIGIN_MOVED, INFO, "EKF origin moved; positions follow it", {},
           "GPS_GLOBAL_ORIGIN changes while disarmed", f"{_SENT}, relative to the new origin",
           _NONE),
-    event(A.ORIGIN_KNOWN, INFO, "EKF origin known", {}, "the first GPS_GLOBAL_ORIGIN",
-          "positions can be sent", _NONE),
+    event(A.ORIGIN_KNOWN, INFO, "EKF origin known", {},
+          "the first GPS_GLOBAL_ORIGIN after the start, a reboot or a lost link",
+          "positions relative to the origin can be sent", _NONE),
     event(A.ORIGIN_DIFFERS, INFO, "EKF origin {metres:.0f} m from configured one", {"metres": "m"},
-          "the EKF's origin is over 1 m from bridge.origin",
+          "the first GPS_GLOBAL_ORIGIN is over 1 m from bridge.origin",
           f"{_SENT}, relative to the EKF's origin",
           "check bridge.origin"),
     condition(A.UNKNOWN_FIRMWARE, WARNING, "unknown firmware, using the safe profile", {},
-              "AUTOPILOT_VERSION names no known firmware",
+              "AUTOPILOT_VERSION is not ArduPilot from 4.5 or PX4 from 1.15 on",
               "AUTOPILOT_VERSION names a known firmware",
               f"{_SENT}, with the settings of the most cautious firmware",
               "check that ArduPilot is 4.5 or newer, or PX4 1.15 or newer"),
@@ -109,8 +114,9 @@ VEHICLE: tuple[AlertSpec, ...] = (
           f"{_SENT}; which source set the EKF uses is not known", "check the EKF source set"),
     event(A.SOURCE_SET_SELECTED, WARNING, "EKF source set {source_set}: {cause}",
           {"source_set": "", "cause": (GnssProblem, ReturnCause), "metres": "m"},
-          "GNSS was bad for 1.5 s (to vision); or it is good again, or vision was gone for 3 s "
-          "while GNSS was good (to GNSS)", f"{_SENT}; the EKF uses the sensors of this set",
+          "switch.enabled: the command is sent. To vision: GNSS was bad for 1.5 s. To GNSS: it is "
+          "good again (return_to_gnss), or vision was gone for 3 s while GNSS was good",
+          f"{_SENT}; the EKF uses the sensors of this set, unless `source_set_refused` follows",
           "compare the position with landmarks"),
     event(A.SOURCE_SET_REFUSED, WARNING, "source switch refused", {},
           "the autopilot refuses to select the source set",
@@ -118,10 +124,12 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "select the source set yourself"),
     condition(A.SOURCE_SET_HELD, WARNING, "no switch: {cause}, {why}",
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
-              "GNSS is bad for 1.5 s, but the vision set must not be selected; again every 10 s",
+              "switch.enabled: GNSS is bad for 1.5 s, but the vision set must not be selected; "
+              "again every 10 s",
               "GNSS is good, or vision is selected",
               f"{_SENT}; the EKF stays on its source set; *not ready*: the shadow check has not "
-              "passed, or an alert inhibits",
+              "passed, or an alert inhibits; *EKF with GNSS*: the EKF's position is nearer to "
+              "GNSS than to vision; *set N chosen*: the pilot selected it",
               "decide by landmarks which source is right, and select it"),
     event(A.LOOK_AT_REFUSED, WARNING, "look-at refused: {why}", {"why": LookAtRefusal},
           "a command to point the gimbal cannot be carried out", "the gimbal does not move",
@@ -151,8 +159,10 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "their commands are denied",
           "if they are yours: add them to bridge.ground_systems, or sign their link"),
     event(A.HINT_TAKEN, NOTICE, "search {metres:.0f} m about the place given", {"metres": "m"},
-          "the operator gives a position", "the map is searched there", _NONE),
+          "the operator gives a position", "until the position is found, at most for 2 min, the "
+          "map is searched within twice this radius", _NONE),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
-          "the operator gives a position outside the map", "the search continues without it",
+          "the operator gives a position farther from the map than twice its radius",
+          "the search continues without it",
           "give a position on the map"),
 )  # fmt: skip

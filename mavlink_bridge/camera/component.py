@@ -162,11 +162,10 @@ class CameraComponent:
             send(message, self._component)
 
     def _told(self) -> list[int]:
-        """The target that the camera protocol reports; the protocol has room for one, without a
-        number.
+        """The target that the camera protocol reports. The protocol has room for one target,
+        without a number.
 
-        The one that the operator clicked last; without a click those that a detector sees take
-        turns.
+        It is the last clicked target. Without a click, the detected targets are reported in turn.
         """
         clicked = [number for number, target in self._targets.items() if target.clicked]
         return [max(clicked)] if clicked else list(self._targets)

@@ -95,8 +95,8 @@ def aircraft_on_map(
 ) -> bytes:
     """The aircraft's event: position, field of view of the camera, and address of the video.
 
-    The wedge's range is the way over the ground to the picture's centre, so that it ends there on
-    the map; a camera that looks into the sky has none.
+    The range of the field of view is the horizontal distance to the image's centre, so that it ends
+    there on the map. A camera that looks into the sky has no range.
     """
     seen = _moment(view.time_ns, utc)
     stale = seen + timedelta(seconds=_AIRCRAFT_STALE_S)

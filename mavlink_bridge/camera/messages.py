@@ -32,8 +32,8 @@ def _text(value: str, length: int) -> list[int]:
 def camera_information(config: CameraConfig, uptime_ms: int) -> Any:
     """CAMERA_INFORMATION (259) with the tracking flags; focal length and sensor size unknown.
 
-    A video stream is announced only where there is one: QGroundControl would leave the video that
-    was set by hand for a stream without an address.
+    A video stream is announced only if it has an address. Otherwise QGroundControl would replace
+    the video that the user has set by a stream that does not exist.
     """
     flags = _CAMERA_FLAGS
     if config.stream_uri:
@@ -75,10 +75,11 @@ def video_stream_information(config: CameraConfig) -> Any:
 
 
 def stream_address(uri: str) -> tuple[int, str]:
-    """VIDEO_STREAM_TYPE and the uri field: an address to connect to, of UDP the port to listen at.
+    """VIDEO_STREAM_TYPE and the uri field: the address to connect to; for UDP the port to listen
+    at.
 
-    QGroundControl and Mission Planner put the field of an MPEG-TS stream behind "0.0.0.0:", so the
-    port must stand there alone.
+    QGroundControl and Mission Planner append the field of an MPEG-TS stream to "0.0.0.0:", so the
+    field contains the port alone.
     """
     scheme, _, rest = uri.rpartition("://")
     if scheme in ("rtsp", "rtsps"):
@@ -93,7 +94,8 @@ def camera_fov_status(
     view: CameraView, config: CameraConfig, geoid_separation_m: float, uptime_ms: int
 ) -> Any:
     """CAMERA_FOV_STATUS (271): camera position, attitude and the ground point in the middle of the
-    image. geoid_separation_m: ellipsoid height minus height above mean sea level, which is sent.
+    image. The message contains heights above mean sea level. geoid_separation_m: ellipsoid height
+    minus height above mean sea level.
     """
 
     def degrees_e7(value: float | None) -> int:

@@ -89,7 +89,7 @@ def image_captured(
 ) -> Any:
     """CAMERA_IMAGE_CAPTURED (263) at the target's position: QGroundControl marks it on its map.
 
-    index: counts these messages. There is no picture: the file's address is empty.
+    index: counter of these messages. No image is stored, so the file's address is empty.
     """
     altitude_mm = round((report.height_m - geoid_separation_m) * 1e3)
     return mavlink.MAVLink_camera_image_captured_message(

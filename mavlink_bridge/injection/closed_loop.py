@@ -110,9 +110,9 @@ class ClosedLoopCheck:
     def jump_missed(self) -> bool:
         """Whether an announced jump must be announced again, because the EKF is still elsewhere.
 
-        ArduPilot's EKF takes the newest measurement of each of its steps: of two that arrive
-        together it never sees the first, nor that it was the one with the new reset_counter. It
-        then refuses all positions, for 7 s (VISION_POSITION_ESTIMATE) or for ever (ODOMETRY).
+        In each of its steps ArduPilot's EKF uses only the newest measurement. If two arrive
+        together, it never uses the first one, which had the new reset_counter. It then refuses all
+        positions, for 7 s (VISION_POSITION_ESTIMATE) or without end (ODOMETRY).
         """
         if self._jump_ns is None:
             return False

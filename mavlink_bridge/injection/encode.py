@@ -46,8 +46,8 @@ _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 class EncodedEstimate:
     """An estimate to send. position: as propagated; quaternion: body to NED, None where unknown.
 
-    fresh: a fix as it came, not propagated. quality: 0..100. velocity_is_new: the fix measured a
-    velocity, which was not sent yet. protection_m: horizontal and vertical level.
+    fresh: the fix itself, not propagated. quality: 0..100. velocity_is_new: the fix measured a
+    velocity, which was not sent before. protection_m: horizontal and vertical level.
     """
 
     position: PropagatedFix
@@ -124,8 +124,8 @@ def odometry(
 ) -> Any:
     """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion.
 
-    A velocity that is repeated or derived from the positions is NaN, "unknown": the EKF would take
-    its error for an independent one.
+    A velocity that is repeated or derived from the positions is sent as NaN ("unknown"), because
+    the EKF would treat its error as independent.
     """
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
     body, velocity_covariance = (NAN, NAN, NAN), [NAN] * 21
@@ -187,9 +187,10 @@ def vision_position_delta(
 def gps_input(
     e: EncodedEstimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
 ) -> Any:
-    """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored.
+    """GPS_INPUT (232), every field filled: ArduPilot does not arm if HDOP is marked as ignored.
 
-    Dilution and satellites follow from the protection level: they are what ArduPilot judges by.
+    Dilution and number of satellites follow from the protection level, because ArduPilot judges a
+    receiver by them.
     """
     p = e.position
     horizontal_m, vertical_m = e.levels_m
@@ -224,7 +225,8 @@ def gps_input(
 def global_position_sensor(e: EncodedEstimate, altitude_amsl_m: float, now_ns: int) -> Any:
     """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes.
 
-    Unlike the others it is stamped with its transmission, and says how long ago the exposure was.
+    Its timestamp is the time of transmission, and a field holds the time since the exposure. The
+    other messages hold the time of the exposure.
     """
     p = e.position
     return mavlink.MAVLink_global_position_sensor_message(
@@ -249,8 +251,8 @@ def external_position_estimate(
 ) -> Any:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) to an autopilot, as COMMAND_INT (75).
 
-    It says when it is sent, seconds since since_ns, and how long before that the exposure was. It
-    has no height: ArduPilot refuses another frame and another altitude than NaN.
+    It holds the time of transmission, in seconds since since_ns, and the time between exposure and
+    transmission. It has no height: ArduPilot accepts only this frame and an altitude of NaN.
     """
     p = e.position
     return mavlink.MAVLink_command_int_message(

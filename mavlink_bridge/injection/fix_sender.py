@@ -37,9 +37,10 @@ _AIDING = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_GPS_GLITCHING
 class PositionCommand:
     """Tracks whether the autopilot accepts MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
 
-    It says so by accepting the command while GNSS aids its EKF. ArduPilot 4.7 refuses it then and
-    accepts it after the loss of GNSS, as a reset: streamed so, the vehicle landed after 8 s all the
-    same. Who refused is not asked again until a reboot.
+    An autopilot that fuses such positions accepts the command while its EKF uses GNSS. ArduPilot
+    4.7 refuses it then. After the loss of GNSS it accepts the command, but only to reset the
+    position: in a test the vehicle landed after 8 s although each fix was sent. An autopilot that
+    has refused is not asked again until a reboot.
     """
 
     def __init__(self) -> None:
@@ -95,7 +96,7 @@ class FixSender:
         shared: Shared,
         origin: OriginExchange,
         outcome: InjectionOutcome,
-        teller: StatusNotifier,
+        notifier: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self.dropped = 0
@@ -109,7 +110,7 @@ class FixSender:
         self._attitude_at = shared.tracker.attitude_at
         self._origin = origin
         self._outcome = outcome
-        self._teller = teller
+        self._notifier = notifier
         self._counters = counters
         self._reason: Alert | None = None
         self._taken = True  # by the link, of the last position
@@ -163,7 +164,7 @@ class FixSender:
         waits = of is AlertId.COMMAND_NOT_TAKEN and command and not command.is_held(now_ns)
         if of is not AlertId.NO_FIX_YET and not (recent and of in _BRIEF) and not waits:
             relief = alert(AlertId.INJECTING) if mode == "inject" else None
-            self._teller.tell_settled("inject", reason, relief, now_ns)
+            self._notifier.notify_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
         """Whether positions were received lately (and sent, in mode ``inject``), and the yaw guard
@@ -184,7 +185,7 @@ class FixSender:
     @property
     def refusal(self) -> Alert | None:
         """Why due positions are not sent, if this has lasted and was reported; else None."""
-        reported = self._teller.reported("inject")
+        reported = self._notifier.reported("inject")
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 

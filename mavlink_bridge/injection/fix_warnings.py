@@ -22,30 +22,30 @@ _IN_TIME_S = 15.0  # until lateness is over; a computer at its limit is late and
 class FixWarnings:
     """Checks the injector and the computer's clock; one thread."""
 
-    def __init__(self, shared: Shared, injector: Injector, teller: StatusNotifier) -> None:
+    def __init__(self, shared: Shared, injector: Injector, notifier: StatusNotifier) -> None:
         self._config = shared.config.injection
         self._utc = shared.utc
         self._injector = injector
-        self._teller = teller
+        self._notifier = notifier
 
     def firmware(self, state: VehicleState, profile: FirmwareProfile) -> None:
         """Report firmware that is unknown or does not support the configured message."""
         if not state.connected or state.version is None:
             return
-        self._teller.tell("profile", None if profile.known else alert(AlertId.UNKNOWN_FIRMWARE))
+        self._notifier.notify("profile", None if profile.known else alert(AlertId.UNKNOWN_FIRMWARE))
         sent = self._config.message
         taken = sent in profile.messages
         unsupported = (
             None if taken else alert(AlertId.MESSAGE_UNSUPPORTED, message=Name(sent.upper()))
         )
-        self._teller.tell("message", unsupported)
+        self._notifier.notify("message", unsupported)
 
     def fixes(self, profile: FirmwareProfile, now_ns: int) -> None:
         """Report fixes that are late, not checked, or without a valid time."""
-        tell = self._teller.tell
+        tell = self._notifier.notify
         late = self._latency(profile)
         relief = alert(AlertId.FIXES_IN_TIME)
-        self._teller.tell_settled("latency", late, relief, now_ns, wait_s=_IN_TIME_S)
+        self._notifier.notify_settled("latency", late, relief, now_ns, wait_s=_IN_TIME_S)
         blind = alert(AlertId.YAW_UNCHECKED) if self._injector.guard.blind else None
         tell("blind", blind, cleared(AlertId.YAW_UNCHECKED))
         unset = self._config.message == "gps_input" and not self._utc.is_set
@@ -62,7 +62,7 @@ class FixWarnings:
         lag = least if profile.least_lag else latency
         late = alert(AlertId.FIXES_LATE, age_ms=lag, limit_ms=limit_ms)
         over = alert(AlertId.FIXES_OVER_LIMIT, age_ms=latency, limit_ms=profile.max_delay_ms)
-        reported = self._teller.reported("latency")
+        reported = self._notifier.reported("latency")
         last = None if reported is None else reported.id
         is_over = last is AlertId.FIXES_OVER_LIMIT
         if latency > profile.max_delay_ms * (_RELIEF_SHARE if is_over else 1.0):

@@ -28,7 +28,8 @@ COMMANDS = {
 
 
 class InjectionEnable:
-    """The newest order is valid: a move of the RC channel, or a command.
+    """Enables and disables injection. The newest order is valid: a change of the RC channel, or a
+    command.
 
     If the RC receiver goes silent, injection continues: without a position, ArduPilot would land
     instead of returning. Any thread may call.

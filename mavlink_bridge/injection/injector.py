@@ -255,9 +255,10 @@ class Injector:
         return self._last_slot_ns + self._least_gap_ns
 
     def _fill_due_ns(self) -> int:
-        """When the next propagated message is due. It goes so early that the next fix need not wait
-        for it, or not at all: a fix that is sent late is fused at the EKF's position of that time,
-        which is wrong by the distance flown. For a late fix it waits half a period, once.
+        """When the next propagated message is due. It is sent so early that it does not delay the
+        next fix, or not at all. The EKF fuses a late fix at its position of that time, which is
+        wrong by the distance flown. If the next fix is late, the message waits once for half a
+        period.
         """
         due = self._waiting[0].time_ns + self._delay_ns if self._waiting else self._pace.next_ns
         if due is None or due <= self._last_slot_ns:

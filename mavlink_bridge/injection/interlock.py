@@ -25,10 +25,11 @@ _GO_NS = 600_000_000_000
 
 
 class ShadowInterlock:
-    """Decides at each step of the injection; one thread.
+    """Decides at each step whether fixes may be injected; one thread.
 
-    force: `bridge.injection.force`. score: the shadow's verdict now. compared_ns: when a fix was
-    last compared with GNSS, 0 never. memory: of what spoke against the map, over a restart.
+    force: `bridge.injection.force`. score: the current result of the shadow check. compared_ns:
+    when a fix was last compared with GNSS, 0 if never. memory: keeps a failed shadow check over a
+    restart.
     """
 
     def __init__(
@@ -36,13 +37,13 @@ class ShadowInterlock:
         force: bool,
         score: Callable[[int], ShadowScore],
         compared_ns: Callable[[], int],
-        teller: StatusNotifier,
+        notifier: StatusNotifier,
         memory: ShadowFailureMemory | None = None,
     ) -> None:
         self._force, self._memory = force, memory
         self._score = score
         self._compared_ns = compared_ns
-        self._teller = teller
+        self._notifier = notifier
         self.inhibited_by: frozenset[AlertId] = frozenset()
         self._next_ns = 0
         self._without_since_ns: int | None = None
@@ -55,7 +56,7 @@ class ShadowInterlock:
         """Restore the failed shadow check of a process that was killed."""
         if self._memory is not None and self._memory.recall():
             self._against = self._reason = alert(AlertId.SHADOW_RESTORED)
-            self._teller.report(self._against)
+            self._notifier.report(self._against)
 
     def end(self, *, clean_shutdown: bool = True) -> None:
         """Stop; a clean shutdown keeps nothing for a restart."""
@@ -66,7 +67,7 @@ class ShadowInterlock:
         """The mode that is allowed. by_pilot: the pilot enabled injection in mode ``rc``; this is
         followed, and reported if the shadow check has not passed.
         """
-        self._judge(state, now_ns)
+        self._update(state, now_ns)
         if wanted != "inject":
             if by_pilot:
                 self._open = False  # its next opening is reported again
@@ -116,16 +117,16 @@ class ShadowInterlock:
         if self._recent_go(now_ns) and not self.inhibited_by:
             return True
         if self._force:
-            self._teller.report(alert(AlertId.INJECTION_FORCED))
+            self._notifier.report(alert(AlertId.INJECTION_FORCED))
         elif by_pilot:
-            self._teller.report(alert(AlertId.INJECTION_NOT_READY))
+            self._notifier.report(alert(AlertId.INJECTION_NOT_READY))
         elif without and not self._against and not self.inhibited_by:
-            self._teller.report(alert(AlertId.INJECTION_UNCHECKED))
+            self._notifier.report(alert(AlertId.INJECTION_UNCHECKED))
         else:
             return False
         return True
 
-    def _judge(self, state: VehicleState, now_ns: int) -> None:
+    def _update(self, state: VehicleState, now_ns: int) -> None:
         """Update with GNSS, and with the score once a second."""
         if gnss_healthy(state, now_ns) or not state.connected:
             self._without_since_ns = None

@@ -22,15 +22,20 @@ _RECEIVER_LATE_NS = 200_000_000  # from what it measured to the arrival of its r
 
 
 class InjectionOutcome:
-    """Keeps recent positions, computed and sent, for both checks; one thread.
+    """Keeps recent computed and sent positions, for the shadow check and the check of the EKF; one
+    thread.
 
-    verdict: the last one; None while nothing is sent or it is too early. ekf_ok_inhibited_by:
-    alerts for which "the EKF follows" is not reported. compared_ns: exposure of the last fix that
-    was compared with GNSS, 0 for none.
+    verdict: the last result of the check of the EKF; None while nothing is sent or it is too early.
+    ekf_ok_inhibited_by: alerts for which "the EKF follows" is not reported. compared_ns: exposure
+    of the last fix that was compared with GNSS, 0 for none.
     """
 
     def __init__(
-        self, shared: Shared, origin: OriginExchange, teller: StatusNotifier, counters: Counter[str]
+        self,
+        shared: Shared,
+        origin: OriginExchange,
+        notifier: StatusNotifier,
+        counters: Counter[str],
     ) -> None:
         self.shadow = ShadowScorer(shared.geoid_separation_m)
         self.verdict: LoopVerdict | None = None
@@ -39,7 +44,7 @@ class InjectionOutcome:
         self._loop = ClosedLoopCheck(shared.config.injection.message)
         self._tracker = shared.tracker
         self._origin = origin
-        self._teller = teller
+        self._notifier = notifier
         self._counters = counters
         self._to_compare: deque[PropagatedFix] = deque(maxlen=_QUEUE)
 
@@ -81,16 +86,16 @@ class InjectionOutcome:
                 self.shadow.compare(fix, reference)
                 self.compared_ns = fix.time_ns
 
-    def judge(self, state: VehicleState, now_ns: int) -> bool:
+    def check_ekf(self, state: VehicleState, now_ns: int) -> bool:
         """Check and report whether the EKF follows. True if a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
         if self.verdict is not None and (self.verdict.reason or not self.ekf_ok_inhibited_by):
             follows = alert(AlertId.EKF_FOLLOWS)
-            self._teller.tell_settled("loop", self.verdict.reason, follows, now_ns)
+            self._notifier.notify_settled("loop", self.verdict.reason, follows, now_ns)
         if not self._loop.jump_missed():
             return False
         self._counters["jumps_repeated"] += 1
-        self._teller.report(alert(AlertId.JUMP_REPEATED))
+        self._notifier.report(alert(AlertId.JUMP_REPEATED))
         return True
 
     def waiting(self) -> dict[str, int]:

@@ -65,9 +65,9 @@ def propagated_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float
 class FixPropagator:
     """Estimates velocity from fixes and propagates the newest fix to a wanted time.
 
-    The propagated position starts at the newest fix itself, not at the filter's smoothed state, and
-    its covariance is that fix's plus what the unknown velocity and acceleration add: smoothing here
-    and again in the EKF would claim the same information twice.
+    The propagation starts at the newest fix itself and not at the filter's smoothed state, because
+    the EKF smooths again: smoothing twice would use the same information twice. The covariance is
+    that of the fix plus the uncertainty of velocity and acceleration.
     """
 
     def __init__(self, acceleration_sigma_mps2: float, sigma_floor_m: float) -> None:

@@ -27,13 +27,13 @@ _STOP_S = 2.0
 
 
 class RestartMemory:
-    """State for the process that replaces a killed one. Reads once; writes in its own thread, so
-    that a hanging disk blocks no other thread.
+    """State for the process that replaces a killed one. It reads once. It writes in its own thread,
+    so that a hanging disk blocks no other thread.
 
-    about: what it holds of, empty where that is always the same; what was kept of another counts
-    for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the
-    computer that clock counts, which nobody sets; else, where it lost its power in the air, the
-    wall clock.
+    about: what the state refers to, for example map and camera; the state of another `about` is
+    ignored. wall_s: UTC seconds; boot, clock_s: identifier of the boot, and CLOCK_MONOTONIC. The
+    age of the state is measured by this clock, which nobody can set. After a power loss in the air
+    it is measured by the wall clock.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class RestartMemory:
             return None
         return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
 
-    def keep(self, told: dict[str, Any]) -> None:
+    def store(self, told: dict[str, Any]) -> None:
         """Store this state from now on."""
         self._in_use = True
         self._told = told
@@ -87,9 +87,10 @@ class RestartMemory:
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
         """End the thread. After a clean shutdown the state is removed, otherwise it is kept for the
-        next process. The first call counts.
+        next process. Only the first call has an effect.
 
-        A standby that never flew leaves the file alone: it is of the process that flies.
+        A standby that never flew does not touch the file, because the file belongs to the flight
+        process.
         """
         if not self._stopping:
             if clean_shutdown:
@@ -150,7 +151,7 @@ class InjectionEnableMemory:
 
     def opened(self, *, by_channel: bool) -> None:
         """Injection is enabled from now on."""
-        self._memory.keep({"open": True, "by_channel": by_channel})
+        self._memory.store({"open": True, "by_channel": by_channel})
 
     def closed(self) -> None:
         """Injection is disabled from now on."""
@@ -183,7 +184,7 @@ class ShadowFailureMemory:
             return
         self._kept = against
         if against:
-            self._memory.keep({"against": True})
+            self._memory.store({"against": True})
         else:
             self._memory.drop()
 

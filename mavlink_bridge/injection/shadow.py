@@ -38,10 +38,10 @@ _CONSISTENCY_LIMIT = 9.0 * 1.39
 class ShadowScore:
     """How vision compared with GNSS over the last two minutes; errors are horizontal.
 
-    Without samples nothing of that is known: None. bias_ne_m: mean north and east difference.
-    height_m: median difference of the heights. consistency: median squared Mahalanobis distance
-    (1.4 is ideal). reasons: why it is not ready; empty if it is a go. against: those of them
-    that speak against the positions themselves, not against how many came.
+    Without samples the figures are None. bias_ne_m: mean north and east difference. height_m:
+    median difference of the heights. consistency: median squared Mahalanobis distance (1.4 is
+    ideal). reasons: why the check has not passed; empty if it has. against: those of the reasons
+    that show wrong positions, and not only too few.
     """
 
     go: bool

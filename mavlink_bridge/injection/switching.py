@@ -130,10 +130,11 @@ def gnss_fault(
 
 
 class SourceSwitch:
-    """Decides; the caller sends and reports the acknowledgement. One thread.
+    """Decides about the source set; the caller sends the command and reports the acknowledgement.
+    One thread.
 
-    refusal: why GNSS that is bad is not left for vision; None when that is not so. current: the
-    set in use; None where it is not known. returning: what is found of GNSS while it is not used.
+    refusal: why the vision set is not selected although GNSS is bad; else None. current: the set in
+    use, None if unknown. returning: the check of GNSS while it is not used.
     """
 
     def __init__(self, config: SourceSwitchConfig) -> None:
@@ -159,9 +160,9 @@ class SourceSwitch:
         self.current = None
 
     def chosen(self, source_set: int) -> None:
-        """The autopilot reports the set that it uses. If it is not our order, it is the pilot's
-        choice and stays: a vision set always, a GNSS set as long as the fault at which it was
-        chosen.
+        """Process the autopilot's report of the set in use. A set that we did not order is the
+        pilot's choice. A chosen vision set stays; a chosen GNSS set stays until the present fault
+        of GNSS ends.
         """
         if source_set in (self.current, self._ordered):
             return
@@ -267,14 +268,14 @@ class SourceOrders:
         self,
         config: SourceSwitchConfig,
         commander: Commander,
-        teller: StatusNotifier,
+        notifier: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self._switch = SourceSwitch(config)
         self._alerted_ns: int | None = None
         self._gnss_set = config.gnss_set
         self._commander = commander
-        self._teller = teller
+        self._notifier = notifier
         self._counters = counters
         self._refused_ns: int | None = None
         self._has_met = False
@@ -305,7 +306,7 @@ class SourceOrders:
         self._has_met = True
         if state.armed and state.autopilot == "ardupilot":
             self._switch.met_in_flight()
-            self._teller.report(alert(AlertId.SOURCE_SET_UNKNOWN))
+            self._notifier.report(alert(AlertId.SOURCE_SET_UNKNOWN))
 
     def on_text(self, text: str) -> None:
         """Process a STATUSTEXT of the autopilot."""
@@ -316,12 +317,12 @@ class SourceOrders:
     def rebooted(self) -> None:
         """The flight controller uses its first set."""
         self._switch.reset()
-        self._teller.forget("switch")
+        self._notifier.forget("switch")
 
     def acknowledged(self, accepted: bool) -> None:
         """Process a COMMAND_ACK of an order."""
         if self._switch.acknowledged(accepted) and not accepted:
-            self._teller.report(alert(AlertId.SOURCE_SET_REFUSED))
+            self._notifier.report(alert(AlertId.SOURCE_SET_REFUSED))
 
     def tick(
         self,
@@ -339,12 +340,12 @@ class SourceOrders:
         refusal = self._switch.refusal
         if refusal is not None and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
             self._refused_ns = now_ns  # again as long as it lasts: the operator decides
-            self._teller.report(refusal)
+            self._notifier.report(refusal)
         if order is None:
             return
         self._counters["source_switches"] += 1
         self._commander.send(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
-        self._teller.tell("switch", order.alert)
+        self._notifier.notify("switch", order.alert)
 
     def _tell_refused(self, now_ns: int) -> None:
         returning, alerted_ns = self._switch.returning, self._alerted_ns
@@ -352,8 +353,8 @@ class SourceOrders:
         if returning.refusal is not None:
             if alerted_ns is None or now_ns - alerted_ns >= again_ns:
                 self._alerted_ns, why = now_ns, returning.refusal
-                self._teller.report(alert(AlertId.GNSS_REFUSED, size=why.size, why=why.why))
+                self._notifier.report(alert(AlertId.GNSS_REFUSED, size=why.size, why=why.why))
         elif alerted_ns is not None:
             self._alerted_ns = None
             if returning.accepted:
-                self._teller.report(cleared(AlertId.GNSS_REFUSED))
+                self._notifier.report(cleared(AlertId.GNSS_REFUSED))

@@ -38,8 +38,8 @@ class YawVerdict:
 class YawGuard:
     """Rejects fixes whose yaw changed wrongly, and blocks injection if most of the last ones did.
 
-    Blocking takes the majority of `minimum_samples` fixes, for noise lets some of a turned frame
-    pass; releasing takes as many good ones in a row, held to a tighter limit.
+    It blocks if the majority of `minimum_samples` fixes fail, because noise lets some fixes of a
+    rotated frame pass. It releases after as many good fixes in a row, tested with a smaller limit.
     """
 
     def __init__(self, config: YawGuardConfig) -> None:

@@ -48,7 +48,7 @@ def boot_id() -> str:
 class SteadyUtc:
     """UTC that cannot jump: it follows CLOCK_MONOTONIC from one reading of the wall clock.
 
-    A step of the wall clock (NTP, GNSS that comes back) must not appear inside a flight's stamps.
+    If the wall clock steps in flight (NTP, GNSS), the timestamps of this flight do not.
     """
 
     def __init__(self, utc_ns: int | None = None, at_monotonic_ns: int | None = None) -> None:
@@ -79,8 +79,9 @@ class SteadyUtc:
 def process_utc() -> SteadyUtc:
     """The UTC clock of all records of this process, with one constant offset.
 
-    A computer without a battery begins in the past and its clock steps once it meets the network; a
-    .tlog dated by that clock would tell a message's time apart from its picture's by the step.
+    A computer without a battery starts with a wrong time, and its clock steps when it gets a
+    network. With the stepping clock, a message in the .tlog and the frame of the same moment would
+    get times that differ by this step.
     """
     return SteadyUtc()
 
@@ -132,14 +133,15 @@ class _StampRun:
 class BootClock:
     """Converts the flight controller's boot time to CLOCK_MONOTONIC; times in ns.
 
-    ``monotonic = middle + (boot - boot of that middle) / rate``, from the fastest round trip of
-    30 s. Two answers whose round trips cannot both be true show that the clock stepped, or that it
-    runs at another rate: a third answer tells which (a simulation at N times real speed runs at
-    rate N). A boot time that runs back, or a clock that is behind after a silence, is a reboot. One
-    stamp far ahead is a damaged one, no new time from which all others then run back.
+    ``monotonic = middle + (boot - boot of that middle) / rate``, from the fastest round trip of 30
+    s. If two round trips contradict each other, the clock has stepped, or it runs at another rate;
+    a third answer decides (a simulation at N times real speed runs at rate N). A boot time that
+    decreases, or a clock that is behind after a silence, is a reboot. A single timestamp far ahead
+    is treated as damaged.
 
-    As long as stamps come that are in time, others are a stranger's, however many: who could make
-    a vehicle seem to reboot would have its origin forgotten, and could forge another.
+    As long as plausible timestamps arrive, implausible ones are attributed to another sender,
+    however many there are. Otherwise a sender could pretend a reboot, and forge another origin
+    after it.
     """
 
     def __init__(self) -> None:

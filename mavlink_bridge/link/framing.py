@@ -43,12 +43,12 @@ class FramingCounters:
 
 
 class VerifyingMavlink(mavlink.MAVLink):
-    """pymavlink's codec, changed to verify the signature before it uses the time stamp.
+    """pymavlink's codec, changed to verify the signature before it uses the timestamp.
 
-    pymavlink stores the time stamp of a frame before checking its signature, so one forged frame
-    from the future would shut out the real sender.
+    pymavlink stores the timestamp of a frame before it checks the signature, so one forged frame
+    from the future would block the real sender.
 
-    window: remembers over restarts how far each stream was.
+    window: remembers over restarts the newest timestamp of each stream.
     """
 
     window: ReplayWindow | None = None
@@ -77,8 +77,9 @@ class VerifyingMavlink(mavlink.MAVLink):
 class FrameReader:
     """Decodes MAVLink messages from byte fragments of any size.
 
-    wanted: message ids to decode; None decodes all of the dialect. `raw` frames of the last `feed`
-    are kept for a recorder. window: of the key's streams; what it has seen before is refused.
+    wanted: message ids to decode; None decodes all of the dialect. `raw` holds the frames of the
+    last `feed` for a recorder. window: of the key's streams; frames that are not newer than it are
+    refused.
     """
 
     def __init__(

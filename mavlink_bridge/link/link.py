@@ -50,7 +50,7 @@ class LinkHandler(Protocol):
     def on_tick(self, link: Link, now_ns: int) -> int:
         """Do what is due; return when to be called next (CLOCK_MONOTONIC ns).
 
-        It is called while the transport is closed, too: what is sent then is dropped and counted.
+        It is called also while the transport is closed. Messages sent then are dropped and counted.
         """
 
 
@@ -74,11 +74,11 @@ class LinkOptions:
     """Settings of a link besides its endpoint. name: of thread and counters. wanted: ids of
     messages to decode, None: all. opener: opens the transport. recorder: records all frames.
 
-    signing_key: 32 bytes, None without signing; window: what outlives a restart of the time stamps
-    that signed messages had. timeout_s: silence after which a stream (TCP, serial) is reopened.
+    signing_key: 32 bytes, None without signing; window: the newest timestamps of signed messages,
+    which survive a restart. timeout_s: silence after which a stream (TCP, serial) is reopened.
 
-    sender, follow_hosts_after_s: UDP, who alone is heard, and after which silence another host may
-    be. stop: what ends the owner thread when it is set.
+    sender: of UDP, the only host that is accepted. follow_hosts_after_s: of UDP, silence after
+    which another host is accepted. stop: ends the owner thread when it is set.
     """
 
     name: str = "link"
@@ -97,8 +97,8 @@ class LinkOptions:
 class Link:
     """A MAVLink 2 link that reconnects by itself.
 
-    Above 200 lines: one thread owns transport, parser, packers and what is unsent, and the order in
-    which its loop serves them keeps positions first on a slow port.
+    Above 200 lines: one thread owns transport, parser, packers and send queue. The order in which
+    its loop serves them gives positions priority on a slow port.
     """
 
     def __init__(

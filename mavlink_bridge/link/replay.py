@@ -24,12 +24,13 @@ Stream = tuple[int, int, int]
 
 
 class ReplayWindow:
-    """Stores the newest time stamps of a link's streams in a file of mode 0600.
+    """Stores the newest timestamps of a link's streams in a file of mode 0600.
 
-    What is written is 2 s ahead of what was seen, so that a second's messages need one write and
-    none of them can be repeated after a kill. After a start our own stamps begin beyond it, and a
-    peer that does not know the time follows them. A thread of its own writes: the disk cannot stop
-    a link. A file that is lost or damaged is reported in the log and restarted.
+    The stored timestamps are 2 s ahead of the received ones. So one write covers the messages of a
+    second, and none of them can be replayed after a kill. After a start our own timestamps begin
+    later than the stored ones, and a peer that does not know the time follows them. A thread of its
+    own writes, so that the disk cannot stop a link. A file that is lost or damaged is reported in
+    the log and restarted.
     """
 
     def __init__(self, path: Path) -> None:

@@ -61,9 +61,9 @@ def _append_to(path: Path) -> RecordFile:
 class TlogRecorder:
     """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
-    Raises `TlogError` when the file cannot be opened, unless the disk is full or failing. What
-    the disk does not take is dropped and counted, and on_failure (called once, in the recorder's
-    thread) is told why. open_file: raises OSError as `Path.open` does.
+    Raises `TlogError` if the file cannot be opened, unless the disk is full or failing. Frames that
+    cannot be written are dropped and counted. on_failure: called once with the reason, in the
+    recorder's thread. open_file: raises OSError as `Path.open` does.
     """
 
     def __init__(

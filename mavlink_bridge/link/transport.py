@@ -102,10 +102,10 @@ class Transport(Protocol):
 
 class UdpTransport:
     """A UDP socket. With `remote`, only that peer is accepted. Without it, every sender is accepted
-    and the last one answered, until `keep_peer` selects one.
+    and the last one is answered, until `keep_peer` selects one.
 
-    The peer may come back from another port of its host (a restart) once it was silent for 3 s;
-    from another host never, unless `follow_hosts_after` says after which silence.
+    The peer may change its port (after a restart) once it was silent for 3 s. Another host is
+    accepted only after a silence of `follow_hosts_after`; if that is None, never.
     """
 
     stream = False

@@ -10,7 +10,7 @@ import threading
 class WakePipe:
     """Wakes a polling thread from any thread; the polling thread reads `read_end`.
 
-    read_end, write_end: descriptors that do not block; void once it is closed.
+    read_end, write_end: non-blocking descriptors; invalid after `close`.
     """
 
     def __init__(self) -> None:

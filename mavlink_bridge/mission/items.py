@@ -52,8 +52,8 @@ _WINGED = frozenset((1, *range(19, 26)))  # an aeroplane, VTOLs
 
 @dataclass(frozen=True)
 class MissionVehicle:
-    """Vehicle that a mission is for, as its file says. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE;
-    has_rally_points: it may return to a rally point instead of home.
+    """Vehicle that a mission is for, as its file states. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE;
+    has_rally_points: whether it may return to a rally point instead of home.
     """
 
     autopilot: int | None = None

@@ -16,8 +16,8 @@ _WINGED_M, _PX4_M, _COPTER_M = 60.0, 80.0, 10.0
 def circle_of(item: MissionItem, vehicle: MissionVehicle) -> tuple[LoiterCircle | None, list[str]]:
     """The circle of a loiter item, None if the vehicle hovers or flies on; and notes as sentences.
 
-    A multirotor of ArduPilot circles for LOITER_TURNS only, PX4's never. A vehicle of unknown kind
-    may have wings.
+    A multirotor with ArduPilot flies a circle for LOITER_TURNS only; with PX4 it flies none. A
+    vehicle of unknown kind is treated as one with wings.
     """
     if item.command not in LOITERS:
         return None, []

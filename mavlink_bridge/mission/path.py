@@ -45,8 +45,9 @@ _ENDS = (*LANDINGS, mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
 @dataclass(frozen=True)
 class MissionPlace:
     """A position on the flight path. name: number among the waypoints, "home" or "take-off"; item:
-    number in the mission; gimbal, speed_m_s: on the leg to it (None: not commanded); after_gap: the
-    path to it is unknown; curved: by a spline; circle: flown about it on arrival.
+    number in the mission; gimbal, speed_m_s: on the leg to it (None: not commanded); after_gap:
+    whether the path to it is unknown; curved: whether the path to it is a spline; circle: circle
+    that is flown about it on arrival.
     """
 
     name: str
@@ -74,8 +75,9 @@ class MissionPlace:
 
 @dataclass(frozen=True)
 class NotJudged:
-    """An item whose effect is unknown before the flight. text: its MAVLink name, number and reason;
-    gimbal_only: it affects a gimbal camera only; flies: it moves the vehicle.
+    """An item whose effect is unknown before the flight. text: its MAVLink name and number, and why
+    the effect is unknown; gimbal_only: whether it affects only a gimbal camera; flies: whether it
+    moves the vehicle.
     """
 
     text: str
@@ -87,10 +89,10 @@ class NotJudged:
 class PlannedMission:
     """A mission as it will be flown.
 
-    home: (latitude, longitude) degrees, if known; path: the places in the order in which they are
-    flown to, from home or the take-off on, returns to home among them; takeoff_height_m: above
-    home, if said; speed_m_s: the last that is said; no_effect: names of commands that change
-    neither the way nor the view; notes: what else one should know, as sentences.
+    home: (latitude, longitude) degrees, if known. path: the positions in flight order, from home or
+    the take-off on, including returns to home. takeoff_height_m: above home, if stated. speed_m_s:
+    the last stated one. no_effect: names of commands that change neither path nor view. notes:
+    further remarks, as sentences.
     """
 
     home: tuple[float, float] | None
@@ -125,7 +127,7 @@ def fly(
 ) -> PlannedMission:
     """Compute the flight path of a mission's items (without home). speed_m_s: default speed.
 
-    MissionError for a place that is none on Earth, or in a frame without global coordinates.
+    MissionError for an impossible position, or one in a frame without global coordinates.
     """
     flight = _Flight(items, home, vehicle, speed_m_s)
     flight.run()

@@ -25,7 +25,7 @@ _Self = TypeVar("_Self", bound="VehicleClient")
 class VehicleClient:
     """Finds the autopilot and keeps its link active by heartbeats. A context manager.
 
-    Raises `ConnectionSilentError` when no heartbeat comes. Subclasses take their messages in
+    Raises `ConnectionSilentError` if no heartbeat arrives. A subclass receives its messages in
     `take`, which is called under the lock of `wait_for`.
     """
 

@@ -317,7 +317,7 @@ def _source_switch_of_px4(config: BridgeConfig) -> list[DoctorFinding]:
 def repair(config: BridgeConfig, findings: Iterable[DoctorFinding]) -> bool:
     """Write the value of each `DoctorFinding.fix` in order; True if a reboot is needed.
 
-    The order matters: VISO_TYPE brings the other VISO parameters into being.
+    The order matters: the other VISO parameters exist only after VISO_TYPE is set.
     """
     reboot = False
     with ParameterClient(config) as client:

@@ -29,8 +29,8 @@ Read = Callable[[str], float | None]
 class ParameterRule:
     """A parameter's requirement. names: the parameter and its older names, newest first.
 
-    allowed: values that are right, the first being the one to write; None with `minimum` or
-    `maximum` for a bound. required: a flight fails without it; otherwise it is advice.
+    allowed: correct values, the first of which is written; None if `minimum` or `maximum` gives a
+    bound. required: whether a flight fails without it; otherwise it is advice.
     """
 
     names: tuple[str, ...]
@@ -101,9 +101,9 @@ def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[ParameterRule
 def arming_rules(config: BridgeConfig, source_set: int, read: Read) -> list[ParameterRule]:
     """Rules for arming on GNSS while VISO_TYPE is set and no vision arrives yet.
 
-    ArduPilot refuses to arm then ('VisOdom: not healthy'), so in shadow mode always. A vehicle that
-    takes off on vision (source set 1) keeps the check. ARMING_CHECK names the checks to do,
-    ARMING_SKIPCHK (4.7 and later) those to leave out.
+    ArduPilot then refuses to arm ('VisOdom: not healthy'). In shadow mode this is always so. A
+    vehicle that takes off on vision (source set 1) keeps the check. ARMING_CHECK names the checks
+    to do, ARMING_SKIPCHK (4.7 and later) those to leave out.
     """
     gps_input = config.injection.message == "gps_input"
     if config.injection.gps_id == 0 if gps_input else source_set == 1:
@@ -231,7 +231,7 @@ def missing_feature(config: BridgeConfig, read: Read, *, px4: bool) -> tuple[str
     """A parameter whose absence shows that the firmware was built without a required feature, and
     the build option that adds it; None if nothing is missing.
 
-    Boards with 1 MB of flash come without it. No capability flag of MAVLink tells.
+    Firmware for boards with 1 MB of flash lacks it. MAVLink has no capability flag for it.
     """
     message = config.injection.message
     parameters: tuple[str, ...]

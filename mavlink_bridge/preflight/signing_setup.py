@@ -38,8 +38,8 @@ class _KeyGiver(VehicleClient):
 def install_key(connection: str, key_file: Path) -> bool:
     """Send the key of a file to the autopilot; True if its heartbeat is then signed with it.
 
-    False on ArduPilot's USB port, which stays unsigned, and where another key was in force before.
-    Raises `BridgeStateError` when the vehicle is armed (ArduPilot would ignore the key).
+    False on ArduPilot's USB port, which stays unsigned, and if the autopilot already used another
+    key. Raises `BridgeStateError` if the vehicle is armed, because ArduPilot then ignores the key.
     """
     key = load_key(key_file)
     config = BridgeConfig(connection=connection)

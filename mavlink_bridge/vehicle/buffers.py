@@ -48,8 +48,8 @@ class GimbalSample:
     """One gimbal message: attitude to the horizontal frame that points north (earth_frame) or to
     the nose.
 
-    earth_frame: yaw is from true north, else from the vehicle's heading. device: component and
-    gimbal_device_id that it is of.
+    earth_frame: whether yaw counts from true north; otherwise it counts from the vehicle's heading.
+    device: component and gimbal_device_id of the sender.
     """
 
     time_ns: int
@@ -233,9 +233,9 @@ class InertialBuffer:
 class GimbalBuffer:
     """History of one gimbal's attitude, from the best source available.
 
-    The first gimbal that is heard is followed as long as it speaks: the angles of two, mixed, are
-    those of none. device: the (component, gimbal_device_id) to follow instead, 0 for any. others:
-    which were heard besides, eight at most.
+    It uses the first gimbal that sends, as long as it sends, because mixed angles of two gimbals
+    are wrong. device: the (component, gimbal_device_id) to use, 0 for any. others: the other
+    gimbals that have sent, eight at most.
     """
 
     def __init__(self, device: tuple[int, int] = (0, 0)) -> None:

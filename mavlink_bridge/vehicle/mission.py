@@ -61,12 +61,12 @@ def item_of(message: Any) -> MissionItem:
 
 
 class MissionWatch:
-    """Downloads the mission when it is first wanted, and again when it may have changed.
+    """Downloads the mission when it is first needed, and again when it may have changed.
 
-    ArduPilot does not tell that a mission was changed: the number of items is asked for every ten
-    seconds, and all of it is read again when that number or the mode changes, or the vehicle arms
-    or disarms. One request is under way at a time. Runs in the link's thread; `waypoints` and
-    `wanted` are anybody's.
+    ArduPilot does not report changes of the mission. So the number of items is requested every ten
+    seconds. The whole mission is read again when this number, the mode or the armed state changes.
+    One request is under way at a time. Runs in the link's thread; `waypoints` and `wanted` may be
+    used from any thread.
     """
 
     def __init__(self, component: int) -> None:

@@ -111,8 +111,7 @@ def _distance_m(a: Origin, b: Origin) -> float:
 class OriginKeeper:
     """Reads the vehicle's EKF origin, and sets the configured one only if there is none.
 
-    A second origin is silently ignored by ArduPilot, so what GPS_GLOBAL_ORIGIN says is the truth,
-    whatever was sent.
+    ArduPilot silently ignores a second origin, so only GPS_GLOBAL_ORIGIN shows the origin in use.
     """
 
     def __init__(self, configured: OriginConfig | None) -> None:
@@ -132,8 +131,8 @@ class OriginKeeper:
     def on_origin(self, message: Any, *, armed: bool) -> Alert | None:
         """Process GPS_GLOBAL_ORIGIN; returns an alert if the origin is new or changed.
 
-        armed: an origin that is known is kept then. No EKF moves its origin in flight, and who
-        forged one would drag every position by its distance.
+        armed: a known origin is then kept. No EKF moves its origin in flight, and a forged origin
+        would shift every position.
         """
         read = Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
         self.moved_m = None

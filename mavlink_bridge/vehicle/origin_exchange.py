@@ -28,14 +28,14 @@ class OriginExchange:
         config: BridgeConfig,
         tracker: VehicleTracker,
         commander: Commander,
-        teller: StatusNotifier,
+        notifier: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self._keeper = OriginKeeper(config.origin)
         self._component = config.companion_component
         self._tracker = tracker
         self._commander = commander
-        self._teller = teller
+        self._notifier = notifier
         self._counters = counters
         self._told: dict[AlertId, int] = {}
 
@@ -51,11 +51,11 @@ class OriginExchange:
         moved_m = self._keeper.moved_m
         if moved_m is not None:
             self._counters["origins_refused"] += 1
-            self._teller.tell("origin", alert(AlertId.ORIGIN_REFUSED, metres=moved_m))
+            self._notifier.notify("origin", alert(AlertId.ORIGIN_REFUSED, metres=moved_m))
         self._tracker.set_origin(self._keeper.origin)
         if news is not None and time_ns - self._told.get(news.id, -_AGAIN_NS) >= _AGAIN_NS:
             self._told[news.id] = time_ns
-            self._teller.report(news)
+            self._notifier.report(news)
 
     def forget(self) -> None:
         """Drop the origin, because it may have changed; nothing relative to it is sent."""

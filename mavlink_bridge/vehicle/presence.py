@@ -23,8 +23,8 @@ _NEWS = {
 class VehicleWatch:
     """Reports found and lost vehicles. Every link calls `check` at each tick.
 
-    report: tell the operator. first: called after the first of these alerts.
-    clock: CLOCK_MONOTONIC, ns.
+    report: reports an alert to the operator. first: called after the first of these alerts. clock:
+    CLOCK_MONOTONIC, ns.
     """
 
     def __init__(

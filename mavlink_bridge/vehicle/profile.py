@@ -24,10 +24,10 @@ class FirmwareProfile:
 
     covariance: how it turns the message's diagonal into an error (see `covariance_entry`).
     max_delay_ms: age beyond which a measurement cannot be fused any more.
-    messages: the injections it accepts. odometry_frame: MAV_FRAME it accepts for position.
-    least_lag: the delay parameter stands for the least lag of its last messages; it maps the others
-    by their stamps (ArduPilot's AP_HAL JitterCorrection, over 100 messages). position_delta: it
-    holds a relative position by VISION_POSITION_DELTA alone.
+    messages: the injection messages that it accepts. odometry_frame: MAV_FRAME that it accepts for
+    positions. least_lag: whether its delay parameter is the smallest lag of the last 100 messages;
+    it then dates the other messages by their timestamps (ArduPilot's AP_HAL JitterCorrection).
+    position_delta: whether it keeps a relative position with VISION_POSITION_DELTA alone.
     """
 
     name: str

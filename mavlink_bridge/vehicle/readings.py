@@ -72,8 +72,9 @@ class Arming:
         self._armed_ns = 0  # when it last said so
 
     def heard(self, said: bool, time_ns: int) -> bool:
-        """Process a heartbeat's armed flag; returns the state. Disarmed needs `_DISARMED_NS`
-        without an armed heartbeat, so that a forged one unlocks nothing in flight.
+        """Process a heartbeat's armed flag; returns the state. The state becomes disarmed only
+        after `_DISARMED_NS` without an armed heartbeat, so that a forged heartbeat unlocks nothing
+        in flight.
         """
         self.turns += said != self._said
         self._said = said
@@ -86,9 +87,9 @@ class Arming:
 class VehicleReadings:
     """Newest values and interpolation buffers of the telemetry; the tracker's lock guards it.
 
-    globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin. gimbal:
-    component and device whose angles count, 0 for any. impostors: messages of the vehicle's ids
-    that name another make or firmware than it has.
+    globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED position from the origin.
+    gimbal: component and device whose angles are used, 0 for any. impostors: number of messages
+    with the vehicle's ids that state another firmware or vehicle type.
 
     Above 200 lines: one short method for each of its messages.
     """
@@ -300,9 +301,10 @@ class VehicleReadings:
         self.state = replace(self.state, pressure_altitude_m=altitude, pressure_time_ns=time_ns)
 
     def _distance(self, m: Any, time_ns: int) -> None:
-        """Of a sensor that looks down. What is out of its range, as it says itself, or marked as
-        invalid is no reading: the one before grows old. Of two sensors the first one that is heard
-        counts as long as it measures: their distances, mixed, would be jumps of the ground.
+        """Process DISTANCE_SENSOR of a sensor that looks down. A value out of the sensor's own
+        range, or marked as invalid, is ignored, and the previous one ages. Of two sensors the first
+        one is used as long as it measures, because alternating distances would look like steps of
+        the ground.
         """
         in_range = max(m.min_distance, 1) <= m.current_distance < m.max_distance
         invalid = getattr(m, "signal_quality", 0) == _INVALID_SIGNAL

@@ -31,11 +31,11 @@ class TimeSync:
         self,
         tracker: VehicleTracker,
         component: int,
-        teller: StatusNotifier,
+        notifier: StatusNotifier,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._tracker, self._clock = tracker, clock
-        self._teller = teller
+        self._notifier = notifier
         self._component = component
         self._sent: dict[int, int] = {}
         self._next_ns = 0
@@ -75,7 +75,7 @@ class TimeSync:
         if answered_ns is not None:
             is_silent = now_ns - max(answered_ns, self._asking_ns) > _UNANSWERED_NS
             problem = alert(AlertId.TIMESYNC_UNANSWERED) if is_silent else None
-            self._teller.tell("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
+            self._notifier.notify("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
 
     def waiting(self) -> dict[str, int]:
         """Number of unanswered requests."""

@@ -31,7 +31,7 @@ _OLD_NS = 2_000_000_000
 class VehicleTracker:
     """Processes one vehicle's messages. `handle` runs in the link's thread; other methods in any.
 
-    gimbal: component and gimbal_device_id whose angles count, 0 for any.
+    gimbal: component and gimbal_device_id whose angles are used, 0 for any.
     """
 
     def __init__(

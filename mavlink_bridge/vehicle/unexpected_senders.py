@@ -27,12 +27,12 @@ class UnexpectedSenderMonitor:
         self,
         config: BridgeConfig,
         tracker: VehicleTracker,
-        teller: StatusNotifier,
+        notifier: StatusNotifier,
         counters: Counter[str],
     ) -> None:
         self._config = config
         self._tracker = tracker
-        self._teller = teller
+        self._notifier = notifier
         self._counters = counters
         self._twins = DuplicateSystemIdMonitor()
         self._turns = (0, 0)  # arming's at a time
@@ -43,7 +43,7 @@ class UnexpectedSenderMonitor:
         if message.get_type() != "HEARTBEAT" or not link.system_id:
             return
         system, component = message.get_srcSystem(), message.get_srcComponent()
-        config, tell = self._config, self._teller.tell
+        config, tell = self._config, self._notifier.notify
         ours = (config.localizer_component, config.companion_component, config.camera_component)
         if system == link.system_id and component in ours:
             tell("twin", alert(AlertId.SECOND_COMPANION, component=component))
@@ -59,25 +59,25 @@ class UnexpectedSenderMonitor:
         """Detect other hosts, and two vehicles with the same ids."""
         if link.stranger:
             ignored = alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
-            self._teller.tell("foreign", ignored)
+            self._notifier.notify("foreign", ignored)
         others = self._tracker.other_gimbals
         if others and not self._config.camera.gimbal_component:
             component, device = others[0]
             ignored = alert(AlertId.GIMBAL_IGNORED, component=component, device=device)
-            self._teller.tell("gimbals", ignored)
+            self._notifier.notify("gimbals", ignored)
         self._check_arming(link, now_ns)
         clock = self._tracker.clock
         self._check_answers(clock.contradictions, now_ns)
         ran_back = self._twins.two(now_ns, clock.strays + clock.reboots)
         if ran_back or self._tracker.impostors:
             twins = alert(AlertId.DUPLICATE_SYSTEM_ID, system=link.system_id)
-            self._teller.tell("twins", twins)
+            self._notifier.notify("twins", twins)
 
     def _check_answers(self, now: int, now_ns: int) -> None:
         """TIMESYNC answers far from the vehicle's own time stamps come from another sender."""
         lies, since_ns = self._lies
         if now - lies >= _LIES:
-            self._teller.tell("answers", alert(AlertId.TIMESYNC_CONTRADICTS))
+            self._notifier.notify("answers", alert(AlertId.TIMESYNC_CONTRADICTS))
         if now - lies >= _LIES or now_ns - since_ns > _TURNS_IN_NS:
             self._lies = (now, now_ns)
 
@@ -87,6 +87,6 @@ class UnexpectedSenderMonitor:
         now = self._tracker.arming.turns
         if now - turns >= _TURNS:
             forged = alert(AlertId.ARMING_ALTERNATES, system=link.system_id)
-            self._teller.tell("arming", forged)
+            self._notifier.notify("arming", forged)
         if now - turns >= _TURNS or now_ns - since_ns > _TURNS_IN_NS:
             self._turns = (now, now_ns)

@@ -22,8 +22,8 @@ _ROLLING_MARGIN_PX = 8.0  # rows that are exposed before and after look past the
 class RenderedLens:
     """A distorted `camera` and the `pinhole` to render for it; they share the optical centre.
 
-    rays: (H, W, 2) float32, x / z and y / z of every pixel. maps: look-up for ``cv2.remap`` from
-    the pinhole's image to the camera's, fixed-point.
+    rays: (H, W, 2) float32, x / z and y / z of every pixel. maps: fixed-point maps for
+    ``cv2.remap`` from the pinhole's image to the camera's.
     """
 
     camera: Camera

@@ -40,9 +40,9 @@ class PictureFault:
     """A video fault that lasts until the next one.
 
     covered: a lens cap. blinded: cloud or fog. darkens: the light halves every `seconds`, with a
-    gain of up to 16. frozen: the last frame is repeated with new time
-    stamps, encoded anew. stamped_late: the time stamp is `seconds` after the exposure. late: sent
-    `seconds` late and stamped when sent, as by a camera that ignores its own latency. silent:
+    gain of up to 16. frozen: the last frame is encoded again and sent with new timestamps.
+    stamped_late: the timestamp is `seconds` after the exposure. late: the frame is sent `seconds`
+    late and its timestamp is that of sending, as of a camera that ignores its own latency. silent:
     nothing is sent.
     """
 

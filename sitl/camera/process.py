@@ -50,8 +50,8 @@ class WorldCameraConfig:
     """Configuration of the world camera's process, pickled to it.
 
     cache: tiles of the live world. origin: of the map's ENU frame, used for true poses and moving
-    objects. log: file for the true pose of every frame. threads: of the rasteriser. targets:
-    reported by the `Detector` to the address `detections`.
+    objects. log: file for the true pose of every frame. threads: number used by the rasteriser.
+    targets: objects that the `Detector` reports to the address `detections`.
     """
 
     cache: Path

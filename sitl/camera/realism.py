@@ -17,10 +17,10 @@ _WAVES = 3
 class CameraRealism:
     """Imperfections of the simulated camera; the defaults are a perfect one.
 
-    readout_ms: from the first row's exposure to the last one's. vibration_deg: RMS per axis.
-    auto_exposure: the gain follows the image's brightness. supersample: rendered pixels per pixel
-    and axis. packet_loss: share of lost datagrams. stamp_offset_ms, stamp_jitter_ms: error of the
-    time stamps, constant and standard deviation.
+    readout_ms: time between the exposures of the first and the last row. vibration_deg: RMS per
+    axis. auto_exposure: whether the gain follows the image's brightness. supersample: rendered
+    pixels per pixel and axis. packet_loss: share of lost datagrams. stamp_offset_ms,
+    stamp_jitter_ms: constant error of the timestamps, and its standard deviation.
     """
 
     readout_ms: float = 0.0

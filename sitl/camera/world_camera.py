@@ -50,7 +50,7 @@ HAZY_AFTERNOON = Appearance(
 class Exposure:
     """A rendered frame and its truth. image: (H, W, 3) uint8, distorted, with noise, blur and
     weather; depth: (H, W) m along the optical axis, distorted likewise. world_from_camera: at
-    time_ns, the exposure of the middle row; pose_of_row: of any row.
+    time_ns, the exposure of the middle row; pose_of_row: gives the pose of any row.
     """
 
     image: Image
@@ -164,8 +164,8 @@ class FrameLog:
     def add(
         self, sequence: int, time_ns: int, world_from_camera: Pose, true_ns: int | None = None
     ) -> None:
-        """Append one frame; it is on disk when this returns. time_ns: as the stream says, by which
-        estimates are matched; true_ns: of the exposure, where that is another.
+        """Append one frame; it is on disk when this returns. time_ns: by the stream, used to match
+        estimates; true_ns: exposure time, if it differs.
         """
         t, q = world_from_camera.translation, quaternion_from_matrix(world_from_camera.rotation)
         row = (time_ns, sequence, *(f"{x:.5f}" for x in t), *(f"{x:.9f}" for x in q))

@@ -53,7 +53,7 @@ def frame_errors(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -
 def localization_summary(errors: FrameErrors) -> LocalizationMetrics:
     """Summarize the errors of the processed frames in the columns of the PiLoT paper.
 
-    fps is localized frames per second of flight, not the throughput of the machine.
+    fps: localized frames per second of flight. It is not the throughput of the machine.
     """
     done = errors.processed
     localized = int(np.isfinite(errors.translation_m).sum())

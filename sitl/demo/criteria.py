@@ -34,7 +34,7 @@ class Criterion:
 
 @dataclass(frozen=True)
 class FlightFigures:
-    """Measured values of a flight that are judged. ekf_m: horizontal, in the map's frame; fixed_m:
+    """Measured values of a flight that are checked. ekf_m: horizontal, in the map's frame; fixed_m:
     3-D errors of stationary targets; inside, inside_level: per cent of fixes within their 95 %
     bound, and within their protection level; fixed_inside: per cent of stationary targets'
     positions within their 95 % bound.

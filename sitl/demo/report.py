@@ -50,14 +50,14 @@ from sitl.demo.scenario import Scenario
 class FlightReport:
     """The flight's figures over the span without GNSS.
 
-    localizer: the paper's columns over processed frames; localizer_m: of its accepted estimates'
-    errors. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
-    against where GNSS would have it; the map lies map_shift_m beside GNSS. inside_bound: per cent
-    of fixes within their own 95 % ellipse; inside_level: within their protection level, of which
-    protection_m are the horizontal ones. fixed_inside: per cent of the standing targets' fixes
-    within their own 95 % ellipse. map_kind: what the map can show. targets: name to 3-D error, in
-    the map's frame. won: the flight in one line; broken: why it was not flown to its end; slow:
-    what the computer did not keep up with.
+    localizer: the paper's columns over processed frames; localizer_m: errors of the accepted
+    estimates. ekf_in_map_m: EKF errors in the map's frame; ekf_horizontal_m: EKF errors in GNSS's
+    frame; the map is shifted by map_shift_m against GNSS. inside_bound: per cent of fixes within
+    their own 95 % ellipse; inside_level: within their protection level; protection_m: the
+    horizontal protection levels. fixed_inside: per cent of the standing targets' fixes within their
+    own 95 % ellipse. map_kind: kind of the map's data. targets: 3-D error by name, in the map's
+    frame. won: the flight in one line; broken: why it ended early; slow: what the computer was too
+    slow for.
     """
 
     won: str

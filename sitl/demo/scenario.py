@@ -38,8 +38,9 @@ class ScenarioLeg(StrictModel):
 
 
 class ErrorSpec(StrictModel):
-    """Differences between deployment file and aircraft: standard deviations (map_shift_m: least and
-    most) from which each flight draws. The defaults are the residuals of a careful calibration.
+    """Differences between deployment file and aircraft, as standard deviations from which each
+    flight draws (map_shift_m: smallest and largest value). The defaults are the residuals of a
+    careful calibration.
     """
 
     focal_percent: float = Field(0.1, ge=0, le=5, description="of the focal length")

@@ -28,8 +28,8 @@ def record_sequence(
     """Render frames at the given times and write them with their true poses; returns their number.
 
     Times outside the track are left out. calibrated: camera model to write, if it differs from the
-    true one. frame: ENU frame of the track. stamped: time stamp of a true time, written to
-    ``images/timestamps.txt``.
+    true one. frame: ENU frame of the track. stamped: gives the timestamp of a true time, which is
+    written to ``images/timestamps.txt``.
     """
     images = out / "images"
     images.mkdir(parents=True, exist_ok=True)

@@ -42,10 +42,10 @@ _TRIES = 80
 class GroundLink:
     """A link to a vehicle at a MAVLink endpoint ("tcp:127.0.0.1:5760"), with its record.
 
-    answers: what the autopilot sends, for who waits for it.
-    Seconds are simulated seconds, unless they are said to be wall time.
-    speedup: simulated seconds per real second, as the vehicle was started.
-    alive: asked while waiting; it raises when the vehicle has died (`VehicleProcess.check`).
+    answers: messages of the autopilot, for callers that wait for one. Seconds are simulated
+    seconds, unless they are called wall time. speedup: simulated seconds per real second, as the
+    vehicle was started. alive: called while waiting; it raises if the vehicle has died
+    (`VehicleProcess.check`).
     """
 
     def __init__(

@@ -27,7 +27,7 @@ _SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 class Pilot:
     """Flies a vehicle. link: commands; record: received data; missions: mission protocol.
 
-    The arguments are those of `GroundLink`; as a context it is connected.
+    The arguments are those of `GroundLink`. It connects as a context manager.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ class StatusText:
 class TextLog:
     """Status texts in order of their first chunks; one thread fills it, any may read `lines`.
 
-    A chunk that is missing leaves three dots. An id may be used again for another line.
+    A missing chunk is shown as three dots. An id may be used again for another text.
     """
 
     def __init__(self) -> None:

@@ -47,8 +47,8 @@ class VehicleRecord:
     """Stores a vehicle's messages; one thread writes, any thread reads.
 
     latest: the autopilot's newest message of each type; ekf_flags: EKF_STATUS_FLAGS; reached: the
-    mission items, in order; origin: of the EKF; mode: None before the first heartbeat,
-    which tells is_px4.
+    mission items reached, in order; origin: the EKF's origin; mode: None before the first
+    heartbeat; is_px4: known from the first heartbeat.
     """
 
     def __init__(self, speedup: float) -> None:

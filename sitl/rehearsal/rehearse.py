@@ -36,7 +36,8 @@ class Rehearsal:
 
 
 def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Scenario) -> Rehearsal:
-    """Prepare a flight over the tile cache `cache`. live: the cache that the camera sees, else it.
+    """Prepare a flight over the tile cache `cache`. live: the cache that the camera sees, by
+    default the same.
 
     The scenario's weather, camera and errors are kept; its legs are replaced by the mission's, or
     by a triangle about the map's middle.

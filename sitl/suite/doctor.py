@@ -24,8 +24,8 @@ class DoctorError(SimulationError):
 def run_doctor(config: BridgeConfig) -> Doctor:
     """Run the doctor, `companion doctor --fix --yes`, and the doctor again.
 
-    The exit codes are those of the flight controller's part: a suite has neither map nor camera,
-    which `companion doctor` finds missing as well.
+    The exit codes are those of the flight controller's checks, because a suite has neither map nor
+    camera, which `companion doctor` would report as missing.
     """
     before = examine(config)
     found = tuple(f.name for f in before.findings if not f.ok and f.fix is not None)

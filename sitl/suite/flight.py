@@ -46,9 +46,9 @@ def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
 
 
 class _CaseFlight:
-    """The running of one scenario; everything it opens is closed by `stack`.
+    """The flight of one scenario; `stack` closes everything that it opens.
 
-    Above 200 lines: the steps of a flight, read from top to bottom, share all that is open.
+    Above 200 lines: the steps of a flight, read from top to bottom, use the same open objects.
     """
 
     def __init__(self, case: Case, vehicle: VehicleProcess, stack: ExitStack, seed: int) -> None:

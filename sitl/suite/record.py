@@ -67,12 +67,13 @@ class Doctor:
 
 @dataclass
 class CaseRecord:
-    """errors: (seconds, north, east) of every EKF position against the truth of its time.
+    """Record of one scenario's flight. errors: (seconds, north, east) of every EKF position against
+    the truth of its time.
 
-    refusals: texts of the last refused arming; None when nobody tried or it was accepted.
-    pace: simulated seconds per second that it should have been, at the slowest over ten seconds;
-    below 1 the machine was too slow, and the autopilot's clock ran slow against the bridge's.
-    stall_s: what the vehicle fell behind, at most, within one second.
+    refusals: texts of the last refused arming; None if arming was not tried or accepted. pace:
+    lowest ratio of simulated to intended seconds over ten seconds; below 1 the machine was too
+    slow, and the autopilot's clock ran slow against the bridge's. stall_s: largest delay of the
+    vehicle within one second.
     """
 
     errors: list[tuple[float, float, float]] = field(default_factory=list)

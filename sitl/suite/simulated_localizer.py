@@ -30,11 +30,11 @@ Vector = tuple[float, float, float]
 class FixModel(BaseModel):
     """Rate, noise, latency and faults of simulated fixes.
 
-    velocity_sigma_mps: None where no velocity is measured. rotation_deg turns the whole vision
-    frame (positions and yaw) about turns_about_m (north, east of home), yaw_error_deg the yaw
-    alone. frozen: the truth of the moment it began, again and again under fresh time stamps, as
-    from a picture that hangs; it is registered to a fifth of `sigma_m`, since its errors are always
-    the same. odometry_scale: odometry carries the position on, with such a scale error (a share).
+    velocity_sigma_mps: None if no velocity is measured. rotation_deg rotates the whole vision frame
+    (positions and yaw) about turns_about_m (north, east of home); yaw_error_deg rotates the yaw
+    alone. frozen: the true position at its start is sent again with new timestamps, as of a frozen
+    frame, with a fifth of `sigma_m`, because the error of such a frame is constant. odometry_scale:
+    odometry continues the position with this relative scale error.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -43,8 +43,8 @@ class VehicleProcess(ABC):
     gcs_endpoint and companion_endpoint ("tcp:127.0.0.1:PORT") are its first two serial ports;
     spare_endpoint is a third, free for an independent observer.
 
-    It runs in a temporary folder that is removed with its end, however that came. What it prints
-    goes to a file there, or to `log`, which stays; errors quote the end of it.
+    It runs in a temporary folder that is removed at its end, also after a crash. Its output goes to
+    a file there, or to `log`, which stays; errors quote the end of it.
     """
 
     kind: VehicleKind
@@ -241,9 +241,10 @@ class VehicleProcess(ABC):
 
 @contextlib.contextmanager
 def _signals_wait() -> Iterator[None]:
-    """Interrupts come after the block: in the middle of it they would leave what nobody knows of.
+    """Delay signals until the end of the block, because an exception within it would leave
+    processes that nobody ends.
 
-    They are raised on the main thread alone; their blocking would be inherited by the vehicle.
+    Signals raise on the main thread only. Blocking them instead would be inherited by the vehicle.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -268,9 +269,10 @@ def _write_parameters(path: Path, parameters: dict[str, float]) -> None:
 
 
 def _end_with_us(pid: int) -> subprocess.Popen[bytes]:
-    """A shell that ends the process once we are gone, however that came: its input ends then.
+    """A shell that ends the vehicle's process when this process has ended in any way, because the
+    shell's input ends then.
 
-    A parent-death signal would come with the end of the thread that started the process.
+    A parent-death signal would already be sent at the end of the thread that started the process.
     """
     return subprocess.Popen(
         ["/bin/sh", "-c", f"read -r _; kill {pid}"],

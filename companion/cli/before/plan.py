@@ -52,9 +52,9 @@ def plan_command(
     """Forecast a mission over its map. Exit code 1: a leg fails, or not all was judged."""
     from companion.planning import flown as check
     from companion.planning import page, pictures
-    from companion.planning.judge import MissionLimits
     from companion.planning.mission import read_mission
     from companion.planning.plan import Question, aim_of, make_plan
+    from companion.planning.verdicts import MissionLimits
     from companion.preflight.map_pin import map_hash
     from localizer.forecast.visit import FORECAST_CONDITIONS
     from localizer.map.cache.cache import TileCache
@@ -93,7 +93,7 @@ def plan_command(
     (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
     _print("to be bridged", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
-    _print("what would do instead", page.INSTEAD_HEADINGS, page.instead_rows(plan))
+    _print("what would do instead", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))
     if legs:
         _print("flown", check.FLOWN_HEADINGS, [leg.row for leg in legs])
         Console().print(check.flown_words(legs), highlight=False, soft_wrap=True)

@@ -65,9 +65,9 @@ def try_command(
 def _tell_map(flight: RecordedFlight) -> None:
     from companion.trial.wanted_map import wanted_map
 
+    _tell_notes(flight, flight.notes)
     wanted = wanted_map(flight)
     out = Console()
-    _tell_notes(flight, flight.notes)
     out.print(
         f"{len(flight.frames)} frames, {flight.located} with a position; no map is given. "
         f"{wanted.sentence}.",

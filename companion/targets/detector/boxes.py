@@ -40,7 +40,7 @@ def layout_of(
     shape: tuple[int, ...], classes: int | None, size: tuple[int, int]
 ) -> tuple[Layout, int]:
     """(layout, number of classes) by the output's shape; `DetectorError` if it fits no layout, or
-    two. classes: number by the network's names; size: its input, width, height.
+    two. classes: number of class names of the network; size: its input, width, height.
     """
     if len(shape) != 3 or shape[0] != 1:
         raise DetectorError(f"an output of shape {shape} is none of a YOLO network")

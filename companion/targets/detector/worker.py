@@ -37,9 +37,9 @@ _MOST_AWAY_M = 5000.0
 class BoxDetector:
     """Detects objects in the camera's frames and passes them on as detections.
 
-    on_detection: takes each; must not block. report: tells the operator. A model
-    that cannot be loaded, or fails three times in a row, ends the detector and not the flight.
-    looked, seen, failed count pictures, boxes and errors.
+    on_detection: takes each detection; must not block. report: reports an alert to the operator. A
+    model that cannot be loaded, or fails three times in a row, ends the detector; the flight
+    continues. looked, seen, failed: numbers of frames, boxes and errors.
     """
 
     def __init__(

@@ -38,8 +38,8 @@ class _Node:
 def _graft(root: SourceNode, records: dict[int, TileRecord]) -> _Node:
     """The tree with records, pruned where a tile is missing.
 
-    Where a child of a REPLACE node could not be imported, nothing below the node is used: its
-    coarser surface is shown instead of a hole.
+    If a child of a REPLACE node could not be imported, all children of this node are left out: its
+    coarser surface is shown, and there is no hole.
     """
     first: dict[int, int] = {}
     key = 0

@@ -19,8 +19,8 @@ _MOST_OUTSIDE = 0.5  # of the content's extent on the ground
 def require_upright(
     leaves: Iterable[StoredTile], up_axis: str | None, source: str, rules: ImportRules
 ) -> list[str]:
-    """Warnings if most of the finest tiles' surface does not face up; `MapSourceError` unless that
-    is trusted. up_axis: the one that was used, None if the source has none.
+    """Warnings if most of the finest tiles' surface does not face up; `MapSourceError` unless the
+    user accepts this. up_axis: the axis that was used, None if the source has none.
     """
     if up_axis is None:  # heights, which can only face up
         return []

@@ -25,9 +25,9 @@ def heights_of(
 ) -> tuple[float, VerticalDatum, list[str]]:
     """Geoid separation, vertical datum, and warnings.
 
-    separation_m, datum: as given. The source's own statement, the given number and EGM96 must
-    agree; what nobody says is computed (the separation) or an error (the datum).
-    `GeoreferenceError` if the datum is unknown or its separation cannot be found.
+    separation_m, datum: given by the user. The source's own statement, the given number and EGM96
+    must agree. A separation that is neither given nor stated is computed; an unknown datum is an
+    error. `GeoreferenceError` if the datum is unknown or its separation cannot be found.
     """
     if datum not in (None, "ellipsoidal", "amsl"):
         raise GeoreferenceError(f"vertical datum {datum!r}: ellipsoidal and amsl are known")

@@ -88,8 +88,8 @@ def tiles_of(root: SourceNode) -> Iterator[TileSource]:
 def import_all(
     root: SourceNode, job: ImportJob, workers: ImportWorkers, progress: Progress
 ) -> dict[int, TileRecord]:
-    """Records of every source tile, by its place in `tiles_of` order. progress: called here, in the
-    caller's thread, with the number of tiles that are done and of all. `MapSourceError` if no tile
+    """Records of every source tile, by its place in `tiles_of` order. progress: called in the
+    caller's thread with the number of finished tiles and of all tiles. `MapSourceError` if no tile
     has content.
     """
     records: dict[int, TileRecord] = {}

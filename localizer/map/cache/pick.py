@@ -66,10 +66,10 @@ def pick(
     """Surface points (N, 3) in world metres under pixels (N, 2) of a rendered view, and a mask of
     those that exist.
 
-    1/z is linear in the image on a plane, so it is interpolated bilinearly. Where neighbouring
-    depths jump (a roof's edge, the skyline) that would invent points in mid-air: there the nearest
-    pixel's depth is taken. With `meshes` (what the view was drawn from) every ray is intersected
-    with their triangles instead, exactly; about 0.3 ms a pixel.
+    On a plane 1/z is linear in the image, so it is interpolated bilinearly. At a depth step (a
+    roof's edge, the skyline) this would give points in mid-air, so the nearest pixel's depth is
+    taken there. With `meshes`, from which the view was rendered, each ray is intersected with their
+    triangles. This is exact and takes about 0.3 ms a pixel.
     """
     pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
     rays = view.camera.rays(pixels)
@@ -112,8 +112,8 @@ def _nearest(
 def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) -> BundleHits:
     """The nearest hits of rays from `origin` (3,) with similar directions (N, 3).
 
-    For N rays about as fast as `cast_rays` for one: a triangle on the far side of one of the
-    bundle's four bounding planes is passed over for all of them.
+    It takes about as long as one ray of `cast_rays`: a triangle outside one of the bundle's four
+    bounding planes is skipped for all rays.
     """
     nearest, normals = _nearest_of_bundle(meshes, origin, directions, 0.0)
     missed = ~np.isfinite(nearest)

@@ -14,8 +14,9 @@ from localizer.map.cache.tile import TileMesh
 class ResidentNodes:
     """Nodes in memory. Callers hold the streamer's lock.
 
-    sizes: bytes of each node (N,), in memory or not; resident: which are (N,); bytes: of those.
-    evicted: what left and is not yet freed; evictions: how many nodes ever did.
+    sizes: bytes of each node (N,), whether in memory or not; resident: (N,), whether it is in
+    memory; bytes: sum of the nodes in memory. evicted: removed nodes that are not yet freed;
+    evictions: number of removals so far.
     """
 
     def __init__(self, sizes: NDArray[np.int64], budget: int) -> None:

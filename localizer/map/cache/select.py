@@ -204,8 +204,9 @@ def _select(  # type: ignore[no-untyped-def]
 ):
     """Fills nodes with (wanted, shown, requests); returns their counts and whether a hole is left.
 
-    Nodes are in breadth-first order, so passes over the arrays take the place of recursion. The GIL
-    is kept: the walk takes a fraction of a millisecond, getting the GIL back may take five.
+    Nodes are in breadth-first order, so passes over the arrays replace recursion. The GIL is not
+    released: the function takes a fraction of a millisecond, and acquiring the GIL again may take
+    five.
     """
     n = len(refine)
     state = np.zeros(n, np.uint8)

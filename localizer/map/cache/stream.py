@@ -34,9 +34,10 @@ _CLOSE_S = 10.0  # for a tile to be read to its end
 class StreamCounters:
     """Counters since the streamer was made.
 
-    hits, misses: wanted nodes that were in memory or not; complete: selections at the wanted detail
-    throughout; stalls: selections with a hole; failures: attempts at nodes that could not be read;
-    unreadable: nodes whose last attempt failed, now; loaded, evicted: nodes; resident_bytes: now.
+    hits, misses: needed nodes that were in memory, or were not; complete: selections with the
+    needed detail everywhere; stalls: selections with a hole; failures: failed attempts to read a
+    node; unreadable: nodes whose last attempt failed; loaded, evicted: numbers of nodes;
+    resident_bytes: memory in use now.
     """
 
     selections: int = 0
@@ -63,13 +64,13 @@ class TileStreamer:
         bytes_per_select: int = 64 << 20,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start the loader thread, and hold the cache: until `close` no build replaces it.
-        MapCacheError where one has since it was opened.
+        """Start the loader thread and lock the cache, so that no build replaces it until `close`.
+        MapCacheError if one has replaced it since it was opened.
 
-        byte_budget: of decoded tiles. max_error_px, max_texel_px: see `DetailLimits`.
-        bytes_per_select: how much new data one selection may bring in, so that a renderer that has
-        to upload it keeps its pace; a selection that waits is not bounded. clock: in seconds, by
-        which nodes that could not be read are tried again.
+        byte_budget: size limit of the decoded tiles. max_error_px, max_texel_px: see
+        `DetailLimits`. bytes_per_select: limit of the new data of one selection, so that the upload
+        does not slow the renderer; there is no limit for a selection that waits. clock: in seconds;
+        nodes that could not be read are tried again by it.
         """
         self.cache = cache
         self._selector = TileSelector(cache.index, cache.frame)
@@ -95,8 +96,8 @@ class TileStreamer:
     ) -> list[TileMesh]:
         """Meshes to draw for a view.
 
-        wait: block until all wanted detail is resident; then a tile that cannot be read raises
-        `MapCacheError`, while without `wait` its parent stays in view and the failure is logged.
+        wait: block until all needed detail is resident. A tile that cannot be read then raises
+        `MapCacheError`. Without `wait` its parent is shown, and the failure is logged.
         """
         limits = self._fitting_limits(world_from_camera, camera)
         with self._lock:

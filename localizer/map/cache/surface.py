@@ -21,8 +21,9 @@ _MOST_NODES = 64  # of a ray along the horizon: what comes later is not looked f
 class MapSurface:
     """Casts rays into a cache's finest tiles, of which it reads only the geometry.
 
-    What the renderer shows is chosen for its picture: its tiles may be off by several pixels, which
-    at a target is metres. Safe to use from several threads; a cast may wait for the disk.
+    The renderer's tiles suit the image and may be off by several pixels, which is metres at a
+    target. Therefore they are not used here. Safe to use from several threads; a cast may wait for
+    the disk.
     """
 
     def __init__(self, cache: TileCache, byte_budget: int = 64 << 20) -> None:

@@ -46,8 +46,8 @@ class FoundSource:
 def source_in(folder: Path, georeference_given: bool) -> FoundSource:
     """The source in a folder, if there is only one way to read it.
 
-    A tileset, an OpenDroneMap result, or one mesh with its georeference, or two rasters.
-    `MapSourceError` lists what was found and what to pass where it is none of these or several.
+    It is a tileset, an OpenDroneMap result, one mesh with its georeference, or two rasters.
+    Otherwise `MapSourceError` lists the files found and the options to give.
     """
     if (folder / TILESET).is_file():
         return FoundSource((folder,))

@@ -23,14 +23,15 @@ def height_mesh(
     *,
     lossless: bool,
 ) -> tuple[Array, NDArray[np.int32]] | None:
-    """Vertices (V, 3), x east and y north of the tile's first vertex, and faces (F, 3).
+    """Vertices (V, 3), x east and y north of the tile's first vertex, and faces (F, 3); None if
+    nothing is left.
 
     heights: (n + 1, n + 1), m, the northern row first; masked where unknown. shown: which pixels of
-    the tile's picture are known. step: distance of neighbouring vertices to the east and to the
+    the tile's image are known. step: distance of neighbouring vertices to the east and to the
     south, m. lossless: keep the surface exact (the finest level); otherwise simplification removes
     half of the triangles. Vertical strips (skirts) two steps deep hang from the tile's border, so
-    that no gap shows between neighbouring tiles. Cells with an unknown corner or no picture are
-    left out; None where nothing is left.
+    that no gap shows between neighbouring tiles. Cells with an unknown corner or without image are
+    left out.
     """
     n = heights.shape[0] - 1
     known = ~np.ma.getmaskarray(heights)
@@ -75,11 +76,11 @@ def _simplified(
 def _with_corners(
     points: Array, faces: NDArray[np.integer], corners: Array, reach: float
 ) -> tuple[Array, NDArray[np.integer]]:
-    """With the tile's corners (K, 3) where simplification cut them off.
+    """The mesh with the tile's corners (K, 3) where simplification cut them off.
 
-    It draws a corner's vertex along the border; the neighbours' likewise, so that where four tiles
-    meet the ground had a hole of one to two steps. The edges of the rim within `reach` metres that
-    turn their outer side to the corner are joined with it.
+    Simplification moves a corner's vertex along the border, in the neighbouring tiles, too. Without
+    this repair the ground has a hole of one to two steps where four tiles meet. The border edges
+    within `reach` metres whose outer side faces the corner are joined with it.
     """
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, first, count = np.unique(

@@ -48,9 +48,9 @@ class GltfMaterial:
 def material_of(material: dict[str, Any]) -> GltfMaterial:
     """Parse a glTF material.
 
-    Specular-glossiness goes before the metallic fallback, where it has a picture or the other has
-    none. Emission stands for a base that is black or has no picture: so unlit photographs were
-    written before KHR_materials_unlit.
+    Specular-glossiness is preferred to the metallic fallback if it has a texture, or if the
+    fallback has none. A base colour that is black or has no texture is replaced by the emission:
+    unlit photographs were stored so before KHR_materials_unlit.
     """
     extensions = material.get("extensions", {})
     pbr = material.get("pbrMetallicRoughness", {})

@@ -189,8 +189,8 @@ def read_rasters(
 ) -> SourceTree:
     """The tree of a DSM (one band of heights) and an orthophoto (bands of colours).
 
-    height_unit: of the DSM where it does not say it, see `UNITS`; nodata: the number that stands
-    for a missing height where the DSM does not say it. `MapSourceError` if a file cannot be read.
+    height_unit: of the DSM if the file does not state it, see `UNITS`; nodata: number for a missing
+    height, if the file does not state it. `MapSourceError` if a file cannot be read.
     """
     rules = rules or ImportRules()
     try:

@@ -148,8 +148,8 @@ def _step_m(data: DatasetReader) -> float:
 def _stand_alone(metres: Array, step_m: float) -> list[tuple[int, int, float]]:
     """Row, column and height over its surroundings of each spike. metres: (h, w), NaN is unknown.
 
-    A spike is at most three cells wide and more slender than any chimney: 30 times as high as wide,
-    at least 80 m; from 500 m on nothing stands so.
+    A spike is at most three cells wide and more slender than any chimney: at least 80 m and 30
+    times as high as wide. Everything higher than 500 m is a spike, too.
     """
     least = float(np.clip(_SLENDER * step_m, _SPIKE_LEAST_M, _SPIKE_M))
     steps = (np.abs(np.diff(metres, axis=axis)) > least for axis in (0, 1))

@@ -201,8 +201,8 @@ def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
 def stated_imagery(data: DatasetReader) -> tuple[str | None, str | None]:
     """Date (year, month or day) and sensor of an orthophoto, by its tags; None if unknown.
 
-    GDAL's IMAGERY tags, and what vendors write among the plain ones. TIFFTAG_DATETIME is when the
-    file was written, and not when its photos were taken.
+    It reads GDAL's IMAGERY tags and the plain tags of some vendors. TIFFTAG_DATETIME is not read,
+    because it is the time of the file and not of the photos.
     """
     stated = data.tags() | data.tags(ns="IMAGERY")
     tags = {name.upper(): text.strip() for name, text in stated.items()}

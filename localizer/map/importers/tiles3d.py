@@ -358,8 +358,9 @@ def _is_in_degrees(region: Any) -> bool:
 
 
 def _centre_of_content(root: SourceNode, stated: Array) -> Array:
-    """Where the map is, (3,) ECEF: as stated if that is about its content, else the content's
-    middle at its lowest height. A volume may span a country of which one village is there.
+    """Position of the map, (3,) ECEF: the stated one if it is near the content, else the content's
+    middle at its lowest height. A stated volume may span a country although the content is one
+    village.
     """
     tiles = [t for node in root.walk() if not node.children for t in node.tiles]
     tiles = tiles or [t for node in root.walk() for t in node.tiles]

@@ -22,8 +22,9 @@ _LEAST_PEAK = 4.0  # of the best shift's correlation over the others', in their 
 
 @dataclass(frozen=True)
 class ImageryOffset:
-    """east_m, north_m: offset of the imagery from the surface; peak: its significance, in standard
-    deviations; edges: cells of the surface with a step. known: whether it is significant.
+    """Offset between imagery and surface. east_m, north_m: offset of the imagery from the surface;
+    peak: its significance, in standard deviations; edges: number of cells of the surface with a
+    step. known: whether it is significant.
     """
 
     east_m: float
@@ -45,8 +46,7 @@ class ImageryOffset:
 def alignment_of(mosaic: Mosaic) -> ImageryOffset:
     """The offset at which the imagery's edges match the surface's steps best.
 
-    Good to about a metre: walls that lean in the picture draw it to one side. Without colours
-    nothing can be said.
+    Accurate to about a metre: walls that lean in the image bias it. Unknown without colours.
     """
     scale = mosaic.gsd_m / _CELL_M
     size = (round(mosaic.rgb.shape[1] * scale), round(mosaic.rgb.shape[0] * scale))

@@ -80,8 +80,9 @@ class MapUse:
 
 @dataclass(frozen=True)
 class MapCheck:
-    """findings: each question's; pictures: name to RGB; size_m: east and north of the rectangle
-    about the map; usable: the largest part of it without gaps, blanks and coarse texels.
+    """Result of `companion map check`. findings: the result of each question; pictures: RGB images
+    by name; size_m: east and north of the rectangle about the map; usable: the largest part of it
+    without gaps, blank areas and coarse texels.
     """
 
     findings: tuple[MapFinding, ...]

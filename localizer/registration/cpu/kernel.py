@@ -242,10 +242,10 @@ def _evaluate(  # type: ignore[no-untyped-def]
 def refine_kernel(channels: int) -> Callable[..., int]:
     """The compiled kernel for feature maps of `channels` channels.
 
-    It closes over the number alone: numba's cache on disk tells closures apart by their pickled
-    variables. A compiled function among them is pickled with a number of its process, so the
-    kernel would be compiled in every process again. The functions that need the number as a
-    constant are inlined instead.
+    It closes over the number alone. Numba's cache on disk identifies closures by their pickled
+    variables. A pickled compiled function contains a number of its process, so the kernel would be
+    compiled in every process again. Therefore the functions that need the number as a constant are
+    inlined.
     """
     C = channels
 

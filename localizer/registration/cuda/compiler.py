@@ -44,8 +44,8 @@ def compile_kernels(
     """Compile the kernels for one channel count and compute capability, or load them from the
     cache.
 
-    An unwritable cache costs the compilation at every start and is no error. Raises
-    `CudaUnavailableError` without NVRTC, `CudaError` where it refuses the source.
+    If the cache cannot be written, the kernels are compiled at every start. Raises
+    `CudaUnavailableError` without NVRTC, `CudaError` if it refuses the source.
     """
     sources = {path.name: path.read_text() for path in sorted(SOURCES.glob("*.cu*"))}
     return compile_sources(sources, _MAIN, macros(channels, half), architecture, cache)

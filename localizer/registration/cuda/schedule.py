@@ -264,11 +264,11 @@ class CudaSchedule:
 
 def _survivors(config: JNGOConfig, count: int) -> int:
     """Hypotheses at most after the last level."""
-    return min([count, *config.keep[: len(config.iterations) - 1]])
+    return min([count, *config.survivors[: len(config.iterations) - 1]])
 
 
 def _taking_part(total: int, wanted: int) -> int:
-    """Anchors that `thinned` leaves."""
+    """Anchors that `subsample_anchors` leaves."""
     step = max(1, total // wanted)
     return -(-total // step)
 

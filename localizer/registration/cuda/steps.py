@@ -62,7 +62,7 @@ def launches(
         blocks = _FINITE_BLOCKS_PER_MULTIPROCESSOR * multiprocessors
         yield KernelLaunch("all_finite", k, blocks, _SMALL_THREADS, finite)
     alive, source = shape.hypotheses, 0
-    keep = (*c.keep[: searched - 1], c.hypotheses)
+    keep = (*c.survivors[: searched - 1], c.hypotheses)
     for k in range(searched):
         swarm, wanted = memory.swarms[source], c.swarm_anchors[k]
         target = 2 if k == searched - 1 else 1 - source
@@ -166,6 +166,6 @@ def _selecting(
     arguments["source"], arguments["target"] = memory.swarms[source], memory.swarms[target]
     arguments["totals"], arguments["order"] = memory.totals, memory.order
     arguments["alive"], arguments["projected"] = memory.alive, memory.projected
-    arguments["distinct"], arguments["least_score"] = shape.config.distinct_px, LEAST_SCORE
+    arguments["distinct"], arguments["least_score"] = shape.config.duplicate_px, LEAST_SCORE
     arguments["wanted"], arguments["keep"] = shape.config.swarm_anchors[level], keep
     return KernelLaunch("select_hypotheses", level, 1, _SMALL_THREADS, arguments)

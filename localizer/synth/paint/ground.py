@@ -185,7 +185,7 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
 @njit(cache=True, nogil=True, fastmath=True)
 def paint_albedo(region, material, tint, shape, west, north, gsd, season, moved, out):  # type: ignore[no-untyped-def]
     """Colour of a ground window without its light: region ids (H, W) to out (H, W, 3) float32 in
-    0 to 255. moved: (2,) metres by which the fine texture is another place's.
+    0 to 255. moved: (2,) shift of the fine texture, metres.
     """
     rgb = np.empty(3)
     for i in range(region.shape[0]):

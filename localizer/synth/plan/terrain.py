@@ -38,10 +38,11 @@ class River:
 
 @dataclass(frozen=True)
 class Terrain:
-    """heights: (n, n) float32 metres, row 0 = south, column 0 = west, `spacing_m` apart.
+    """The world's terrain. heights: (n, n) float32 metres, row 0 = south, column 0 = west,
+    `spacing_m` apart.
 
-    The surface is the grid's triangles with the diagonal from south-west to north-east: the
-    finest tiles are made of exactly these.
+    The surface is the grid's triangles with the diagonal from south-west to north-east; the finest
+    tiles consist of exactly these triangles.
     """
 
     heights: NDArray[np.float32]

@@ -17,8 +17,9 @@ _GROWTH = (1.0, 1.2)  # of a crown's radius and height, in a few years
 
 @dataclass(frozen=True)
 class Changes:
-    """Shares of changed objects. gone, rebuilt, new: of the buildings; felled: of the trees; the
-    others grew. regrown: soft ground has another fine texture. seed: which objects.
+    """Shares of changed objects. gone, rebuilt, new: shares of the buildings; felled: share of the
+    trees, of which the others have grown. regrown: whether soft ground has another fine texture.
+    seed: selects the changed objects.
     """
 
     gone: float = 0.03

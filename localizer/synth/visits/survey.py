@@ -23,9 +23,9 @@ _WALL = 0.35  # height of a wall's unit normal at most
 
 @dataclass(frozen=True)
 class SurveyErrors:
-    """A survey's own errors. bumps_m: standard deviation of the surface per axis; holes_per_km2;
-    wall_blur_m: of facades, seen only aslant from above; texel_m: ground size of a texel; seed: of
-    where the bumps and holes are.
+    """A survey's own errors. bumps_m: standard deviation of the surface per axis; holes_per_km2:
+    number of holes; wall_blur_m: blur of the facades, which a survey sees at a flat angle; texel_m:
+    ground size of a texel; seed: selects the positions of bumps and holes.
     """
 
     bumps_m: float = 0.0

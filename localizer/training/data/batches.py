@@ -60,8 +60,8 @@ class Schedule:
 class ShardStream:
     """Makes batches of the shards that a schedule selects.
 
-    A step waits for the shards it may draw from, so that training can begin while later shards are
-    still being generated and yet see the same data every time.
+    A step waits until its shards exist. Training can therefore begin while later shards are still
+    being generated, and it sees the same data in every run.
     """
 
     def __init__(

@@ -40,8 +40,9 @@ _SPARE = 1.25  # candidates for each sample: some see too little in common
 
 @dataclass(frozen=True)
 class LivePlan:
-    """Places that a step draws from: `active` of them; every `steps_per_place` steps the oldest is
-    replaced. places: number before they repeat; flight_days: per place.
+    """Schedule of the places that training steps draw from. active: number of places at a time; the
+    oldest is replaced every `steps_per_place` steps. places: number of different places;
+    flight_days: per place.
     """
 
     first_seed: int

@@ -45,8 +45,9 @@ _OVERLAP = 0.45  # least share of the reference's surface that the query must se
 @dataclass(frozen=True)
 class Pair:
     """Both views of one pair. reference, query: (H, W, 3) uint8; depths (H, W) float32, metres
-    along the axis, 0 = sky. The query is clean: its `condition` says what weather to put on it.
-    outdated: buildings are gone and new; season: the query's vegetation is of another time of year.
+    along the axis, 0 = sky. The query has no weather yet; its `condition` states which to apply.
+    outdated: whether buildings are gone or new; season: whether the query's vegetation is of
+    another time of year.
     """
 
     reference: Image

@@ -97,8 +97,8 @@ class Guidance:
 
     def steer(self, home_down: float, *, level_when_lost: bool) -> Array:
         """Attitude quaternion and thrust (5,) that follow the set point (or descend) and hold the
-        heading target. home_down: of home, NED metres; level_when_lost: stay level without a
-        position and drift with the wind.
+        heading target. home_down: height of home, NED metres; level_when_lost: without a position
+        stay level and drift with the wind.
         """
         limits, position = self.limits, self.estimator.position
         if self.yaw_target is not None:

@@ -35,7 +35,7 @@ class RtlStage(Enum):
 class FlightModes:
     """Flight mode logic: target, attitude and thrust of the active mode.
 
-    Above 200 lines: a few lines for each mode, which share home, target and the way down.
+    Above 200 lines: each mode takes a few lines, and all share home, target and landing.
     """
 
     parameters: Parameters

@@ -15,7 +15,8 @@ _WARNING_PERIOD_S = 30.0
 class EkfCheck:
     """Checks the EKF's variances and innovations; call both methods at 10 Hz.
 
-    failsafe: set by whoever acts on a failure, cleared with a text when the filter is good again.
+    failsafe: set by the caller that acts on a failure; cleared with a text when the filter is good
+    again.
     """
 
     def __init__(

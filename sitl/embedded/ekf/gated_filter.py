@@ -45,8 +45,8 @@ class GatedFilter:
     """State and covariance with gated updates. Times are ms since boot.
 
     state: nominal state (16,), cov: (15, 15), see `navigation`, at the delayed time horizon;
-    now_ms: the present. position_timeout, velocity_timeout: nothing was within its gate for so long
-    that the state may be reset to a measurement.
+    now_ms: the present. position_timeout, velocity_timeout: time without a measurement within its
+    gate after which the state may be reset to a measurement.
     """
 
     def __init__(self, parameters: Parameters) -> None:

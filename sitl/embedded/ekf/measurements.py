@@ -35,7 +35,7 @@ class GpsData:
 class ExternalPosition:
     """A position from the companion: NED metres about the EKF origin, sigma in metres.
 
-    is_global: it came as latitude and longitude (PX4's auxiliary global position).
+    is_global: whether it was received as latitude and longitude (PX4's auxiliary global position).
     """
 
     position: tuple[float, float, float]

@@ -45,7 +45,7 @@ def step(x: Array, motors: Array, wind: Array, dt: float, force: Array) -> None:
     """Advance the true state x (17,) by dt seconds, in place.
 
     motors: (4,) commanded thrusts in N; wind: (3,) NED m/s; force: (3,) is set to the specific
-    force in body axes (m/s²), which is what accelerometers feel.
+    force in body axes (m/s²), which accelerometers measure.
     """
     for i in range(4):
         lag = dt / (MOTOR_TIME_CONSTANT + dt)

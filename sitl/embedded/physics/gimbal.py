@@ -70,10 +70,11 @@ class Gimbal:
         return quaternion(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
     def reported(self, vehicle_roll_rad: float, vehicle_pitch_rad: float) -> Array:
-        """The reported attitude quaternion (4,): the true one of a brushless gimbal (type 7).
+        """The reported attitude quaternion (4,). For a brushless gimbal (type 7) it is the true
+        one.
 
-        For a servo gimbal (type 1) ArduPilot sends the servo angles, from which the vehicle's lean
-        is subtracted, under the same earth-frame flags.
+        For a servo gimbal (type 1) ArduPilot sends the servo angles minus the vehicle's roll and
+        pitch, under the same earth-frame flags.
         """
         if self.parameters["MNT1_TYPE"] != _SERVO:
             return self.attitude

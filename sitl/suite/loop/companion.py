@@ -46,7 +46,7 @@ class Health:
 class LoopCompanion:
     """`companion run` with one deployment file; each start logs to its own folder.
 
-    supervised: its supervisor is started, which starts it again when it is killed.
+    supervised: the supervisor is started, which restarts a killed companion.
     """
 
     def __init__(

@@ -69,7 +69,7 @@ class Flight:
             place = np.array(self.true(k)) + self.shift + self._rng.normal(0, 0.1, 2)
             fix = VisionFix(k * SECOND // HZ, *offset(*HOME, *place), 550.0)
             self._clock_ns = fix.time_ns + LATENCY_NS
-            self.fixes.append(judge.judge(seen, fix))
+            self.fixes.append(judge.check(seen, fix))
         self._now += round(seconds * HZ)
 
     def error(self, k: int) -> float:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from companion.convert.angles import Angles, pose_of_gimbal
+from companion.convert.angles import Angles, AutopilotAngles, pose_of_autopilot
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.posefile import pose_row
 
@@ -17,7 +17,6 @@ from localizer.geometry.posefile import pose_row
 )
 def test_the_tables_zeros_and_signs(gimbal, row):
     place = Geodetic(47.3, 8.5, 500.0)
-    found = pose_row(
-        "", pose_of_gimbal(place, Angles(*gimbal), LocalFrame(place)), LocalFrame(place)
-    )
+    level = AutopilotAngles("", None, place, Angles(0.0, 0.0, 0.0), Angles(*gimbal))
+    found = pose_row("", pose_of_autopilot(level, LocalFrame(place)), LocalFrame(place))
     assert (found.roll_deg, found.pitch_deg, found.yaw_deg) == pytest.approx(row, abs=1e-9)

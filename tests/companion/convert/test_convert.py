@@ -8,7 +8,13 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
-from companion.convert.angles import Angles, angles_of_matrix, gimbal_of_pose, pose_of_gimbal
+from companion.convert.angles import (
+    Angles,
+    AutopilotAngles,
+    angles_of_matrix,
+    gimbal_of_pose,
+    pose_of_autopilot,
+)
 from companion.convert.formats import AUTOPILOT_COLUMNS
 from companion.errors import ConfigError, ReportError
 from companion.flight.recorder import ESTIMATE_COLUMNS
@@ -359,7 +365,8 @@ def test_a_gimbal_straight_down_keeps_its_heading():
         angles = angles_of_matrix(matrix_from_euler(0.0, -np.pi / 2, np.radians(yaw)))
         assert (angles.roll_deg, angles.pitch_deg) == (0.0, -90.0)
         assert angles.yaw_deg == pytest.approx(yaw)
-        pose = pose_of_gimbal(ORIGIN, Angles(0.0, -90.0, yaw), FRAME)
+        level, down = Angles(0.0, 0.0, 0.0), Angles(0.0, -90.0, yaw)
+        pose = pose_of_autopilot(AutopilotAngles("", None, ORIGIN, level, down), FRAME)
         assert gimbal_of_pose(pose, FRAME).yaw_deg == pytest.approx(yaw)
 
 

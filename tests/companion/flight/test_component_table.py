@@ -37,7 +37,7 @@ def test_the_guardian_is_made_of_a_deployment_in_a_folder_whose_name_is_no_utf8(
     deployment.write_text(yaml.safe_dump({"map": "m", "camera": camera, "record": record}))
     stand_ins = {
         Bridge: object(), CameraExtrinsics: object(), InertialTrack: object(),
-        FixInjection: SimpleNamespace(add_judge=lambda _: None, add_observer=lambda _: None),
+        FixInjection: SimpleNamespace(add_check=lambda _: None, add_observer=lambda _: None),
     }  # fmt: skip
     parts: list[Component[Any]] = [
         Component(kind.__name__, kind, partial(_given, one)) for kind, one in stand_ins.items()

@@ -86,7 +86,7 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
             return replace(fix, position_covariance_ned=4.0 * fix.position_covariance_ned)
         return fix if verdict else None
 
-    injection.add_judge(judge)
+    injection.add_check(judge)
     injection.add_observer(lambda _estimate, _bundle, fix: seen.append(fix))
     for _ in range(3):
         injection.add_estimate(_estimate(TRACKING), None)
@@ -113,7 +113,7 @@ def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
         return fix
 
     injection = FixInjection(bridge, INSTALLATION)
-    injection.add_judge(judge)
+    injection.add_check(judge)
     for tenth in range(300):
         broken[0] = 100 <= tenth < 130 or (tenth > 200 and tenth % 2 == 0)
         estimate = replace(_estimate(TRACKING), exposure_time_ns=10**9 + tenth * 10**8)

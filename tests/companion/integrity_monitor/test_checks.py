@@ -81,7 +81,7 @@ class Filmed:
             picture = cv2.warpAffine(ground, shift, (320, 240))[..., None].astype(np.float64)
             picture *= self.light(self.flight.at_s)
             noisy = np.clip(picture + rng.normal(0.0, 2.0, (240, 320, 3)), 0, 255)
-            self.flight.monitor.see(second(self.flight.at_s), noisy.astype(np.uint8))
+            self.flight.monitor.add_frame(second(self.flight.at_s), noisy.astype(np.uint8))
             self.flight.fly(self.flight.at_s + 0.1)
         return self.flight
 
@@ -98,7 +98,7 @@ def test_fog_is_no_frozen_video() -> None:
     """Found on ArduPilot: a bank of fog was told as a feed that hangs."""
     fog = Flight(monitor(), leg, noise_m=0.03)
     while fog.fly(fog.at_s + 0.1).at_s < 12.0:
-        fog.monitor.see(second(fog.at_s), np.full((240, 320, 3), 205, np.uint8))
+        fog.monitor.add_frame(second(fog.at_s), np.full((240, 320, 3), 205, np.uint8))
     assert {one.id for _, one in fog.lines} == {AlertId.LOW_CONTRAST}
 
 

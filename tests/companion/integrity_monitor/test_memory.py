@@ -70,7 +70,7 @@ def test_what_forbade_in_a_process_that_was_killed_forbids_from_the_start() -> N
     again.start()
     assert inhibited == [AlertId.FOCAL_LENGTH]
     again.stop()
-    again.turn()
+    again.run_checks()
     assert inhibited == [AlertId.FOCAL_LENGTH]
     assert kept.told == {"inhibits": KEPT}  # for the next, too
     again.close()
@@ -92,7 +92,7 @@ def test_what_flies_is_not_taken_back_by_a_restart() -> None:
     flying, _ = integrity_monitor(kept, injecting=True)
     flying.start()
     flying.stop()
-    flying.turn()
+    flying.run_checks()
     assert kept.told is None
 
 

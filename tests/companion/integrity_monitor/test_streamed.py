@@ -93,7 +93,7 @@ def test_a_stream_that_does_not_show_the_present_is_told(ground, wrong, told, wi
             at_s = k / HZ
             image = through(shown(ground, wrong(at_s), rng))
             if image is not None:
-                flight.monitor.see(second(at_s), image)
+                flight.monitor.add_frame(second(at_s), image)
             flight.fly(at_s + 1.0 / HZ)
     assert FAULT_S < flight.told(told) <= FAULT_S + within_s
     assert not [fix for fix in flight.passed if fix.time_ns > second(FAULT_S + within_s + 0.2)]

@@ -130,7 +130,7 @@ def test_pictures_whose_clock_stands_or_runs_back_are_withheld(stamp: Any) -> No
         flight.fly(0.1 * tenth)
         at_s = 0.1 * tenth
         moved = np.roll(PICTURE, 7 * tenth, axis=1)
-        watched.see(second(at_s if at_s < 5.0 else stamp(at_s)), moved)
+        watched.add_frame(second(at_s if at_s < 5.0 else stamp(at_s)), moved)
         told_s = min(told_s, flight.told(AlertId.VIDEO_TIMESTAMPS))
     assert 5.5 <= told_s < 6.5
     assert max(flight.held) > 9.7
@@ -142,8 +142,8 @@ def test_pictures_that_come_twice_now_and_then_are_no_broken_clock() -> None:
     flight = Flight(watched, noise_m=0.05)
     for tenth in range(1, 60):
         flight.fly(0.1 * tenth)
-        watched.see(second(0.1 * tenth), PICTURE)
-        watched.see(second(0.1 * tenth), PICTURE)  # as a feed repeats a frame
+        watched.add_frame(second(0.1 * tenth), PICTURE)
+        watched.add_frame(second(0.1 * tenth), PICTURE)  # as a feed repeats a frame
     assert not flight.times(AlertId.VIDEO_TIMESTAMPS)
 
 
@@ -197,21 +197,21 @@ def test_a_fix_that_cannot_be_judged_is_withheld_told_and_costs_itself_only(faul
     """It passed unjudged: whatever position fails the monitor would have been believed."""
     integrity_monitor, bridge = faulty
     bridge.fails_at = {"state"}
-    assert integrity_monitor.judge(FIX) is None
+    assert integrity_monitor.check(FIX) is None
     assert "boom" in caplog.text
     bridge.fails_at = set()
-    assert integrity_monitor.judge(FIX) is not None
-    integrity_monitor.turn()
+    assert integrity_monitor.check(FIX) is not None
+    integrity_monitor.run_checks()
     assert bridge.said == []  # one of many
     bridge.fails_at = {"state"}
-    assert integrity_monitor.judge(FIX) is None
-    integrity_monitor.turn()
+    assert integrity_monitor.check(FIX) is None
+    integrity_monitor.run_checks()
     assert bridge.said == [FAILED]
     assert integrity_monitor.reason == FAILED
     bridge.fails_at = set()
-    assert integrity_monitor.judge(FIX) is not None
+    assert integrity_monitor.check(FIX) is not None
     for _ in range(30):
-        integrity_monitor.turn()
+        integrity_monitor.run_checks()
     assert bridge.said[1:] == [cleared(AlertId.MONITOR_FAILED)]
     assert integrity_monitor.reason is None
 
@@ -220,15 +220,15 @@ def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(fault
     """Fixes can be judged, but nobody watches the pictures, the IMU, the EKF."""
     integrity_monitor, bridge = faulty
     bridge.fails_at = {"inertial_since"}
-    integrity_monitor.turn()
-    assert integrity_monitor.judge(FIX) is not None
+    integrity_monitor.run_checks()
+    assert integrity_monitor.check(FIX) is not None
     for _ in range(9):
-        integrity_monitor.turn()
-    assert integrity_monitor.judge(FIX) is None
+        integrity_monitor.run_checks()
+    assert integrity_monitor.check(FIX) is None
     assert FAILED in bridge.said
     bridge.fails_at = set()
-    integrity_monitor.turn()
-    assert integrity_monitor.judge(FIX) is not None
+    integrity_monitor.run_checks()
+    assert integrity_monitor.check(FIX) is not None
 
 
 def test_a_guardian_that_fails_at_each_picture_of_a_slow_video_withholds(faulty, monkeypatch):
@@ -241,49 +241,49 @@ def test_a_guardian_that_fails_at_each_picture_of_a_slow_video_withholds(faulty,
         raise ValueError("no picture")
 
     with monkeypatch.context() as broken:
-        broken.setattr(IntegrityChecks, "see", fails)
+        broken.setattr(IntegrityChecks, "add_frame", fails)
         for turn in range(20):
             if turn % 2:
-                integrity_monitor.see(second(10.0 + turn), PICTURE)
-            integrity_monitor.turn()
-        assert integrity_monitor.judge(FIX) is None
+                integrity_monitor.add_frame(second(10.0 + turn), PICTURE)
+            integrity_monitor.run_checks()
+        assert integrity_monitor.check(FIX) is None
         assert bridge.said == [FAILED]
-    integrity_monitor.turn()
-    assert integrity_monitor.judge(FIX) is None  # without a picture it saw nothing
-    integrity_monitor.see(second(40.0), PICTURE)
-    integrity_monitor.turn()
-    assert integrity_monitor.judge(FIX) is not None
+    integrity_monitor.run_checks()
+    assert integrity_monitor.check(FIX) is None  # without a picture it saw nothing
+    integrity_monitor.add_frame(second(40.0), PICTURE)
+    integrity_monitor.run_checks()
+    assert integrity_monitor.check(FIX) is not None
 
 
 def test_a_picture_that_fails_now_and_then_withholds_nothing(faulty, monkeypatch):
     integrity_monitor, _ = faulty
-    see = IntegrityChecks.see
+    see = IntegrityChecks.add_frame
 
     def fails(watched: IntegrityChecks, time_ns: int, image: Any) -> None:
         if time_ns % second(4.0) == 0:
             raise ValueError("no picture")
         see(watched, time_ns, image)
 
-    monkeypatch.setattr(IntegrityChecks, "see", fails)
+    monkeypatch.setattr(IntegrityChecks, "add_frame", fails)
     for turn in range(60):
-        integrity_monitor.see(second(10.0 + turn), np.roll(PICTURE, 7 * turn, axis=1))
-        integrity_monitor.turn()
-        assert integrity_monitor.judge(replace(FIX, time_ns=second(1.0) + turn)) is not None
+        integrity_monitor.add_frame(second(10.0 + turn), np.roll(PICTURE, 7 * turn, axis=1))
+        integrity_monitor.run_checks()
+        assert integrity_monitor.check(replace(FIX, time_ns=second(1.0) + turn)) is not None
 
 
 def test_a_reset_that_falls_into_a_blind_time_is_announced_after_it(faulty):
     """A jumped place proved itself while nobody watched: the EKF would have fought it, untold."""
     integrity_monitor, bridge = faulty
-    before = integrity_monitor.judge(FIX)
+    before = integrity_monitor.check(FIX)
     jumped = [replace(FIX, time_ns=second(1.0 + k), latitude_deg=47.01) for k in range(1, 9)]
-    assert [integrity_monitor.judge(fix) for fix in jumped[:3]] == [None, None, None]
+    assert [integrity_monitor.check(fix) for fix in jumped[:3]] == [None, None, None]
     bridge.fails_at = {"inertial_since"}
     for _ in range(10):
-        integrity_monitor.turn()
-    assert [integrity_monitor.judge(fix) for fix in jumped[3:7]] == [None, None, None, None]
+        integrity_monitor.run_checks()
+    assert [integrity_monitor.check(fix) for fix in jumped[3:7]] == [None, None, None, None]
     bridge.fails_at = set()
-    integrity_monitor.turn()
-    passed = integrity_monitor.judge(jumped[7])
+    integrity_monitor.run_checks()
+    passed = integrity_monitor.check(jumped[7])
     assert before is not None
     assert passed is not None
     assert passed.reset_count != before.reset_count
@@ -310,23 +310,23 @@ def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock:
     integrity_monitor = IntegrityMonitor(
         IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
     )
-    integrity_monitor.turn()
+    integrity_monitor.run_checks()
     clock.now_ns += second(1.9)  # a busy computer
-    assert integrity_monitor.judge(FIX) is not None
+    assert integrity_monitor.check(FIX) is not None
     clock.now_ns += second(0.2)
-    assert integrity_monitor.judge(FIX) is None
+    assert integrity_monitor.check(FIX) is None
     assert bridge.said == [FAILED]
     assert integrity_monitor.reason == FAILED
     assert (integrity_monitor.level, integrity_monitor.standing()) == (None, {})
     clock.now_ns += second(10.0)
-    integrity_monitor.judge(FIX)
+    integrity_monitor.check(FIX)
     assert len(bridge.said) == 2
-    integrity_monitor.turn()  # it was only asleep
-    assert integrity_monitor.judge(FIX) is not None
+    integrity_monitor.run_checks()  # it was only asleep
+    assert integrity_monitor.check(FIX) is not None
     clock.now_ns += second(1.5)
-    integrity_monitor.turn()
+    integrity_monitor.run_checks()
     clock.now_ns += second(1.6)
-    integrity_monitor.turn()
+    integrity_monitor.run_checks()
     assert bridge.said[2:] == [cleared(AlertId.MONITOR_FAILED)]
 
 
@@ -348,7 +348,7 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
     try:
         assert stuck.wait(30.0)
         clock.now_ns += second(2.5)
-        assert integrity_monitor.judge(FIX) is None
+        assert integrity_monitor.check(FIX) is None
         assert integrity_monitor.reason == FAILED
         assert bridge.said == [FAILED]
     finally:
@@ -365,12 +365,12 @@ def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Ha
     turned_ns = clock.now_ns
     integrity_monitor.watch(lambda: {"health": turned_ns})
     for _ in range(39):
-        integrity_monitor.turn()
+        integrity_monitor.run_checks()
         clock.now_ns += second(0.1)
     assert bridge.said == []
     for _ in range(112):
         clock.now_ns += second(0.1)
-        integrity_monitor.turn()
+        integrity_monitor.run_checks()
     assert bridge.said == [
         alert(AlertId.COMPONENT_STALLED, seconds=pytest.approx(s, abs=0.11), component="health")
         for s in (4.0, 14.0)
@@ -378,5 +378,5 @@ def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Ha
     integrity_monitor.watch(lambda: {"health": clock.now_ns})
     for _ in range(32):
         clock.now_ns += second(0.1)
-        integrity_monitor.turn()
+        integrity_monitor.run_checks()
     assert bridge.said[2:] == [cleared(AlertId.COMPONENT_STALLED)]

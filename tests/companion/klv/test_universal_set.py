@@ -24,7 +24,12 @@ _KEYS = {  # by hand, from ST 0601.12 section 8: name, whole key, format
     tag.SENSOR_LONGITUDE: ("060e2b34010101030701020102060200", ">d"),
     tag.SENSOR_ALTITUDE: ("060e2b34010101010701020102020000", ">f"),
     tag.PLATFORM_HEADING: ("060e2b34010101070701100106000000", ">f"),
+    tag.PLATFORM_PITCH: ("060e2b34010101070701100105000000", ">f"),
+    tag.PLATFORM_ROLL: ("060e2b34010101070701100104000000", ">f"),
+    tag.CENTRE_LATITUDE: ("060e2b34010101010701020103020000", ">d"),
+    tag.CENTRE_LONGITUDE: ("060e2b34010101010701020103040000", ">d"),
     tag.HORIZONTAL_FOV: ("060e2b34010101020420020101080000", ">f"),
+    tag.VERTICAL_FOV: ("060e2b340101010704200201010a0100", ">f"),
     tag.SLANT_RANGE: ("060e2b34010101010701080101000000", ">f"),
     ANGLE_TO_NORTH: ("060e2b34010101010701100102000000", ">f"),
     OBLIQUITY: ("060e2b34010101010701100103000000", ">f"),
@@ -32,12 +37,12 @@ _KEYS = {  # by hand, from ST 0601.12 section 8: name, whole key, format
 
 
 def _by_search(packet):
-    """Each key looked for in the bytes, its value behind one byte of length."""
+    """Each key looked for in the bytes without its version, its value behind a byte of length."""
     found = {}
     for number, (key, kind) in _KEYS.items():
-        at = packet.find(bytes.fromhex(key))
+        at = packet.find(bytes.fromhex(key)[8:])
         if at >= 0:
-            (found[number],) = struct.unpack_from(kind, packet, at + 17)
+            (found[number],) = struct.unpack_from(kind, packet, at + 9)
     return found
 
 
@@ -85,6 +90,7 @@ def test_a_real_flights_universal_sets(real_data, clip, count):
     assert len(packets) == count
     for _, packet in packets:
         read, expected = decode(packet), _by_search(packet)
+        assert expected.keys() == _KEYS.keys()
         assert {k: read.get(k) for k in expected} == pytest.approx(expected)
     track = read_klv(real_data("clips") / clip)
     assert (len(track.samples), track.damaged) == (count, 0)

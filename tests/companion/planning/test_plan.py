@@ -12,17 +12,17 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import MissionFileError
 from companion.geometry import Mount
+from companion.planning.alternatives import changes
 from companion.planning.flown import flown_legs, flown_words
-from companion.planning.instead import changes
-from companion.planning.judge import (
-    JudgedSample,
+from companion.planning.mission import HeightAbove, read_mission
+from companion.planning.verdicts import (
     LegVerdict,
     MissionLimits,
     Reason,
-    judge,
+    SampleVerdict,
+    sample_verdict,
     stretches,
 )
-from companion.planning.mission import HeightAbove, read_mission
 from companion.planning.way import Aim, MapHeights, camera_pose, legs_of
 from companion.preflight.map_pin import map_hash
 from localizer.forecast.forecast import ViewForecast
@@ -286,12 +286,12 @@ def leg(tmp_path, cache):
     ],
 )
 def test_each_verdict_has_its_reason(leg, given, reason):
-    assert judge(leg.samples[0], [given], MissionLimits()).reason is reason
+    assert sample_verdict(leg.samples[0], [given], MissionLimits()).reason is reason
 
 
 def test_the_worst_condition_counts(leg):
     both = [forecast(condition="day"), forecast(risk=0.5, condition="night")]
-    judged = judge(leg.samples[0], both, MissionLimits())
+    judged = sample_verdict(leg.samples[0], both, MissionLimits())
     assert (judged.forecast.condition, judged.holds) == ("night", False)
 
 
@@ -299,7 +299,7 @@ def test_a_forecast_is_checked_by_a_flight(leg):
     """A frame every 4 m over the leg's first 60 m; vision fails on 20 m that should hold, and holds
     on 20 m that should fail.
     """
-    judged = [judge(s, [forecast(risk=0.9 if k == 2 else 0.0)], MissionLimits())
+    judged = [sample_verdict(s, [forecast(risk=0.9 if k == 2 else 0.0)], MissionLimits())
               for k, s in enumerate(leg.samples)]  # fmt: skip
     places = np.array([s.position + np.array([dx, 0.3, 2.0]) for s in leg.samples[:3]
                        for dx in (-8.0, -4.0, 0.0, 4.0, 8.0)])  # fmt: skip
@@ -317,7 +317,7 @@ def test_a_forecast_is_checked_by_a_flight(leg):
 
 def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
     def verdict(bad):
-        judged = [judge(s, [forecast(risk=0.9 if k in bad else 0.0)], MissionLimits())
+        judged = [sample_verdict(s, [forecast(risk=0.9 if k in bad else 0.0)], MissionLimits())
                   for k, s in enumerate(leg.samples)]  # fmt: skip
         return [LegVerdict(leg, tuple(judged))]
 
@@ -337,7 +337,7 @@ def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
 def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg):
     def drift_m(share, terrain=False):
         off = forecast(risk=0.9, share=share, ground=0.0 if share == 0.0 else 0.3)
-        judged = tuple(judge(s, [off], MissionLimits()) for s in leg.samples)
+        judged = tuple(sample_verdict(s, [off], MissionLimits()) for s in leg.samples)
         return stretches([LegVerdict(leg, judged)], 5.0, OdometryConfig(), terrain=terrain)[
             0
         ].drift_m
@@ -349,7 +349,7 @@ def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg):
 
 
 def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
-    worst = JudgedSample(leg.samples[0], forecast(risk=0.9), Reason.WEAK)
+    worst = SampleVerdict(leg.samples[0], forecast(risk=0.9), Reason.WEAK)
     assert any("gimbal" in c.words for c in changes(worst, fixed=False))
     assert not any("gimbal" in c.words for c in changes(worst, fixed=True))
     assert any("higher" in c.words for c in changes(worst, fixed=True))

@@ -86,9 +86,10 @@ def test_subtitles_of_each_kind(tmp_path, body, height):
         np.testing.assert_allclose(axis, [0, 0.5, np.sqrt(0.75)], atol=1e-6)
 
 
-def test_subtitles_that_hold_words_alone_are_named(tmp_path):
+@pytest.mark.parametrize("text", [_CUE.format(n=1, s=0, body="Good evening."), "", "\ufffd\x00"])
+def test_subtitles_that_hold_no_position_are_named(tmp_path, text):
     file = tmp_path / "a.srt"
-    file.write_text(_CUE.format(n=1, s=0, body="Good evening."))
+    file.write_text(text, encoding="utf-8")
     with pytest.raises(FootageError, match="none with a position"):
         read_subtitles(file)
 

@@ -11,7 +11,7 @@ import pytest
 
 from companion.sources.zoom import longer
 from localizer.config import LocalizerConfig
-from localizer.geometry.camera import Camera, followed
+from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
@@ -120,7 +120,7 @@ def test_a_lens_that_does_not_zoom_has_one_pinhole_for_all(flight, small_assets)
     with localizer_of(flight, small_assets) as localizer:
         pinhole = localizer.camera
         for camera in (LENS, LENS.resized(640, 480), LENS.resized(160, 121)):
-            assert followed(pinhole, camera) is pinhole
+            assert with_field_of_view(pinhole, camera) is pinhole
         localizer.extract_query(flight.frame(1, 1.0))
         assert localizer.camera is pinhole
         localizer.extract_query(flight.frame(2, 1.4))

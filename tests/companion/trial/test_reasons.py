@@ -27,6 +27,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 
+_HEIGHT = Height(80.0, Datum.ELLIPSOID, 0.1)
 CAMERA = CameraGuess(Camera.from_fov(640, 480, 60.0), 2.0, "test")
 
 
@@ -58,6 +59,18 @@ def test_heights_that_cannot_be_true_are_not_used(cache):
     lost = priors_of(_flight(cache.frame, places, (under,)), cache)
     assert lost.datum is None
     assert not any(p.height_known or p.is_complete for p in lost.priors)
+
+
+def test_frames_without_the_height_that_others_have_are_counted(cache):
+    """RTK was lost in the flight: half of the photos have a height of another datum."""
+    own = replace(_HEIGHT, value_m=cache.frame.origin.height_m + 80.0)
+    flight = _flight(cache.frame, [(0.0, 20.0 * k) for k in range(4)], (own,))
+    frames = list(flight.frames)
+    other = replace(frames[0].telemetry.position, heights=(replace(own, datum=Datum.AMSL),))
+    frames[0] = frames[0].with_telemetry(replace(frames[0].telemetry, position=other))
+    found = priors_of(replace(flight, frames=tuple(frames)), cache)
+    assert [p.height_known for p in found.priors] == [False, True, True, True]
+    assert "no usable height in 1 of 4 frames: searched" in found.notes
 
 
 def test_a_height_of_another_datum_that_disagrees_is_told(cache):

@@ -1,6 +1,7 @@
 """``companion try`` on photos of a generated world whose tags are wrong by known amounts."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -11,14 +12,14 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.convert.angles import gimbal_of_pose
-from companion.errors import ReportError
+from companion.errors import FootageError, ReportError
 from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
-from companion.trial.localize import FrameLocalizer, height_bands
+from companion.trial.localize import FrameLocalizer, Localized, height_bands
 from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
-from companion.trial.run import sampled
+from companion.trial.run import localize_each, placed, spread
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -135,7 +136,26 @@ def test_no_photo_fails_because_the_one_before_failed(small_assets, small_sequen
     stack.close()
 
 
-def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(small_assets, tmp_path):
+def _silent(_what):
+    return nullcontext(lambda _done, _total: None)
+
+
+class _Finds(FrameLocalizer):
+    """Localizes these of the frames that it is asked for, counted from 1, and remembers all."""
+
+    def __init__(self, found):
+        self.asked, self._found_ones = [], found
+
+    def from_prior(self, recorded, prior):
+        self.asked.append(int(recorded.name[:2]))
+        return Localized(recorded.name, None, accepted=len(self.asked) in self._found_ones)
+
+
+@pytest.mark.parametrize(("found", "tried"), [((), 6), ((6,), 24), ((7,), 6), (range(99), 24)])
+def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(
+    small_assets, tmp_path, found, tried
+):
+    """They took longer than ten minutes where none could be found: 24 of up to 40 s each."""
     cache = TileCache.open(small_assets.map_cache)
     middle = cache.frame.position(np.zeros(3))
     for k in range(90):
@@ -145,15 +165,34 @@ def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(small_assets,
                   RelativeAltitude=60, **view)  # fmt: skip
         write_photo(tmp_path / f"{k:02d}.jpg", xmp, exif={_FOCAL_35: 24})
     flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    known = priors_of(flight, cache)
-    kept, priors = sampled(flight, known)
+    loader = _Finds(found)
+    kept, known, first = placed(flight, priors_of(flight, cache), loader, _silent)
     names = [int(frame.name[:2]) for frame in kept.frames]
     assert [k for k in names if not k % 2] == list(range(0, 90, 2))  # their heading is known
     odd = [k for k in names if k % 2]
-    assert (len(odd), odd[0], odd[-1]) == (24, 1, 89)
-    assert len(priors.priors) == len(names)
-    assert sum("24 of them" in note for note in priors.notes) == 1
-    assert sampled(kept, priors)[0] is kept
+    assert len(odd) == tried
+    assert np.diff([0, *odd, 90]).max() <= 2 * 90 / tried  # spread over the flight
+    assert sorted(loader.asked) == names
+    assert [one.name for one in first] == [frame.name for frame in kept.frames]
+    assert len(known.priors) == len(names)
+    (note,) = [n for n in known.notes if "stand for all" in n]
+    assert f"{tried} of them" in note
+    assert f"{45 - tried} are not tried" in note
+    assert ("none of them is found" in note) == (tried == 6)
+
+
+def test_searches_end_where_none_of_the_first_finds_anything():
+    chosen = spread(range(100), 20)
+
+    def count(found, searched=chosen):
+        return len(localize_each(chosen, searched, lambda k: Localized(str(k), None, accepted=k in
+                                 found), _silent("")))  # fmt: skip
+
+    assert count(()) == 6
+    assert count((), ()) == 20
+    assert count(range(100)) == 20
+    assert count({chosen[5]}) == 20
+    assert count({chosen[6]}) == 6
 
 
 def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_assets, tmp_path):
@@ -197,3 +236,11 @@ def test_without_a_map_the_needed_one_is_named(tmp_path):
     assert result.exit_code == 1
     assert "needs a map of latitude" in result.output
     assert "companion map fetch --rectangle" in result.output
+
+
+def test_without_map_and_position_the_file_of_other_photos_is_named(tmp_path):
+    write_photo(tmp_path / "a.jpg", exif={_FOCAL_35: 24})
+    (tmp_path / "places.csv").write_text("name,lat,lon\nb.jpg,47.0,8.0\n")
+    result = _run(tmp_path, "--report", tmp_path / "r")
+    assert "not used: places.csv names none of the photos" in result.output
+    assert isinstance(result.exception, FootageError)

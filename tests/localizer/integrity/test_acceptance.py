@@ -67,6 +67,12 @@ def test_each_kind_of_evidence_counts() -> None:
     assert all(log_odds(worse) < log_odds(base) for worse in less)
 
 
+@pytest.mark.parametrize("earlier", [0.9, -math.inf, math.nan])
+def test_every_pass_over_an_image_must_show_the_place(earlier):
+    assert is_acceptable(CONFIG, _registration(earlier_log_odds=1.1), 1.0)
+    assert not is_acceptable(CONFIG, _registration(earlier_log_odds=earlier), 1.0)
+
+
 def test_another_focal_length_that_fits_better_rejects() -> None:
     assert not is_acceptable(CONFIG, _registration(focal_gain=0.05), 1.0)
     assert is_acceptable(CONFIG, _registration(focal_gain=-0.01), 1.0)

@@ -9,7 +9,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.height_error import CANDIDATES_M, MapHeightError, height_likelihood
 from localizer.integrity.patch_covariance import height_correlation, patch_covariance
 from localizer.registration.agreement import PatchDisplacements
-from localizer.registration.priors import attitude_constraint, combine, fused, height_constraint
+from localizer.registration.priors import attitude_constraint, combine, fuse, height_constraint
 
 HEIGHT_M, FOCAL_PX = 120.0, 110.0
 DOWN = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, HEIGHT_M]))
@@ -92,7 +92,7 @@ def test_gravity_and_height_undo_what_the_roofs_pulled():
     before, after, ratio = [], [], []
     for seed in range(40):
         seen, off = town(5.0, seed)
-        found = fused(registered(off), patch_covariance(seen, 5.0), gravity(seed))
+        found = fuse(registered(off), patch_covariance(seen, 5.0), gravity(seed))
         left = found.world_from_camera.translation - DOWN.translation
         before.append(np.linalg.norm(off[:3]))
         after.append(np.linalg.norm(left))

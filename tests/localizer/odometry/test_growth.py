@@ -5,7 +5,7 @@ import pytest
 
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.config import GrowthModel
-from localizer.odometry.growth import carried, fused, stretched, without_constant_error
+from localizer.odometry.growth import add_scale_error, carried, fuse, without_constant_error
 from localizer.registration import attitude_constraint, combine, height_constraint
 
 MODEL = GrowthModel(scale=0.01, horizontal=0.1, vertical=0.2, tilt=1e-3, heading=2e-3)
@@ -27,11 +27,13 @@ def test_a_carried_pose_errs_as_its_keyframe_does():
 def test_a_way_back_does_not_take_back_what_another_ground_added():
     """Out over a valley and back over a hill, with errors that are opposite, alike or neither."""
     out = np.array([300.0, 0.0, 0.0])
-    half = stretched(np.zeros((3, 3)), 0.1, 0.5 * out)
-    assert stretched(half, 0.1, 0.5 * out)[0, 0] ** 0.5 == pytest.approx(30.0)
-    there = stretched(stretched(np.zeros((3, 3)), 0.1, out), 0.2, -out)
+    half = add_scale_error(np.zeros((3, 3)), 0.1, 0.5 * out)
+    assert add_scale_error(half, 0.1, 0.5 * out)[0, 0] ** 0.5 == pytest.approx(30.0)
+    there = add_scale_error(add_scale_error(np.zeros((3, 3)), 0.1, out), 0.2, -out)
     assert there[0, 0] ** 0.5 == pytest.approx(30.0 + 60.0)
-    corner = stretched(stretched(np.zeros((3, 3)), 0.1, out), 0.1, np.array([0.0, 300.0, 0.0]))
+    corner = add_scale_error(
+        add_scale_error(np.zeros((3, 3)), 0.1, out), 0.1, np.array([0.0, 300.0, 0.0])
+    )
     for share in (-1.0, 0.0, 1.0):  # correlation of the two
         whole = 900.0 * np.array([[1.0, share], [share, 1.0]])
         assert np.linalg.eigvalsh(corner[:2, :2] - whole)[0] > -1e-9
@@ -39,9 +41,9 @@ def test_a_way_back_does_not_take_back_what_another_ground_added():
 
 def test_a_sensor_is_weighed_against_what_is_known():
     pose = Pose(np.eye(3), np.array([1.0, 2.0, 10.0]))
-    after, covariance = fused(pose, SIGMA, height_constraint(11.0, 0.5))
+    after, covariance = fuse(pose, SIGMA, height_constraint(11.0, 0.5))
     assert after.translation == pytest.approx([1.0, 2.0, 10.0])  # it knows no more than we do
-    after, covariance = fused(pose, 4 * SIGMA, height_constraint(11.0, 0.5))
+    after, covariance = fuse(pose, 4 * SIGMA, height_constraint(11.0, 0.5))
     assert after.translation == pytest.approx([1.0, 2.0, 10.75])
     assert covariance[2, 2] == pytest.approx(0.25)  # the sensor's own: its error stays
     assert covariance[0, 0] == pytest.approx(4 * SIGMA[0, 0])
@@ -50,7 +52,7 @@ def test_a_sensor_is_weighed_against_what_is_known():
 def test_a_sensor_that_is_asked_often_does_not_average_out():
     pose, covariance = Pose(np.eye(3), np.zeros(3)), SIGMA
     for _ in range(100):
-        pose, covariance = fused(pose, covariance + np.eye(6) * 0.01, height_constraint(1.0, 0.4))
+        pose, covariance = fuse(pose, covariance + np.eye(6) * 0.01, height_constraint(1.0, 0.4))
     assert covariance[2, 2] == pytest.approx(0.16)
     assert pose.translation[2] > 0.5  # it follows the sensor nevertheless
     assert np.linalg.eigvalsh(covariance)[0] > 0
@@ -61,7 +63,7 @@ def test_what_hangs_on_the_height_moves_with_it():
     tied = SIGMA.copy()
     tied[0, 0] = tied[2, 2] = 1.0
     tied[0, 2] = tied[2, 0] = 0.9
-    after, covariance = fused(Pose.identity(), tied, height_constraint(1.0, 0.1))
+    after, covariance = fuse(Pose.identity(), tied, height_constraint(1.0, 0.1))
     assert after.translation == pytest.approx([0.9 * 0.99, 0.0, 0.99])
     assert covariance[0, 0] == pytest.approx(1 - 0.81 * 0.99)
 
@@ -87,7 +89,7 @@ def test_attitude_turns_the_pose_and_spares_the_heading():
     unsure = np.diag([0.1, 0.1, 0.1, 0.05, 0.05, 0.01]) ** 2
     compass = so3_exp([0, 0, np.radians(30)])
     constraint = combine(attitude_constraint(compass, np.radians(0.2), 10.0))
-    after, _ = fused(tilted, unsure, constraint)
+    after, _ = fuse(tilted, unsure, constraint)
     tilt = np.degrees(np.arccos(after.rotation[2, 2]))
     assert tilt < 0.3
     assert abs(np.degrees(np.arctan2(after.rotation[1, 0], after.rotation[0, 0]))) < 0.5

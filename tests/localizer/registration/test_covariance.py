@@ -21,7 +21,7 @@ from localizer.registration.covariance import (
     sandwich_covariance,
 )
 from localizer.registration.cpu.reference import project, projection_jacobian, retractions
-from localizer.registration.selection import mode_probabilities, thinned
+from localizer.registration.selection import mode_probabilities, subsample_anchors
 
 PLAIN = NoiseModel(1.0, floor=0.05)
 SETTINGS = LMSettings(scale=10.0)  # least squares, so that only noise acts
@@ -69,7 +69,7 @@ def test_each_step_moves_the_image_by_the_wanted_distance(problem, pose):
 
 def summed(level, pose, count):
     """Sums over about `count` of the level's anchors, as `JNGO` makes them."""
-    few, total = thinned(level, count), level.points.shape[1]
+    few, total = subsample_anchors(level, count), level.points.shape[1]
     sums = covariance_sums(anchor_model(few, *pose, SETTINGS, 16.0))
     assert sums is not None
     return replace(sums, anchors=total, share=few.points.shape[1] / total)

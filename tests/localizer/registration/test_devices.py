@@ -120,7 +120,7 @@ def test_a_gpu_that_fails_in_flight_leaves_the_cpu(monkeypatch, caplog, scene, p
     monkeypatch.setattr(driver, "Arena", lambda _device: None)
     backend = cuda_backend.CudaBackend(_Gpu())
     failed = []
-    config = JNGOConfig(hypotheses=9, keep=(4, 2))
+    config = JNGOConfig(hypotheses=9, survivors=(4, 2))
     optimizer = JNGO(config, backend, 1)
     assert optimizer.on_gpu
 

@@ -49,7 +49,7 @@ def test_converges_from_the_papers_box(jngo, scene_factory, prior, seed):
 
 def test_swarm_reaches_what_one_hypothesis_does_not(scene_factory, prior):
     """The paper's Table 4: rotation-aware sampling is what bridges large rotations."""
-    single = JNGO(JNGOConfig(hypotheses=1, keep=(1, 1)))
+    single = JNGO(JNGOConfig(hypotheses=1, survivors=(1, 1)))
     swarm = JNGO()
     reached = {"single": 0, "swarm": 0}
     for seed in range(12):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from localizer.targets.locate import RaySpread
-from localizer.targets.static import SightedRay, StaticTarget, thinned
+from localizer.targets.static import SightedRay, StaticTarget, every_second
 from localizer.types import TargetSurface
 
 PLACE = np.zeros(3)
@@ -33,6 +33,6 @@ def test_of_too_many_viewpoints_none_counts_twice():
 
 @pytest.mark.parametrize("count", [2, 3, 32, 33])
 def test_the_first_and_the_newest_are_kept(count):
-    kept = thinned(list(range(count)))
+    kept = every_second(list(range(count)))
     assert (kept[0], kept[-1]) == (0, count - 1)
     assert sorted(set(kept)) == kept

@@ -17,6 +17,7 @@ from localizer.geometry.pose import Pose
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.render.base import SKY
+from localizer.tracking import pipeline
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.pipeline import Localizer, Undistorter, working_camera
 from localizer.types import (
@@ -319,6 +320,13 @@ def test_a_frame_is_tracked_in_one_call_as_in_its_two_halves():
     assert again.track(_frame(0), passes=3, query=lambda: whole.extract_query(_frame(0))).accepted
     assert len(renderer.poses) == 3
     assert again.tracker.track_status.accepted_in_row == 1
+
+
+def test_an_image_that_an_earlier_pass_refused_is_refused(monkeypatch):
+    localizer, odds = _localizer(), iter([np.inf, -1.0])
+    monkeypatch.setattr(pipeline, "log_odds", lambda _found: next(odds))
+    localizer.set_prior(_prior(10**9))
+    assert not localizer.track(_frame(0), passes=3).accepted
 
 
 def test_a_frame_of_another_size_is_named():

@@ -11,7 +11,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.acceptance import IntegrityConfig
 from localizer.integrity.confirmation import IndependentEvidence
 from localizer.tracking.dead_reckoning import PropagationResult
-from localizer.tracking.states import RegistrationOutcome, TrackStatus, judge
+from localizer.tracking.states import RegistrationOutcome, TrackStatus, next_status
 from localizer.types import TrackingState
 
 CONFIG = IntegrityConfig(confirmations=3, degraded_after=2, lost_after=5)
@@ -35,7 +35,7 @@ def run(
 ) -> TrackStatus:
     """The machine after frames, 0.1 s and `speed_m` metres apart."""
     for n, mark in enumerate(outcomes, first):
-        machine = judge(machine, CONFIG, outcome(mark == "+", n, n * speed_m), evidence)
+        machine = next_status(machine, CONFIG, outcome(mark == "+", n, n * speed_m), evidence)
     return machine
 
 
@@ -57,19 +57,19 @@ def test_a_prediction_beyond_capture_is_lost_at_once_unless_the_odometry_carries
     """One frame a second: ten rejections were ten seconds."""
     tracking = run(TrackStatus(), "+++")
     far = replace(outcome(False, 3), beyond_capture=True)
-    assert judge(tracking, CONFIG, far).state is TrackingState.LOST
+    assert next_status(tracking, CONFIG, far).state is TrackingState.LOST
     carried = replace(far, carry=PropagationResult.CARRIED)
-    assert judge(tracking, CONFIG, carried).state is TrackingState.BRIDGING
-    assert judge(TrackStatus(), CONFIG, far).state is TrackingState.INITIALIZING
+    assert next_status(tracking, CONFIG, carried).state is TrackingState.BRIDGING
+    assert next_status(TrackStatus(), CONFIG, far).state is TrackingState.INITIALIZING
 
 
 def test_frames_without_a_reference_end_tracking_by_their_prediction_alone() -> None:
     machine = run(TrackStatus(), "+++")
     blind = replace(outcome(False, 3), counts=False)
     for _ in range(2 * CONFIG.lost_after):
-        machine = judge(machine, CONFIG, blind)
+        machine = next_status(machine, CONFIG, blind)
     assert machine.state is TrackingState.TRACKING
-    machine = judge(machine, CONFIG, replace(blind, beyond_capture=True))
+    machine = next_status(machine, CONFIG, replace(blind, beyond_capture=True))
     assert machine.state is TrackingState.LOST
 
 
@@ -78,7 +78,7 @@ def test_lost_lasts_however_often_it_is_tried_again() -> None:
     machine = run(TrackStatus(), "+" * 20)
     states = []
     for n in range(280):
-        machine = judge(machine, CONFIG, outcome(False, 20 + n))
+        machine = next_status(machine, CONFIG, outcome(False, 20 + n))
         if machine.wants_prior:
             machine = machine.proposed(independent=False)
         states.append(machine.state)
@@ -119,7 +119,7 @@ def test_a_place_that_moves_otherwise_than_the_vehicle_is_refuted() -> None:
     assert run(lost, "+" * 6, speed_m=1.0, evidence=still).state is TrackingState.LOST
     for n in range(6):
         way = IndependentEvidence(np.eye(3), (np.array([n + 0.5, 0, 0]), 0.2))
-        lost = judge(lost, CONFIG, outcome(True, n, float(n)), way)
+        lost = next_status(lost, CONFIG, outcome(True, n, float(n)), way)
     assert lost.state is TrackingState.TRACKING
 
 
@@ -148,7 +148,7 @@ def carried(carry: PropagationResult, frame: int) -> RegistrationOutcome:
 def test_rejections_that_the_odometry_carries_are_bridged_and_not_lost() -> None:
     machine = run(TrackStatus(), "+++")
     for n in range(3, 60):
-        machine = judge(machine, CONFIG, carried(PropagationResult.CARRIED, n))
+        machine = next_status(machine, CONFIG, carried(PropagationResult.CARRIED, n))
     assert machine.state is TrackingState.BRIDGING
     assert machine.last_fix_ns == 2 * SECOND // 10  # of the map, not of the odometry
     assert run(machine, "++", first=60).state is TrackingState.BRIDGING
@@ -158,14 +158,16 @@ def test_rejections_that_the_odometry_carries_are_bridged_and_not_lost() -> None
 def test_a_frame_that_shows_nothing_is_a_gap_and_a_broken_thread_is_lost() -> None:
     machine = run(TrackStatus(), "+++")
     for n in range(3, 9):
-        machine = judge(machine, CONFIG, carried(PropagationResult.CARRIED, n))
-    machine = judge(machine, CONFIG, carried(PropagationResult.GAP, 9))
+        machine = next_status(machine, CONFIG, carried(PropagationResult.CARRIED, n))
+    machine = next_status(machine, CONFIG, carried(PropagationResult.GAP, 9))
     assert machine.state is TrackingState.BRIDGING
-    machine = judge(machine, CONFIG, carried(PropagationResult.BROKEN, 10))
+    machine = next_status(machine, CONFIG, carried(PropagationResult.BROKEN, 10))
     assert machine.state is TrackingState.LOST
     assert machine.wants_prior
 
 
 def test_a_place_on_trial_is_not_bridged() -> None:
     lost = run(TrackStatus(), "-----").proposed(independent=False)
-    assert judge(lost, CONFIG, carried(PropagationResult.CARRIED, 9)).state is TrackingState.LOST
+    assert (
+        next_status(lost, CONFIG, carried(PropagationResult.CARRIED, 9)).state is TrackingState.LOST
+    )

@@ -17,9 +17,9 @@ def told(message: Any, profile: FirmwareProfile) -> set[AlertId]:
     told: dict[str, Alert | None] = {}
     config = SimpleNamespace(injection=InjectionConfig(message=message))
     shared: Any = SimpleNamespace(config=config, utc=None)
-    teller: Any = SimpleNamespace(tell=told.__setitem__)
+    notifier: Any = SimpleNamespace(notify=told.__setitem__)
     unused: Any = None
-    warnings = FixWarnings(shared, unused, teller)
+    warnings = FixWarnings(shared, unused, notifier)
     warnings.firmware(VehicleState(connected=True, version=(1, 0, 0)), profile)
     return {problem.id for problem in told.values() if problem is not None}
 

@@ -120,7 +120,7 @@ def test_only_who_never_began_is_kept_from_beginning_by_a_restart(begins, kept):
     """
     told: list[bool] = []
     file: Any = SimpleNamespace(
-        keep=lambda what: told.append(what["against"]), drop=lambda: told.append(False),
+        store=lambda what: told.append(what["against"]), drop=lambda: told.append(False),
         recall=lambda: None,
     )  # fmt: skip
     scores = [ShadowScore(begins, 100, () if begins else (RATE,))]

@@ -389,8 +389,8 @@ def test_the_angles_of_two_gimbals_are_not_mixed(other: tuple[int, int]) -> None
     assert looks(it, 2075) == pytest.approx(10.0, abs=0.01)
     assert it.other_gimbals == (other,)
     told: list[Alert] = []
-    teller = StatusNotifier(told.append)
-    watch = UnexpectedSenderMonitor(BridgeConfig(), it, teller, Counter())
+    notifier = StatusNotifier(told.append)
+    watch = UnexpectedSenderMonitor(BridgeConfig(), it, notifier, Counter())
     link: Any = SimpleNamespace(stranger="", system_id=1)
     for _ in range(3):
         watch.check(link, 20 * SECOND)

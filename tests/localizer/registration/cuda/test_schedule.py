@@ -20,7 +20,7 @@ from localizer.registration import (
 )
 from localizer.types import FeatureLevel, FeaturePyramid, PosePrior, RegistrationStatus
 
-CONFIG = JNGOConfig(hypotheses=16, keep=(6, 3), swarm_anchors=(100, 150, 150))
+CONFIG = JNGOConfig(hypotheses=16, survivors=(6, 3), swarm_anchors=(100, 150, 150))
 
 
 @pytest.fixture
@@ -56,8 +56,8 @@ def check(device, cpu, metres=3e-3, degrees=3e-3, rtol=0.02):
         {},
         {"iterations": (3, 1, 2)},
         {"sharpen": 0},
-        {"hypotheses": 1, "keep": (1, 1)},
-        {"keep": (16, 16), "distinct_px": 0.02},
+        {"hypotheses": 1, "survivors": (1, 1)},
+        {"survivors": (16, 16), "duplicate_px": 0.02},
         {"swarm_anchors": (40, 1000, 70)},
     ],
     ids=str,
@@ -91,7 +91,7 @@ def test_agrees_with_a_prediction_and_a_constraint(registered, scene, prior):
 
 def test_the_prediction_does_not_prune(registered, scene, prior):
     """One survivor a level, and a prediction that would rather keep a hypothesis that is worse."""
-    config = replace(CONFIG, keep=(1, 1), motion_weight=100.0)
+    config = replace(CONFIG, survivors=(1, 1), motion_weight=100.0)
     about = prior(scene.reference, 1.0, 3.0)
     arguments = (scene.query, scene.camera, scene.anchors, about)
     far = replace(scene.true, rotation=so3_exp([0.0, 0.1, 0.0]) @ scene.true.rotation)
@@ -242,7 +242,7 @@ def test_features_on_the_device_are_used_in_place(emulator, registered, scene, p
 
 def test_no_barrier_is_missing(emulator, registered, scene, prior):
     """The bits do not depend on the order in which the threads run between barriers."""
-    register = registered(replace(CONFIG, hypotheses=6, keep=(3, 2)))
+    register = registered(replace(CONFIG, hypotheses=6, survivors=(3, 2)))
     arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.5))
     expected = register(*arguments)
     for order in (1, 5):

@@ -43,7 +43,7 @@ class MissionLimits:
 
 
 @dataclass(frozen=True)
-class JudgedSample:
+class SampleVerdict:
     """A sample with the worst of its forecasts, over the conditions."""
 
     sample: PathSample
@@ -63,28 +63,28 @@ class LegVerdict:
     """
 
     leg: FlightLeg
-    judged: tuple[JudgedSample, ...]
+    samples: tuple[SampleVerdict, ...]
     times: int = 1
 
     @property
     def holds(self) -> bool:
         """Whether every sample holds."""
-        return all(j.holds for j in self.judged)
+        return all(j.holds for j in self.samples)
 
     @property
     def share(self) -> float:
         """Share of the samples that hold."""
-        return float(np.mean([j.holds for j in self.judged]))
+        return float(np.mean([j.holds for j in self.samples]))
 
     @property
-    def worst(self) -> JudgedSample:
+    def worst(self) -> SampleVerdict:
         """The sample with the largest risk."""
-        return max(self.judged, key=lambda j: (not j.holds, j.forecast.risk))
+        return max(self.samples, key=lambda j: (not j.holds, j.forecast.risk))
 
     @property
     def sigma_m(self) -> float:
         """Median sigma of the samples that hold; NaN without any."""
-        held = [j.forecast.sigma_m for j in self.judged if j.holds]
+        held = [j.forecast.sigma_m for j in self.samples if j.holds]
         return float(np.median(held)) if held else math.nan
 
 
@@ -107,12 +107,12 @@ class VisionGap:
         return self.end_m - self.begin_m
 
 
-def judge(
+def sample_verdict(
     sample: PathSample, forecasts: Sequence[ViewForecast], limits: MissionLimits
-) -> JudgedSample:
+) -> SampleVerdict:
     """The sample's result under its worst condition."""
     worst = max(forecasts, key=lambda f: (_reason(f, limits) is not Reason.NONE, f.risk, f.sigma_m))
-    return JudgedSample(sample, worst, _reason(worst, limits))
+    return SampleVerdict(sample, worst, _reason(worst, limits))
 
 
 def _reason(forecast: ViewForecast, limits: MissionLimits) -> Reason:
@@ -142,7 +142,7 @@ def stretches(
     for verdict in verdicts:
         half = verdict.leg.step_m / 2
         seconds = verdict.leg.step_m / (verdict.leg.speed_m_s or speed_m_s)
-        for judged in (j for j in verdict.judged if not j.holds):
+        for judged in (j for j in verdict.samples if not j.holds):
             begin, end = judged.sample.way_m - half, judged.sample.way_m + half
             off_map = judged.reason in (Reason.NO_MAP, Reason.EDGE)
             if found and begin - found[-1][1] < 1e-6 + 0.01 * half:

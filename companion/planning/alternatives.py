@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.planning.judge import JudgedSample, LegVerdict
 from companion.planning.survey import Progress, Surveyor, moved
+from companion.planning.verdicts import LegVerdict, SampleVerdict
 from companion.planning.way import PathSample
 
 _HEIGHT_FACTORS = (0.6, 1.5, 2.2)
@@ -35,7 +35,7 @@ class LegAlternative:
 
 
 @dataclass(frozen=True)
-class Instead:
+class LegProposal:
     """The best alternative for a leg. risk: largest of its samples, 0 to 1; holds: whether vision
     is sufficient at all of them.
     """
@@ -47,9 +47,9 @@ class Instead:
     holds: bool
 
 
-def instead(
+def leg_proposals(
     surveyor: Surveyor, verdicts: Sequence[LegVerdict], fixed: bool, progress: Progress | None
-) -> tuple[Instead, ...]:
+) -> tuple[LegProposal, ...]:
     """Find the alternative with the lowest risk for each of the longest failing legs, if it is
     better. fixed: the camera turns only with the vehicle.
     """
@@ -58,7 +58,7 @@ def instead(
     )[:_LEGS]
     tried: list[tuple[LegVerdict, LegAlternative, list[PathSample]]] = []
     for verdict in bad:
-        worst = sorted((j for j in verdict.judged if not j.holds), key=lambda j: -j.forecast.risk)[
+        worst = sorted((j for j in verdict.samples if not j.holds), key=lambda j: -j.forecast.risk)[
             :_SAMPLES
         ]
         for change in changes(worst[0], fixed):
@@ -66,8 +66,8 @@ def instead(
                 moved(j.sample, change.rise_m, change.pitch_deg, change.turn_deg) for j in worst
             ]
             tried.append((verdict, change, samples))
-    judged = iter(surveyor.judged([s for _, _, part in tried for s in part], progress))
-    found: dict[str, Instead] = {}
+    judged = iter(surveyor.verdicts([s for _, _, part in tried for s in part], progress))
+    found: dict[str, LegProposal] = {}
     for verdict, change, samples in tried:
         results = [next(judged) for _ in samples]
         option = _option(verdict.leg.name, change, results)
@@ -79,7 +79,7 @@ def instead(
     return tuple(found[v.leg.name] for v in bad if v.leg.name in found)
 
 
-def changes(worst: JudgedSample, fixed: bool) -> list[LegAlternative]:
+def changes(worst: SampleVerdict, fixed: bool) -> list[LegAlternative]:
     """Alternatives to try at a sample; for a fixed camera only heights and headings."""
     sample, ground = worst.sample, worst.forecast.ground_m
     options = []
@@ -103,8 +103,8 @@ def changes(worst: JudgedSample, fixed: bool) -> list[LegAlternative]:
     return options
 
 
-def _option(leg: str, change: LegAlternative, results: Sequence[JudgedSample]) -> Instead:
+def _option(leg: str, change: LegAlternative, results: Sequence[SampleVerdict]) -> LegProposal:
     worst = max(results, key=lambda j: (not j.holds, j.forecast.risk))
-    return Instead(
+    return LegProposal(
         leg, change, worst.forecast.risk, worst.forecast.sigma_m, all(j.holds for j in results)
     )
