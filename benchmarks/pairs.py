@@ -1,6 +1,6 @@
 """How fast training pairs are made: places in processes, pairs on a device and on the CPU.
 
-    python -m benchmarks.pairs configs/train_s0.yaml --pairs 4
+    python -m benchmarks.pairs configs/train_s0.yaml --pairs 4 [--json out.json]
 
 One process, one thread, places of the run's own size. "torch" is what `training.data.live`
 does (views, appearance, windows), on a GPU where there is one; "NumPy" makes pairs of the same
@@ -14,7 +14,8 @@ import time
 import cv2
 import numpy as np
 
-from benchmarks.common.arguments import Parser, existing, whole
+from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
@@ -69,6 +70,7 @@ def main() -> None:
         "--pairs", type=whole(1, 10_000), default=4, help="in one batch on the device"
     )
     parser.add_argument("--no-photos", action="store_true", help="generated ground alone")
+    parser.add_argument("--json", type=output, help="the table, for benchmarks.site.keep")
     args = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -82,12 +84,13 @@ def main() -> None:
     began = time.perf_counter()
     places = [make_place(data.first_seed + k, scenes, photos, data.flight_days) for k in (1, 2)]
     each = (time.perf_counter() - began) / len(places)
-    print(
-        f"place of {data.cells} cells with {data.flight_days} flight days: {each:.2f} s on one core"
-    )
+    place = f"place of {data.cells} cells with {data.flight_days} flight days, one core"
+    rows = [(place, f"{each:.2f} s")]
+    print(*rows[-1], flush=True)
     numpy_pairs(places[0], scenes, loader, 1)
     made, seconds = numpy_pairs(places[0], scenes, loader, min(args.pairs, _ON_CPU))
-    print(f"NumPy, one core: {made / seconds:.2f} pairs/s")
+    rows.append(("pairs by NumPy, one core", f"{made / seconds:.2f} /s"))
+    print(*rows[-1], flush=True)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     plan = LivePlan(data.first_seed, data.scenes, 2, 1, data.flight_days)
     stream = LiveStream(plan, scenes, photos, loader, run.seed, device)
@@ -98,7 +101,10 @@ def main() -> None:
         made, seconds = device_pairs(stream, loader, args.pairs)
     finally:
         stream.close()
-    print(f"torch on {device}: {made / seconds:.2f} pairs/s")
+    rows.append((f"pairs by torch on {device}", f"{made / seconds:.2f} /s"))
+    print(*rows[-1])
+    if args.json is not None:
+        write_figures(args.json, ("training data", "found"), rows)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Time of feature extraction: `tiny` and `s0` on every execution provider there is, in one table.
 
-    python -m benchmarks.features.network_speed [--s0 MODEL.onnx] [--threads 2]
+    python -m benchmarks.features.network_speed [--s0 MODEL.onnx] [--threads 2] [--json out.json]
 
 Without a model of `s0` an untrained one is exported (extra `train`): weights do not change its
 time. "to host" is what `extract` takes, with every feature copied back; "on device" leaves them on
@@ -17,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.arguments import Parser, existing, whole
+from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
 from localizer.features import OnnxExtractor
@@ -27,6 +28,7 @@ from localizer.types import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZES = ((320, 240), (512, 512))
+COLUMNS = ("network", "provider", "size", "to host, ms", "on device, ms")
 
 
 @dataclass(frozen=True)
@@ -98,14 +100,11 @@ def measure(
                 yield SpeedRow(extractor.info.name, provider, size, host, device)
 
 
-def table(rows: Sequence[SpeedRow]) -> str:
-    """As Markdown."""
-    lines = ["| network | provider | size | to host, ms | on device, ms |", "|---|---|---|---|---|"]
-    for r in rows:
-        device = "" if r.on_device is None else f"{r.on_device:.2f}"
-        size = f"{r.size[0]} x {r.size[1]}"
-        lines.append(f"| {r.model} | {r.provider} | {size} | {r.to_host:.2f} | {device} |")
-    return "\n".join(lines)
+def cells(row: SpeedRow) -> tuple[str, ...]:
+    """As `COLUMNS` names them."""
+    device = "-" if row.on_device is None else f"{row.on_device:.2f}"
+    size = f"{row.size[0]} x {row.size[1]}"
+    return row.model, row.provider, size, f"{row.to_host:.2f}", device
 
 
 def main() -> None:
@@ -115,10 +114,12 @@ def main() -> None:
     parser.add_argument(
         "--count", type=whole(1, 100_000), default=30, help="calls that are counted"
     )
+    parser.add_argument("--json", type=output, help="the table, for benchmarks.site.keep")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         models = [SHIPPED_MODEL, *(args.s0 or untrained_s0(Path(folder)))]
-        print(table(list(measure(models, SIZES, args.threads, args.count))))
+        rows = [cells(row) for row in measure(models, SIZES, args.threads, args.count)]
+        show_figures(args.json, COLUMNS, rows)
 
 
 if __name__ == "__main__":

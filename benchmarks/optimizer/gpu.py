@@ -1,6 +1,6 @@
 """The GPU's part of the optimizer benchmark, beside the paper's Table 7; '-' where there is none.
 
-    python -m benchmarks.optimizer.gpu
+    python -m benchmarks.optimizer.gpu [--json out.json]
 
 Device events, median of many after warm-up. One iteration is (7 iterations - 1) / 6 of a launch,
 which starts from the same poses each time.
@@ -18,7 +18,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.common.arguments import Parser
+from benchmarks.common.arguments import Parser, output
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.optimizer.problem import SIZES, make_problem, make_swarm, naive_torch
 from localizer.geometry.camera import Camera
@@ -38,6 +39,7 @@ from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid
 
 REPEATS, WARM_UP = 50, 5
+COLUMNS = ("measured on the GPU", "size, pixels", "ms")
 SETTINGS = LMSettings(min_overlap=0.01)
 _SEARCH = JNGOConfig(
     iterations=(2, 3, 4), sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01,
@@ -192,8 +194,12 @@ def schedule_ms(
     )
 
 
-def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Poses) -> None:
-    """The GPU tables; without a GPU the same tables with '-' and the reason."""
+def print_tables(
+    console: Console, problems: dict[int, LevelProblem], swarm: Poses
+) -> list[tuple[str, ...]]:
+    """The GPU tables; without a GPU the same tables with '-' and the reason. The measured figures
+    as rows of `COLUMNS`.
+    """
     sizes = tuple(problems)
     rows: dict[str, list[float | None]] = {
         name: [None] * len(sizes) for name in ("naive PyTorch", "fused float32", "fused float16")
@@ -223,6 +229,13 @@ def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Pos
     console.print(table)
     for note in notes:
         console.print(note)
+    return [
+        *((f"LM iteration, {name}", f"{size} x {size}", "-" if ms is None else f"{ms:.4f}")
+          for name, values in rows.items() for size, ms in zip(sizes, values, strict=True)),
+        *((f"registration {label}, {kind}: {part}", "128, 256, 512", ms)
+          for label, kind, *both, _ in schedules
+          for part, ms in zip(("upload", "graph"), both, strict=True)),
+    ]  # fmt: skip
 
 
 def measure(
@@ -261,8 +274,13 @@ def measure(
 
 
 def main() -> None:
-    Parser(__doc__).parse_args()
-    print_tables(Console(), {size: make_problem(size) for size in SIZES}, make_swarm())
+    parser = Parser(__doc__)
+    parser.add_argument("--json", type=output, help="the figures, for benchmarks.site.keep")
+    args = parser.parse_args()
+    problems = {size: make_problem(size) for size in SIZES}
+    rows = print_tables(Console(), problems, make_swarm())
+    if args.json is not None:
+        write_figures(args.json, COLUMNS, rows)
 
 
 if __name__ == "__main__":

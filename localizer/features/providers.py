@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import io
 import logging
 import os
 from collections.abc import Callable, Sequence
@@ -101,7 +103,18 @@ def start_session(
 
 def available_providers() -> list[str]:
     """Full names of the usable execution providers on this computer."""
-    return [*ort.get_available_providers(), *([_OPENVINO] if is_worthwhile() else [])]
+    names = ort.get_available_providers()
+    if _CUDA in names:
+        load_cuda_packages()
+    return [*names, *([_OPENVINO] if is_worthwhile() else [])]
+
+
+@functools.cache
+def load_cuda_packages() -> None:
+    """Load CUDA and cuDNN from Python packages, where onnxruntime does not look by itself."""
+    with contextlib.redirect_stdout(io.StringIO()) as told:
+        ort.preload_dlls(directory="")
+    _log.debug("features: %s", told.getvalue())
 
 
 def _started(

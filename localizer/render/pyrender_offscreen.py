@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # before OpenGL is imported
+os.environ.setdefault("PYGLET_HEADLESS", "true")  # pyrender imports it; X libraries may be missing
 
 import cv2
 import numpy as np
 import pyrender
 from OpenGL import GL
+from OpenGL.plugins import FormatHandler
 from pyrender.renderer import Renderer
 from pyrender.shader_program import ShaderProgramCache
 
@@ -30,6 +32,13 @@ from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import TileMesh
 from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
 from localizer.types import RenderedView
+
+# PyOpenGL 3.1.0, which pyrender asks for, does not know what Python 3.12 calls references.
+FormatHandler(
+    "ctypesparameter",
+    "OpenGL.arrays.ctypesparameters.CtypesParameterHandler",
+    ["_ctypes.CArgObject"],
+)
 
 _REPEAT, _CLAMP_TO_EDGE = 10497, 33071
 _LINEAR, _LINEAR_MIPMAP_NEAREST = 9729, 9985

@@ -212,3 +212,19 @@ def test_a_cache_folder_that_takes_no_engine_is_told(
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith("features: TensorRT's engine is not kept: ")
     assert str(tmp_path / "tensorrt") in caplog.messages[0]
+
+
+def test_cuda_is_loaded_from_python_packages_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def preload(directory: str) -> None:
+        asked.append(directory)
+
+    providers.load_cuda_packages.cache_clear()
+    monkeypatch.setattr(ort, "preload_dlls", preload)
+    for names, expected in ((["CPU"], []), (["CUDA", "CPU"], [""]), (["CUDA", "CPU"], [""])):
+        there = [f"{name}ExecutionProvider" for name in names]
+        monkeypatch.setattr(ort, "get_available_providers", lambda there=there: there)
+        assert set(there) <= set(providers.available_providers())
+        assert asked == expected
+    providers.load_cuda_packages.cache_clear()
