@@ -26,7 +26,7 @@ class RelocalizationConfig(BaseModel):
         1.35, ge=1.0, le=2.0, description="ratio of heights that share one feature extraction"
     )
     patch_m: float = Field(
-        130.0, ge=40, le=2000, description="largest side of the compared ground, at 0.5 m a pixel"
+        128.0, ge=40, le=2000, description="largest side of the compared ground, at 0.5 m a pixel"
     )
     candidates: int = Field(
         96, ge=1, le=400, description="largest number of candidates rendered at half size"
