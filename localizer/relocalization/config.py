@@ -18,7 +18,7 @@ class RelocalizationConfig:
     heading_reach: float = 2.0  # range of headings, in sigmas
     scale_step: float = 1.1  # ratio of neighbouring heights above ground
     extraction_ratio: float = 1.35  # ratio of heights that share one feature extraction
-    patch_m: float = 130.0  # largest side of the compared ground, at 0.5 m a pixel
+    patch_m: float = 128.0  # largest side of the compared ground, at 0.5 m a pixel
     candidates: int = 96  # largest number of candidates rendered at half size
     finalists: int = 4  # of these, the number that is registered
     passes: int = 3  # renderings of a candidate, each from the last pose
