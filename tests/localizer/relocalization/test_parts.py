@@ -41,7 +41,7 @@ def level(features):
 
 
 def test_a_region_is_an_ellipse():
-    region = SearchRegion.from_covariance(np.array([10.0, -5.0]), np.diag([4.0, 100.0]), 3.0)
+    region = SearchRegion(np.array([10.0, -5.0]), np.diag([36.0, 900.0]))
     assert region.contains(np.array([[10, 24], [15.9, -5], [16.1, -5], [10, 26]])).tolist() == [
         True, True, False, False,
     ]  # fmt: skip
