@@ -106,8 +106,8 @@ HEALTH: tuple[AlertSpec, ...] = (
     event(A.ENDING, NOTICE, "ending, nothing is injected any more", {},
           "the program was stopped or its video ended (no crash)", _NO_FIX, _BY_HAND),
     event(A.COMPANION_RESTARTS, CRITICAL, "companion {how} ({what}), restarting",
-          {"how": ProcessFault, "what": "name"}, "the flight process crashed, was killed, or "
-          "hangs (a thread for 4 s, the process for 3 s)",
+          {"how": ProcessFault, "what": "name"}, "with `companion run --supervised`: the flight "
+          "process crashed, was killed, or hangs (a thread for 4 s, the process for 3 s)",
           f"the supervisor starts it again at once; {_NO_FIX} for some seconds", _WAIT),
     event(A.COMPANION_WAITS, CRITICAL, "companion {how} ({what}), again in {seconds:.0f} s",
           {"how": ProcessFault, "what": "name", "seconds": "s"},
