@@ -40,6 +40,8 @@ whose condition holds.
 Alerts of localization are assessed once a second; the same one is sent at most every 10 s. An alert
 whose row does not mention fixes or positions has no effect on them.
 
+*Fixes are sent* means that this alert does not stop them; another alert can.
+
 The end of an alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the
 text in brackets. The end of the rest shows by the next status, for example `localization tracking`.
 """

@@ -195,7 +195,10 @@ INJECTION: tuple[AlertSpec, ...] = (
           _NONE),
     condition(A.YAW_UNCHECKED, WARNING, "yaw not checked: no attitude or gimbal", {},
               "20 fixes in a row had no attitude or no gimbal angles for their time",
-              "a fix has both", f"{_SENT}; a wrong yaw of vision would not be detected",
+              "a fix has both",
+              "a wrong yaw of vision would not be detected; fixes are sent, but not with "
+              "bridge.injection.message odometry if ATTITUDE is missing (`no_attitude`), and not "
+              "if the yaw guard already blocks (`yaw_mismatch`)",
               "check the rates of ATTITUDE and the gimbal messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
@@ -203,6 +206,6 @@ INJECTION: tuple[AlertSpec, ...] = (
               "clock is set",
               f"{_SENT}, without a time", "set the companion's clock, for example by NTP"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": "name"},
-          "the .tlog cannot be written", f"{_SENT}; MAVLink messages are not recorded",
+          "the .tlog cannot be written", "MAVLink messages are not recorded",
           "check the disk after landing"),
 )  # fmt: skip

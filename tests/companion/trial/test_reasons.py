@@ -151,7 +151,7 @@ def test_a_search_is_wrong_where_neither_record_nor_registration_agree(cache):
     assert trial.search_outcome() == (3, 2, 1)
 
 
-@pytest.mark.parametrize(("count", "kind"), [(1, UNKNOWN), (4, NOT)])
+@pytest.mark.parametrize(("count", "kind"), [(0, UNKNOWN), (1, UNKNOWN), (4, NOT)])
 def test_too_few_frames_give_no_verdict_against_a_place(cache, count, kind):
     """One photo of a folder that works was judged as "does not work"."""
     flight = _flight(cache.frame, [(0.0, 0.0)] * count, ())
