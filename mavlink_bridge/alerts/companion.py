@@ -96,7 +96,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               f"{_SENT}, with a scaled camera model; if the camera crops, they are wrong",
               "set the camera to the calibrated resolution"),
     condition(A.MAP_UNREADABLE, WARNING, "map unreadable", {}, "map tiles cannot be read from disk",
-              "every tile that failed is read; one that is not needed again keeps it up",
+              "every tile that failed was read later; the alert stays while a failed tile is not "
+              "needed again",
               "fixes are less accurate, because coarser tiles replace them",
               "check the disk after landing"),
     condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {},

@@ -21,8 +21,8 @@ _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
 INJECTION: tuple[AlertSpec, ...] = (
     event(A.INJECTING, INFO, "injecting", {},
-          "mode inject: fixes are sent again, 1.5 s after a *not sent* alert ended; up to 60 s "
-          "after it if it recurs", "the autopilot receives fixes", _NONE),
+          "mode inject: the first fix is sent; again 1.5 s after a *not sent* alert ended, or up "
+          "to 60 s after it if it recurs", "the autopilot receives fixes", _NONE),
     condition(A.NO_FIX_YET, WARNING, "no fix yet", {}, "no fix since the start; never sent as text",
               "the first fix", "vision has no position, so nothing is sent", _WAIT,
               lead=_NOT_SENT),

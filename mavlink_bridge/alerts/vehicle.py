@@ -171,7 +171,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "the operator gives a position", "until the position is found, at most for 2 min, the "
           "map is searched within twice this radius", _NONE),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
-          "the operator gives a position farther from the map than twice its radius",
+          "the operator gives a position farther from the map than twice the radius given with it",
           "the search continues without it",
           "give a position on the map"),
 )  # fmt: skip
