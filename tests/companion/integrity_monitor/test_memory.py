@@ -34,7 +34,7 @@ class Kept:
     def recall(self) -> tuple[dict[str, Any], float] | None:
         return None if self.told is None else (self.told, 4.0)
 
-    def keep(self, told: dict[str, Any]) -> None:
+    def store(self, told: dict[str, Any]) -> None:
         self.told = json.loads(json.dumps(told))
 
     def drop(self) -> None:
