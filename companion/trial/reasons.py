@@ -14,7 +14,7 @@ from companion.sources.folder_source import read_image
 from companion.trial.estimate import Estimated
 from companion.trial.localize import Localized, horizontal_m
 from companion.trial.priors import FramePrior
-from localizer.map.kind import HEIGHTS_HOLD, MapKind
+from localizer.map.kind import MapKind
 from localizer.types import Image
 
 _WIDTH_PX = 640
@@ -126,7 +126,8 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
 
 def _map_reason(kind: MapKind | None) -> str:
     if kind is not None and not kind.has_buildings:
-        return f"map of another kind than the image: {HEIGHTS_HOLD[kind.heights]}"
+        what = "flat" if kind.heights == "flat" else "bare terrain"
+        return f"the map is {what} without buildings and trees; use a surface model, which has them"
     return "image and map agree too little: a map of another season, date or sensor"
 
 
