@@ -103,8 +103,9 @@ def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
 def camera_rotation(gimbal: GimbalAttitude) -> Array:
     """Rotation (3, 3) world_from_camera by the gimbal's report.
 
-    The axes are those at the map's origin and not at the vehicle: this error is 0.1° at 10 km, far
-    below the gimbal's.
+    The gimbal reports against north, east and down at the vehicle. The world axes are east, north
+    and up at the map's origin. The difference is ignored: 0.1° at 10 km, far below the gimbal's
+    error.
     """
     world_from_camera: Array = (
         NED_FROM_ENU.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA

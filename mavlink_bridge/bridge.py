@@ -369,8 +369,8 @@ class Bridge:
         return self._fc.outcome.verdict
 
     def counters(self) -> Figures:
-        """Counters of links and injection, None where unknown; the prefix of a key names its
-        source.
+        """Counters, measurements and texts of links and injection, None where unknown. The prefix
+        of most keys names the source: the link's name, `inject`, `bridge` or `rx`.
         """
         result: Figures = {}
         for link in self._links:

@@ -54,6 +54,7 @@ FC_WANTED = frozenset(
         "TIMESYNC",
         "GPS_GLOBAL_ORIGIN",
         "COMMAND_ACK",
+        "STATUSTEXT",
     )
 )
 

@@ -351,8 +351,6 @@ class VehicleState:
     version: tuple[int, int, int] | None = None
     profile: str = "generic"
     """Name of the firmware's profile (mavlink_bridge/vehicle/profile.py)."""
-    vehicle_type: int = 0
-    """MAV_TYPE."""
     armed: bool = False
     custom_mode: int = 0
     mode: str = ""
@@ -361,11 +359,8 @@ class VehicleState:
     """MAV_STATE."""
     ekf_flags: int = 0
     """EKF_STATUS_FLAGS; PX4's ESTIMATOR_STATUS_FLAGS share their first bits."""
-    ekf_velocity_variance: float | None = None
-    """The innovations' test ratio, rejected above 1; as the three that follow."""
     ekf_horizontal_variance: float | None = None
-    ekf_vertical_variance: float | None = None
-    ekf_compass_variance: float | None = None
+    """Test ratio of the position's innovations, rejected above 1."""
     origin: Origin | None = None
     """Of the EKF, as it was read."""
     latitude_deg: float | None = None
@@ -382,7 +377,6 @@ class VehicleState:
     local_time_ns: int = 0
     gps_fix_type: int = 0
     """GPS_FIX_TYPE; 3 is a 3D fix."""
-    gps_satellites: int = 0
     gps_latitude_deg: float | None = None
     """The receiver's own position (GPS_RAW_INT)."""
     gps_longitude_deg: float | None = None
@@ -394,16 +388,12 @@ class VehicleState:
     gps_time_ns: int = 0
     rc_channels_us: tuple[int, ...] = ()
     """Pulse widths of the pilot's channels, first to eighteenth."""
-    rc_time_ns: int = 0
-    heartbeat_age_s: float | None = None
     reboots: int = 0
     """How often the autopilot started over on this link."""
     clock_offset_ns: int | None = None
     """CLOCK_MONOTONIC minus the autopilot's boot time."""
     clock_source: str = "none"
     """What the offset comes from."""
-    last_text: str = ""
-    """The autopilot's newest STATUSTEXT."""
     pressure_altitude_m: float | None = None
     """Of the barometer alone in the standard atmosphere: only its changes mean something."""
     pressure_time_ns: int = 0

@@ -84,8 +84,9 @@ class OperatorStatus:
         return not bad or now_ns - self._reported_ns.get(alert.key, -_AGAIN_NS) >= _AGAIN_NS
 
     def report(self, alert: Alert, now_ns: int | None = None) -> None:
-        """Send an alert as STATUSTEXT and log it. The same alert is left out if it is repeated
-        within a second, so that many refused commands do not hide other alerts.
+        """Send an alert as STATUSTEXT, log it and pass it on. It is left out if it equals the last
+        alert, with its values, and follows within a second: so many refused commands do not hide
+        other alerts. now_ns: None for the own clock.
         """
         if self._is_repeated(alert, self._clock() if now_ns is None else now_ns):
             return

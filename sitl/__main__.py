@@ -8,6 +8,7 @@ import shlex
 import shutil
 import signal
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, get_args
@@ -197,12 +198,14 @@ def loop(
     seeds: Annotated[str, typer.Option(help="world, light and noise: 5, or 1..10")] = "5",
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
     scenarios: Annotated[Path, typer.Option(help="folder of flights")] = LOOP_SCENARIOS,
+    resume: Annotated[bool, typer.Option("--resume", help="skip flights that --out holds")] = False,
 ) -> None:
     """Fly the whole companion with injected faults, one flight a time; exit 1: one fails."""
     cases, (console, options) = (
         load_loop_cases(only or (), scenarios),
         _runner(fc, out, seeds, worlds),
     )
+    options = replace(options, resume=resume)
     rows = fly_loop(cases, options, lambda row: print_loop_row(console, row))
     console.print(escape(markdown(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)

@@ -53,25 +53,6 @@ def test_results_of_one_form_stand_together_and_others_are_refused(tmp_path):
         with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)
 
 
-def test_a_pursuit_s_table_says_why_a_car_was_not_followed(tmp_path):
-    verdict = {
-        "is_followed": False, "why": ["last seen 3.0 s after the click, of 60"], "seen": 4,
-        "reports": 9, "back_s": [0.5, float("inf")], "p50_m": 0.4, "p95_m": 0.5, "max_m": 0.7,
-        "inside_percent": 100.0, "velocity_p95_mps": float("nan"), "foreign": 0,
-    }  # fmt: skip
-    flown = {"vehicle": "embedded", "seed": 1, "error": "", "begin_ns": 1, "verdict": verdict}
-    rows = [{**flown, "draw": 7}, {**flown, "draw": 8, "verdict": None, "error": "no origin"}]
-    path = tmp_path / "follow.json"
-    path.write_text(json.dumps(rows))
-    table, _ = tables_of([path], "")
-    assert table.rows[0][:4] == (
-        "embedded, world 1, draw 7", "**no**: last seen 3.0 s after the click, of 60", "4 of 9",
-        "0.5, inf",
-    )  # fmt: skip
-    assert table.rows[1][1] == "**not flown**: no origin"
-    assert all(len(row) == len(table.columns) for row in table.rows)
-
-
 def test_a_flights_report_is_read_in_the_maps_frame(tmp_path):
     path = tmp_path / "report.json"
     path.write_text(json.dumps(FLIGHT))

@@ -7,14 +7,16 @@ FOLDER keeps the maps between runs. Each image begins from a prior up to 10 m of
 the height (3 m) are reported with the stated sigma, or not at all. A registration is right where
 the middle of its image lies on its true ground. NEES: squared error over the claimed covariance and
 the truth's own, per degree of freedom, the median of the accepted. --search: each image without a
-prior, heading unknown, on its map and on one that does not hold it. --displaced N: N times from
-priors 45 to 110 m off that claim 6 m, roll and pitch known to 1 degree. --rivals: SIFT, XFeat and
-ALIKED + LightGlue on the same images, those that are installed.
+prior, heading unknown, on its map and on one that does not hold it. --rivals: SIFT, XFeat and
+ALIKED + LightGlue on the same images, those that are installed. --displaced N: only wrong priors, N
+of each image, 45 to 110 m off while they claim 6 m, with roll and pitch known to 1 degree.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,7 @@ with needs_torch():
     )
     from benchmarks.real.rivals import load_rivals, rival_images
     from benchmarks.real.searched import searched_images
-    from benchmarks.real.sets import SETS, describe, load
+    from benchmarks.real.sets import SETS, RealView, describe, load
 from companion.versions import made_by
 
 _JUDGED_AT = 1.0  # degrees of attitude, of rivals and displaced priors
@@ -75,13 +77,19 @@ def main() -> None:
     views = {name: load(name, args.folder, args.data) for name in args.sets}
     judged: list[JudgedImage] = []
     rows: list[dict[str, Any]] = []
+    result: dict[str, Any] = {"settings": {"width": args.width}, "versions": made_by()}
+    if args.displaced:
+        result["displaced"] = [_displaced(name, views[name], args) for name in args.sets]
+        print(displaced_table(result["displaced"]))
+        _write(result, args.json)
+        return
     for name in args.sets:
         for attitude in wanted:
             images = list(judged_images(name, describe(name), views[name], attitude, args.width))
             judged += images
             rows.append(judged_row(images))
             print(judged_table(rows[-1:]).splitlines()[-1], flush=True)
-    result: dict[str, Any] = {"settings": {"width": args.width}, "judged": rows}
+    result["judged"] = rows
     print(judged_table(rows))
     if args.search:
         result["searched"] = [
@@ -90,20 +98,6 @@ def main() -> None:
             if name in _SEARCHED
         ]
         print(searched_table(result["searched"]))
-    if args.displaced:
-        result["displaced"] = [
-            displaced_row(
-                [
-                    image
-                    for seed in range(args.displaced)
-                    for image in judged_images(
-                        name, describe(name), views[name], _JUDGED_AT, args.width, seed
-                    )
-                ]
-            )
-            for name in args.sets
-        ]
-        print(displaced_table(result["displaced"]))
     if args.rivals:
         rivals, at = load_rivals(), [i for i in judged if i.attitude_deg == _JUDGED_AT]
         matched = [
@@ -115,11 +109,23 @@ def main() -> None:
         ]
         result["rivals"] = rival_rows(matched, at)
         print(rival_table(result["rivals"]))
-    if args.json:
-        result |= {"images": [asdict(i) for i in judged], "versions": made_by()}
-        args.json.write_text(json.dumps(result, indent=1))
+    _write(result | {"images": [asdict(i) for i in judged]}, args.json)
     if args.plot:
         plot(judged, args.plot)
+
+
+def _displaced(name: str, views: Sequence[RealView], args: Any) -> dict[str, Any]:
+    """The row of one set from all its wrong priors."""
+    images = [
+        judged_images(name, describe(name), views, _JUDGED_AT, args.width, seed)
+        for seed in range(args.displaced)
+    ]
+    return displaced_row(list(itertools.chain.from_iterable(images)))
+
+
+def _write(result: dict[str, Any], path: Path | None) -> None:
+    if path is not None:
+        path.write_text(json.dumps(result, indent=1))
 
 
 def _map_of(name: str, args: Any) -> Path:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.real.judged import JudgedImage
-from benchmarks.real.rivals import RivalImage
-from benchmarks.real.searched import SearchedImage
+if TYPE_CHECKING:
+    from benchmarks.real.judged import JudgedImage
+    from benchmarks.real.rivals import RivalImage
+    from benchmarks.real.searched import SearchedImage
 
 FOUND_M = 6.0  # an answer of the search within this is right
 

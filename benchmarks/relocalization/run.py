@@ -158,5 +158,5 @@ def table(outcomes: Sequence[ViewOutcome]) -> str:
 
 def with_threads(config: LocalizerConfig, threads: int) -> LocalizerConfig:
     """The configuration with so many threads for a search."""
-    places = config.relocalization.model_copy(update={"threads": threads})
+    places = replace(config.relocalization, threads=threads)
     return config.model_copy(update={"relocalization": places})

@@ -23,16 +23,24 @@ An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `h
 identifier. *Fix*: a position from vision; it is sent in mode inject, and in mode rc while injection
 is enabled. *Sent* refers to these modes. *Output held*: no position is sent. *Exclude and
 reset*: as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the
-switch to vision do not start; injection that is running continues. The pilot (mode rc) and
-`bridge.injection.force` override *inhibit* and *not ready*. *Event*: it has no end. PX4 sends
-ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
+switch to vision do not start; injection that is running continues. If the program crashes before
+injection has started, and restarts within 10 min, an alert that inhibits stays active. The pilot
+(mode rc) and `bridge.injection.force` override *inhibit* and *not ready*. *Event*: it has no end.
+PX4 sends ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 
 A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
 the shadow check, which compares fixes with the EKF's position on GNSS over two minutes. It becomes
 a STATUSTEXT in mode inject only, if fixes come but injection has not started for 10 s. It ends
-after 50 or more compared fixes; without GNSS a failed check stays failed.
+after 50 or more compared fixes; without GNSS a failed check stays failed. *Valid pass*: the check
+passed at most 10 min ago, and at most 30 s before the last comparison of a fix with GNSS.
+
+Of the six alerts `fix_rate_low` to `ekf_rejects_fixes` only one is active: the first in the table
+whose condition holds.
+
 Alerts of localization are assessed once a second; the same one is sent at most every 10 s. An alert
 whose row does not mention fixes or positions has no effect on them.
+
+*Fixes are sent* means that this alert does not stop them; another alert can.
 
 The end of an alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the
 text in brackets. The end of the rest shows by the next status, for example `localization tracking`.

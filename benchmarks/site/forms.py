@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.shares import exact_interval
+from benchmarks.real.report import displaced_table, judged_table
 from benchmarks.site.kept import PrintedTable
 from companion.errors import ReportError
 from sitl.demo.scenario import ScenarioError
@@ -72,7 +73,7 @@ def _form(data: Any) -> Callable[[list[Any], str], PrintedTable]:
     for mark, made in (
         ("columns", _figures), ("recall_1", _sequence), ("begin_ns", _followed),
         ("verdict", _suite), ("acceptance", _integrity), ("search_cpu_s", _places),
-        ("rows", _throughput),
+        ("rows", _throughput), ("displaced", _displaced), ("judged", _judged),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -82,6 +83,14 @@ def _form(data: Any) -> Callable[[list[Any], str], PrintedTable]:
 def _figures(data: list[Any], _title: str) -> PrintedTable:
     rows = (tuple(map(str, row)) for one in data for row in one["rows"])
     return PrintedTable(tuple(data[0]["columns"]), tuple(rows))
+
+
+def _displaced(data: list[Any], _title: str) -> PrintedTable:
+    return _of_markdown(displaced_table(data[0]["displaced"]))
+
+
+def _judged(data: list[Any], _title: str) -> PrintedTable:
+    return _of_markdown(judged_table(data[0]["judged"]))
 
 
 def _throughput(data: list[Any], _title: str) -> PrintedTable:

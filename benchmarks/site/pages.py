@@ -29,8 +29,9 @@ prints the same.
 | exit code | meaning |
 |---|---|
 | 0 | done |
-| 1 | `doctor`: advice; `plan`: a failing leg; `map verify`: damage |
-| 1 | `localize`: nothing localized; `replay`: a difference |
+| 1 | `doctor`: advice; `localize`: nothing localized; `map check`: a bad property; `map fetch`, \
+`map verify`: damage; `plan`: a failing leg; `replay`: a difference; `shadow-check`: not ready; \
+`try`: vision does not work, or there is no map |
 | 2 | wrong usage, a named error, or `doctor`: not fit to fly |
 | 130 | interrupted (a flying `run` ends with 0) |
 """

@@ -1,7 +1,6 @@
 """How fast the dual-thread engine is on recorded video, with nothing beside it.
 
     python -m benchmarks.throughput record FOLDER [--seed 0]
-    python -m benchmarks.throughput accuracy FOLDER [--map CACHE] [--shifts 8 16] [--json out.json]
     python -m benchmarks.throughput run FOLDER [--widths 320 640] [--cores 1 2] [--json out.json]
 
 `record` renders 300 frames, 30 a second, over the demo's world of a seed (made if it is missing):
@@ -10,8 +9,7 @@ the engine for each width and number of cores: in real time; with the next frame
 the last is done; and with two frames in the engine all the time, so that one is registered while
 the other's features are extracted; and, on one thread, the processor time of each stage. Run it on
 an idle machine; figures of a loaded one say nothing. The share is the processor time used over what
-the cores had. `accuracy` compares, frame by frame, references that serve several frames with one
-for every frame; FOLDER may be any sequence with its map.
+the cores had.
 """
 
 from __future__ import annotations
@@ -22,13 +20,9 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.throughput.accuracy import paired
-from benchmarks.throughput.settings import OFFERED, map_of, one_setting
-from companion.recorded.sequence import load_sequence
-from localizer.config import LocalizerConfig
-from localizer.tracking.opening import MapStack
+from benchmarks.throughput.settings import OFFERED, one_setting
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
@@ -58,22 +52,6 @@ def record(args: argparse.Namespace) -> None:
     print(f"{count} frames")
 
 
-def accuracy(args: argparse.Namespace) -> None:
-    """One line for each limit of `reference_shift_px`."""
-    config = LocalizerConfig(width=args.widths[0], threads=1, renderer="numba", device="cpu")
-    stack = MapStack(args.map or map_of(args.folder), config)
-    found: list[dict[str, object]] = []
-    try:
-        sequence = load_sequence(args.folder, stack.cache.frame).first(args.frames)
-        for row in paired(stack, sequence, config, args.shifts):
-            found.append({"width": args.widths[0], **row})
-            print(json.dumps(found[-1]), flush=True)
-    finally:
-        stack.close()
-    if args.json:
-        args.json.write_text(json.dumps({"rows": found}, indent=1) + "\n")
-
-
 def run(args: argparse.Namespace) -> None:
     """Every width and number of cores, one process after the other."""
     found: list[dict[str, object]] = []
@@ -93,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = Parser(__doc__)
-    parser.add_argument("what", choices=("record", "accuracy", "run"), help="see above")
+    parser.add_argument("what", choices=("record", "run"), help="see above")
     parser.add_argument("folder", type=Path, help="of the sequence")
     parser.add_argument("--seed", type=whole(0, 10**6), default=0, help="of the world")
     parser.add_argument("--rate", type=number(1, 60), default=30.0, help="frames/s to record")
@@ -103,11 +81,9 @@ def main() -> None:
         "--shift", type=number(0, 100), help="reference_shift_px of `run`; none: the default"
     )
     parser.add_argument("--frames", type=whole(60, 10_000), default=300, help="at most")
-    parser.add_argument("--map", type=existing, help="cache of another sequence")
-    parser.add_argument("--shifts", type=number(0.1, 100), nargs="+", default=[8.0], help="px")
     parser.add_argument("--json", type=output, help="every figure")
     args = parser.parse_args()
-    {"record": record, "accuracy": accuracy, "run": run}[args.what](args)
+    {"record": record, "run": run}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,9 @@ self-test``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `plan` a leg on which vision will not do, `replay`
 differs, `localize` localized nothing, `try` or `shadow-check` found that vision does not work
-there, or `map verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle
-not fit to fly; 130 interrupted (`run` that was flying ends with 0).
+there, `map check` found a bad property, or `map fetch` or `map verify` found damage; 2 wrong usage,
+a named error, or `doctor` found the vehicle not fit to fly; 130 interrupted (`run` that was flying
+ends with 0).
 """
 
 from __future__ import annotations

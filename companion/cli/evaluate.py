@@ -76,17 +76,25 @@ def evaluate_command(
         bool, typer.Option("--known-heading", help="for lost and none: heading known to 15 degrees")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
-    noise_m: Annotated[float, typer.Option(min=0, max=1e6, help="prior noise up to, m")] = 10.0,
+    noise_m: Annotated[
+        float, typer.Option(min=0, max=1e6, help="largest error of the prior's position, m")
+    ] = 10.0,
     noise_deg: Annotated[
-        float, typer.Option(min=0, max=180, help="prior noise up to, degrees")
+        float, typer.Option(min=0, max=180, help="largest error of the prior's angles, degrees")
     ] = 10.0,
     attitude_sigma_deg: Annotated[
         float | None,
-        typer.Option(min=0.01, max=45, help="roll and pitch are reported so well (drawn), degrees"),
+        typer.Option(
+            min=0.01,
+            max=45,
+            help="also give roll and pitch, with random errors of this sigma, degrees",
+        ),
     ] = None,
     height_sigma_m: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1000, help="the height is reported so well (drawn), m"),
+        typer.Option(
+            min=0.01, max=1000, help="also give height, with random errors of this sigma, m"
+        ),
     ] = None,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     renderer: Annotated[

@@ -49,9 +49,9 @@ def localize_command(
     prior: Annotated[
         str | None,
         typer.Option(
-            help="about where the first image was taken: LAT,LON,HEIGHT,ROLL,PITCH,YAW in degrees "
-            "and metres above the ellipsoid, angles as in a pose file (pitch 0 looks straight "
-            "down, yaw counter-clockwise from north)"
+            help="approximate pose of the first image: LAT,LON,HEIGHT,ROLL,PITCH,YAW in degrees "
+            "and metres above the ellipsoid; angles as in a pose file: pitch 0 looks straight down "
+            "(in `map render` -90 does), yaw is counter-clockwise from north"
         ),
     ] = None,
     priors: Annotated[

@@ -77,20 +77,23 @@ def build(
         str | None, typer.Option(help="date of the imagery: 2024, 2024-06 or 2024-06-30")
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="that took the source's pictures; else as its tags say")
+        str | None,
+        typer.Option(help="sensor that took the source's images; default: as its tags state"),
     ] = None,
     heights: Annotated[
         Literal["surface", "terrain", "flat"] | None,
         typer.Option(
-            help="what the heights hold: surface (buildings and trees), terrain or flat; else "
-            "measured"
+            help="what the heights contain: surface (buildings and trees), terrain or flat; "
+            "default: measured"
         ),
     ] = None,
     skip_bad_tiles: Annotated[
         bool, typer.Option(help="skip tiles that cannot be imported")
     ] = False,
     overwrite: Annotated[bool, typer.Option(help="replace an existing cache")] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="processes; one per core")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="number of processes; default: one per core")
+    ] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="address of a Dask scheduler that shares the file system")
     ] = None,
@@ -103,11 +106,11 @@ def build(
     ] = False,
     limit: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=NUMBER: raise a limit that an error names"),
+        typer.Option(help="NAME=NUMBER: raise the limit that an error message names"),
     ] = None,
     trust: Annotated[
         list[str] | None,
-        typer.Option(help="accept a doubt that an error names"),
+        typer.Option(help="import in spite of the doubt that an error message names"),
     ] = None,
 ) -> None:
     """Import a source into a tile cache; continues an interrupted build."""
@@ -308,7 +311,7 @@ def render(
     longitude: Annotated[float, typer.Option(help="degrees")],
     height: Annotated[float, typer.Option(help="metres above the ellipsoid")],
     heading: Annotated[float, typer.Option(help="degrees clockwise from north")] = 0.0,
-    pitch: Annotated[float, typer.Option(help="degrees above the horizon")] = -90.0,
+    pitch: Annotated[float, typer.Option(help="degrees above the horizon; -90 looks down")] = -90.0,
     width: Annotated[int, typer.Option(min=8, max=8192, help="pixels")] = 1280,
     image_height: Annotated[int, typer.Option(min=8, max=8192, help="pixels")] = 960,
     fov: Annotated[
@@ -343,7 +346,7 @@ def export(
     cache: CachePath,
     out: Annotated[Path, typer.Option(help="GLB to write")],
     level: Annotated[
-        int | None, typer.Option(min=0, help="depth of the tile tree; the finest")
+        int | None, typer.Option(min=0, help="level of the tile tree; default: the finest")
     ] = None,
 ) -> None:
     """Write the map's surface as one GLB (y up, metres about the cache's origin)."""

@@ -54,7 +54,9 @@ class VitalSigns:
             self._accepted.append(estimate)
 
     def figures(self, now_ns: int) -> dict[str, float]:
-        """The values at a CLOCK_MONOTONIC time; unknown ones are left out."""
+        """The five named values (see the class) at a CLOCK_MONOTONIC time. Before the first
+        accepted position only VPS_SIGNAL and VPS_RATE.
+        """
         accepted = list(self._accepted)
         recent = sum(1 for e in accepted if 0 <= now_ns - e.exposure_time_ns < _WINDOW_NS)
         figures = {"VPS_SIGNAL": _NONE, "VPS_RATE": recent / (_WINDOW_NS * 1e-9)}

@@ -64,7 +64,7 @@ class MissionForecast:
 
 
 def aim_of(deployment: CompanionConfig, pitch_deg: float) -> Aim:
-    """Direction of the deployment's camera."""
+    """Mounting of the deployment's camera, and the gimbal's pitch while the mission sets none."""
     camera = deployment.bridge.camera
     mount = Mount.from_degrees(
         camera.mount_roll_deg,

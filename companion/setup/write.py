@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
-from companion.setup.difference import differing
+from companion.settings_file import settings
 
 
 def deployment_text(
@@ -34,3 +36,30 @@ def write_deployment(text: str, path: Path, overwrite: bool) -> None:
         raise ConfigError(f"{path}: is there already; --overwrite replaces it") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def differing(model: BaseModel, default: BaseModel | None = None) -> dict[str, Any]:
+    """The settings of a model that differ, as plain data: from `default`, or else from the
+    defaults of its kind; those that have none are all given.
+    """
+    found: dict[str, Any] = {}
+    for name, field in settings(type(model)).items():
+        now = getattr(model, name)
+        if default is None and field.is_required():
+            found[name] = _plain(now)
+            continue
+        by_kind = default is None
+        then = field.get_default(call_default_factory=True) if by_kind else getattr(default, name)
+        if now != then:
+            both = isinstance(now, BaseModel) and isinstance(then, type(now))
+            found[name] = differing(now, then) if both else _plain(now)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """As YAML holds it."""
+    if isinstance(value, BaseModel):
+        return differing(value)
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, bool | int | float | str) or value is None else str(value)

@@ -66,11 +66,6 @@ class UdpAddress:
             )
         return cls(parts.hostname or "0.0.0.0", port, options.get("localaddr", [""])[0])
 
-    @property
-    def everywhere(self) -> bool:
-        """Whether it means every interface of this computer."""
-        return self.host in ("0.0.0.0", "::")
-
     def bound(self) -> socket.socket:
         """A non-blocking socket bound to it; OSError if that is impossible."""
         family, kind, _, _, where = socket.getaddrinfo(

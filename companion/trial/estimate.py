@@ -82,7 +82,13 @@ def estimate(
     loader: FrameLocalizer,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Estimated | None:
-    """Estimate the errors; None if too few frames are consistent."""
+    """Estimate the errors of focal length, mounting angles and map offset.
+
+    frames, priors and localized have one entry for each frame, in the same order. At most 40
+    consistent frames are used, spread over all. progress: is called with the number of frames done
+    and to do; both count two passes over the frames. None if fewer than four frames are consistent,
+    or fewer than four of the used ones can be read and matched.
+    """
     used = consistent(priors, localized)
     if len(used) > _MOST_FRAMES:
         used = [used[int(k)] for k in np.linspace(0, len(used) - 1, _MOST_FRAMES).round()]

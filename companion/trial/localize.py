@@ -14,7 +14,7 @@ from companion.recorded.flight import RecordedFrame
 from companion.trial.priors import FramePrior
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose, so3_log
+from localizer.geometry.pose import Array, Pose
 from localizer.relocalization.relocalizer import Relocalizer
 from localizer.relocalization.types import PlaceQuery, SearchRegion
 from localizer.tracking.pipeline import Localizer
@@ -145,8 +145,3 @@ def height_bands(prior: FramePrior) -> list[tuple[float, float]]:
 def horizontal_m(a: Pose, b: Pose) -> float:
     """Horizontal distance between two cameras, m."""
     return float(np.hypot(*(a.translation - b.translation)[:2]))
-
-
-def turn_deg(a: Array, b: Array) -> float:
-    """Angle between two rotations (3, 3)."""
-    return float(np.degrees(np.linalg.norm(so3_log(a.T @ b))))

@@ -34,6 +34,7 @@ _IMPOSSIBLE_SHARE = 0.1  # of the frames: beyond it a datum's heights are not us
 _UNKNOWN_CLEARANCE_M = (15.0, 150.0)  # of small drones: 120 m is the usual limit, over relief
 _DATUM_M = 10.0  # between the heights of two datums: more is worth a look before a flight
 _FOOT_M = 0.3048
+_CLIMB_M = 100.0  # between take-off and photos; less is no sign of feet: on a hillside by the sea
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
 _FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
 _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
@@ -266,7 +267,10 @@ def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: floa
             continue
         photos = ground + float(np.median([a.value_m - b.value_m for a, b in both]))
         sigma = float(np.median([math.hypot(a.sigma_m, b.sigma_m) for a, b in both]))
-        if abs(photos - ground) > 3.0 * sigma and abs(photos - _FOOT_M * ground) < 2.0 * sigma:
+        if (
+            abs(photos - ground) > max(3.0 * sigma, _CLIMB_M)
+            and abs(photos - _FOOT_M * ground) < 2.0 * sigma
+        ):
             return [
                 f"the map's ground is {ground:.0f} m above the {datum.value}, by the photos' "
                 f"heights {photos:.0f} m: are its heights in feet? Build it with --height-unit ft"

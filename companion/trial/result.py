@@ -109,13 +109,19 @@ class Judgement:
 
 
 def judge(trial: Trial) -> Judgement:
-    """The verdict in one sentence."""
+    """The verdict: its kind, which sets the exit code, and a sentence with the figures.
+
+    WORKS: 80 % of the frames are localized, no search finds a wrong place, and the median
+    difference from GNSS, if known, is at most `spread_limit_m`. PARTLY: 30 % are localized, but one
+    of these conditions fails. NOT: fewer than 30 %. UNKNOWN: fewer than 30 % of fewer than
+    `LEAST_FRAMES` frames, also of none.
+    """
     count = len(trial.best)
     localized = sum(one.accepted for one in trial.best)
     searched, right, wrong = trial.search_outcome()
     errors = trial.errors_m()
     known = errors[np.isfinite(errors)]
-    kind = _kind(localized / count, trial, known)
+    kind = _kind(localized / max(count, 1), trial, known)
     parts = [f"{localized} of {count} frames are localized"]
     if len(known):
         parts[0] += f", {np.median(known):.1f} m from GNSS in the median"

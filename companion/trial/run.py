@@ -178,7 +178,7 @@ def _opened_once(
     cache: TileCache, config: LocalizerConfig, opened: ExitStack
 ) -> Callable[[], Relocalizer]:
     """Opens the relocalizer when it is first needed: it computes the map's overview."""
-    relocalization = config.relocalization.model_copy(update={"threads": 2})
+    relocalization = replace(config.relocalization, threads=2)
 
     @functools.cache
     def relocalizer() -> Relocalizer:

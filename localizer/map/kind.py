@@ -97,7 +97,8 @@ class MapKind:
     def imagery_age(self, today: date, max_days: int) -> tuple[str, bool]:
         """Age of the imagery in words, and whether it is known and within a limit.
 
-        A year or a month counts as its first day, so that the age is the largest possible one.
+        A year or a month counts as its first day, so that the age is the largest possible one. A
+        date after `today` gives a negative age, which is within any limit.
         """
         if not self.imagery_date:
             return "date not known", False

@@ -5,7 +5,7 @@ from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, Odometr
 from localizer.odometry.ground import FlatGround, GroundUncertainty, TerrainModel
 from localizer.odometry.keyframe import DepthSource
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
-from localizer.odometry.usability import ImageFault, Usability, UsabilityConfig, examine
+from localizer.odometry.usability import ImageFault, Usability, examine
 
 __all__ = [
     "DepthSource",
@@ -19,7 +19,6 @@ __all__ = [
     "OdometryStatus",
     "TerrainModel",
     "Usability",
-    "UsabilityConfig",
     "VisualOdometry",
     "examine",
     "odometry_optimizer",

@@ -12,7 +12,6 @@ from enum import Enum
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.types import Float32, Image
 
@@ -30,23 +29,12 @@ class ImageFault(Enum):
     FROZEN = "the stream repeats one picture"
 
 
-class UsabilityConfig(BaseModel):
-    """Thresholds; shares are of the picture's area, grey values of 255."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    black: float = Field(6.0, ge=0, le=255, description="grey value that counts as black")
-    white: float = Field(250.0, ge=0, le=255, description="grey value that counts as saturated")
-    most_lost: float = Field(0.9, ge=0, le=1, description="share of black or saturated area")
-    structure: float = Field(
-        1.5, ge=0, le=255, description="contrast of a block that shows something, grey values"
-    )
-    least_structured: float = Field(
-        0.2, ge=0, le=1, description="share of the area that must show something"
-    )
-    least_sharpness: float = Field(
-        0.06, ge=0, le=1, description="fine over coarse contrast of a sharp picture"
-    )
+# Grey values are of 255, shares of the picture's area.
+_BLACK, _WHITE = 6.0, 250.0  # what counts as black, as saturated
+_MOST_LOST = 0.9  # share of black or saturated area
+_STRUCTURE = 1.5  # contrast of a block that shows something
+_LEAST_STRUCTURED = 0.2  # share of the area that must show something
+_LEAST_SHARPNESS = 0.06  # fine over coarse contrast of a sharp picture
 
 
 @dataclass(frozen=True)
@@ -69,34 +57,31 @@ class Usability:
         return self.fault is None
 
 
-def examine(
-    image: Image, previous: Image | None = None, config: UsabilityConfig | None = None
-) -> Usability:
+def examine(image: Image, previous: Image | None = None) -> Usability:
     """Check an image (H, W, 3) uint8 RGB; previous: the stream's image before it.
 
     Takes a fraction of a millisecond at the working size.
     """
-    c = config or UsabilityConfig()
     grey = _shrunk(image)
-    black, saturated = float(np.mean(grey <= c.black)), float(np.mean(grey >= c.white))
+    black, saturated = float(np.mean(grey <= _BLACK)), float(np.mean(grey >= _WHITE))
     contrast = _block_contrast(grey)
-    structured = float(np.mean(contrast >= c.structure))
-    sharpness = _sharpness(grey, contrast >= c.structure)
+    structured = float(np.mean(contrast >= _STRUCTURE))
+    sharpness = _sharpness(grey, contrast >= _STRUCTURE)
     frozen = previous is not None and np.array_equal(image, previous)
-    fault = ImageFault.FROZEN if frozen else _fault(c, black, saturated, structured, sharpness)
+    fault = ImageFault.FROZEN if frozen else _fault(black, saturated, structured, sharpness)
     return Usability(fault, black, saturated, structured, sharpness)
 
 
 def _fault(
-    c: UsabilityConfig, black: float, saturated: float, structured: float, sharpness: float
+    black: float, saturated: float, structured: float, sharpness: float
 ) -> ImageFault | None:
-    if black >= c.most_lost:
+    if black >= _MOST_LOST:
         return ImageFault.BLACK
-    if saturated >= c.most_lost:
+    if saturated >= _MOST_LOST:
         return ImageFault.SATURATED
-    if structured < c.least_structured:
+    if structured < _LEAST_STRUCTURED:
         return ImageFault.FLAT
-    return ImageFault.BLURRED if sharpness < c.least_sharpness else None
+    return ImageFault.BLURRED if sharpness < _LEAST_SHARPNESS else None
 
 
 def _shrunk(image: Image) -> Float32:

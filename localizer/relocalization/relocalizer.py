@@ -17,6 +17,7 @@ from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.geometry.camera import Camera
 from localizer.integrity.height_error import MapHeightError
+from localizer.integrity.patch_covariance import COMMON
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
@@ -25,7 +26,7 @@ from localizer.relocalization.align import FrameShift
 from localizer.relocalization.confirm import Confirmation, compared
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import MapOverview, Progress, open_overview
-from localizer.relocalization.search import SearchView, search
+from localizer.relocalization.search import SearchView, over_roofs, search
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
 from localizer.relocalization.verdict import VerifiedCandidate, answer
 from localizer.relocalization.verify import QueryFeatures, Verifier
@@ -62,6 +63,7 @@ class Relocalizer:
         self.extractor = extractor
         self._config = config.relocalization
         self._width = config.width
+        self._missing_m = COMMON * height_sigma_m  # mean of what the map lacks
         self._detail = DetailExtractor(extractor)
         self._verifier = Verifier(
             renderer, self._detail, extractor, optimizer, self._config, config.integrity,
@@ -114,11 +116,12 @@ class Relocalizer:
         ):
             return []
         view = SearchView(image.astype(np.uint8, copy=False), camera)
+        over = over_roofs(query, self.overview.levels[0], self._missing_m, self._config)
         threads = self._config.threads
         pool = ThreadPoolExecutor(threads, "place-search") if threads > 1 else None
         try:
             found = search(
-                view, query, self._correlators, self.extractor, self._config,
+                view, over, self._correlators, self.extractor, self._config,
                 pool=pool, should_stop=should_stop,
             )  # fmt: skip
         finally:

@@ -125,6 +125,19 @@ def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> 
     return result
 
 
+def over_roofs(
+    query: PlaceQuery, level: OverviewLevel, missing_m: float, config: RelocalizationConfig
+) -> PlaceQuery:
+    """The query with its height above roofs and trees, which stand `missing_m` above the ground of
+    the map; at most half a step of scale lower, so that bare ground is still within a step.
+    """
+    ground = ground_of(level, query)
+    known = ground[np.isfinite(ground)]
+    above = query.height_m - float(np.median(known)) if len(known) else 0.0
+    most = max(above, 0.0) * (1 - 1 / config.scale_step) / 2
+    return replace(query, height_m=query.height_m - min(missing_m, most))
+
+
 @dataclass
 class Scores:
     """Best score over its trial's noise at each patch origin so far (rows, columns), and the number

@@ -25,11 +25,6 @@ class SearchRegion:
         """A circle of `radius_m` about `centre` (2,)."""
         return cls(np.asarray(centre, np.float64)[:2], np.eye(2) * radius_m**2)
 
-    @classmethod
-    def from_covariance(cls, mean: Array, covariance: Array, sigmas: float = 3.0) -> SearchRegion:
-        """The ellipse of so many sigmas of a position (2,) with its covariance (2, 2)."""
-        return cls(np.asarray(mean, np.float64)[:2], np.asarray(covariance)[:2, :2] * sigmas**2)
-
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Least and greatest east and north, (2,) each."""

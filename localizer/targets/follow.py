@@ -110,7 +110,9 @@ class ImageFollower:
         *,
         was_hidden: bool = False,
     ) -> FollowedPosition | None:
-        """Find the target within `reach_m` of the expected position (3,); None if it is not seen.
+        """Find the target within `reach_m` of the expected position (3,), at most 80 cells from it;
+        None if it is not seen or two places match equally well. A match changes the follower: it
+        learns the target's usual score, its course and its present appearance.
 
         was_hidden: after an occlusion; positions near the expected one are then more likely.
         """

@@ -369,8 +369,10 @@ class Localizer:
     ) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2).
 
-        at: a later pose of the camera, if the view is to be rendered there. `OutsideMapError` if
-        the view shows no map, `MapLoadingError` while tiles are being read.
+        at: a later pose of the camera, if the view is to be rendered there; the bundle keeps the
+        time of `prior`. wait: block until all tiles in view are read. If the map covers less than
+        10 % of the view's pixels, `MapLoadingError` is raised while tiles are being read and `wait`
+        is false, otherwise `OutsideMapError`.
         """
         pose = (at or prior).world_from_camera
         view = self._renderer.render(pose, self.camera, wait=wait)

@@ -43,8 +43,8 @@ class ProcessingTimes:
         self.busy_s += _SHARE * (spent_s - self.busy_s)
 
     def pause_s(self, since_taken_s: float) -> float:
-        """Wait time before the next extraction, so that it ends with the registration and can use a
-        newer frame.
+        """Wait time before the next extraction, so that it ends when the running registration ends
+        and can use a newer frame. since_taken_s: since that registration's frame was taken.
         """
         return max(self.busy_s - self.extract_s - since_taken_s, 0.0)
 

@@ -92,11 +92,17 @@ class Tracker:
         return self._motion.ahead(state, time_ns).prior if state else None
 
     def at_frame(self, seen: TrackerState, time_ns: int) -> MotionState | None:
-        """The motion of `seen` at a frame's exposure; None before the first prior."""
+        """The motion of `seen`, extrapolated to a frame's exposure; None before the first prior.
+
+        For an exposure before that motion's time (the camera's clock jumped) the pose is kept, its
+        sigmas are those of a search, and the velocity is unknown.
+        """
         return self._motion.at_frame(seen.motion, time_ns) if seen.motion is not None else None
 
     def sweep(self, frame: Frame, ahead: MotionState) -> Sweep | None:
-        """The camera's motion while the frame is read out. ahead: the motion at its exposure."""
+        """The camera's motion while a rolling shutter reads the frame; None for a global shutter.
+        ahead: the motion at the frame's exposure.
+        """
         return self._motion.sweep(ahead, frame.camera.readout_ms)
 
     def update(

@@ -21,14 +21,18 @@ _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
 INJECTION: tuple[AlertSpec, ...] = (
     event(A.INJECTING, INFO, "injecting", {},
-          "mode inject: fixes are sent again, 1.5 s after a *not sent* alert ended; up to 60 s "
-          "after it if it recurs", "the autopilot receives fixes", _NONE),
+          "mode inject: the first fix is sent; again 1.5 s after a *not sent* alert ended, or up "
+          "to 60 s after it if it recurs", "the autopilot receives fixes", _NONE),
     condition(A.NO_FIX_YET, WARNING, "no fix yet", {}, "no fix since the start; never sent as text",
               "the first fix", "vision has no position, so nothing is sent", _WAIT,
               lead=_NOT_SENT),
     condition(A.NO_FRESH_FIX, WARNING, "no fresh fix", {},
-              "nothing was sent for 1 s, because the newest fix is older than 0.5 s or two usual "
-              "intervals", "a new fix", "the EKF receives no position", _WAIT, lead=_NOT_SENT),
+              "nothing was sent for 1 s, because the newest fix that passed the checks is older "
+              "than delay_ms + 0.5 s, or no fix passed for two usual intervals", "a fix passes",
+              "the EKF receives no position; vision gives no fix, or the integrity monitor holds "
+              "the fixes",
+              "if an *output held* alert is active, act on that alert; else " + _WAIT,
+              lead=_NOT_SENT),
     condition(A.LINK_FULL, WARNING, "the link takes no more", {},
               "mode inject: the send buffer of the port is full for 1 s", "the port sends again",
               "the EKF receives no position", "check cable and baud rate; " + _BY_HAND,
@@ -102,9 +106,12 @@ INJECTION: tuple[AlertSpec, ...] = (
               "geoid, vertical datum or barometer is wrong; nothing is sent", _MAP,
               lead=_NOT_READY),
     condition(A.SHADOW_YAW, WARNING, "yaw differs by {degrees:+.1f} deg", {"degrees": "deg"},
-              "the yaw guard blocks (`yaw_mismatch`); only in the shadow check and health.json",
-              "the yaw guard no longer blocks",
-              "compass or camera mounting is wrong; nothing is sent",
+              "the yaw guard blocks (`yaw_mismatch`)",
+              "the yaw guard no longer blocks, and 50 fixes of the last two minutes were compared; "
+              "without GNSS it does not end",
+              "compass or camera mounting is wrong; nothing is sent; while the guard blocks, only "
+              "health.json shows this alert; it becomes a text if the guard releases and the "
+              "shadow check stays failed",
               "check compass and camera mounting", lead=_NOT_READY),
     condition(A.SHADOW_RESTORED, WARNING, "failed before the restart", {},
               "at the start: the process before this one crashed or was killed after the shadow "
@@ -112,12 +119,12 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the failure is still valid; nothing is sent", _MAP, lead=_NOT_READY),
     event(A.INJECTION_FORCED, WARNING, "injection forced, no shadow check", {},
           "modes inject and rc: injection starts because bridge.injection.force is set; the "
-          "shadow check has not passed in the last 10 min, or an alert inhibits", _UNVERIFIED,
+          "shadow check has no valid pass, or an alert inhibits", _UNVERIFIED,
           f"land if this flight is no test of `force`; else {_LANDMARKS}; remove `force` "
           "afterwards"),
     event(A.INJECTION_NOT_READY, WARNING, "injecting although not ready", {},
-          "mode rc: the pilot enables injection, but the shadow check has not passed in the last "
-          "10 min, or an alert inhibits", _UNVERIFIED, _LANDMARKS),
+          "mode rc: the pilot enables injection, but the shadow check has no valid pass, or an "
+          "alert inhibits", _UNVERIFIED, _LANDMARKS),
     event(A.INJECTION_UNCHECKED, WARNING, "injecting without shadow check", {},
           "mode inject: no 3D fix for 2 s, no failed shadow check, and no alert that inhibits",
           _UNVERIFIED, _LANDMARKS),
@@ -138,8 +145,9 @@ INJECTION: tuple[AlertSpec, ...] = (
           "after an announced jump the EKF's position stays elsewhere in three comparisons; at "
           "most five times", f"{_SENT}; the next one increments reset_counter again", _NONE),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "1.5 s after the end of one of the next six alerts; up to 60 s after it if it recurs",
-          "the EKF uses vision", _NONE),
+          "3 s after the first fix is sent; again 1.5 s after the end of one of the next six "
+          "alerts, or up to 60 s after it if it recurs",
+          "the EKF's position is that of the fixes", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
               "after at least 3 s of sent fixes: the rate over 3 s is below the shown minimum",
@@ -161,7 +169,9 @@ INJECTION: tuple[AlertSpec, ...] = (
               "after at least 3 s of sent fixes: the median of the EKF's differences from them "
               "over 3 s "
               "is above 2 m + 5 sigma", "the difference is smaller",
-              f"{_SENT}; source set, EKF origin or yaw is wrong", f"{_PARAMETERS}; {_BY_HAND}"),
+              f"{_SENT}; source set, EKF origin or yaw is wrong",
+              f"in flight: {_LANDMARKS}; select the GNSS source set if GNSS is good; {_BY_HAND}; "
+              f"after landing {_PARAMETERS}"),
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
               "after at least 3 s of sent fixes: the horizontal test ratio in EKF_STATUS_REPORT is "
               "above 1", "it is 1 or less", f"{_SENT}; the EKF does not use them",
@@ -185,7 +195,10 @@ INJECTION: tuple[AlertSpec, ...] = (
           _NONE),
     condition(A.YAW_UNCHECKED, WARNING, "yaw not checked: no attitude or gimbal", {},
               "20 fixes in a row had no attitude or no gimbal angles for their time",
-              "a fix has both", f"{_SENT}; a wrong yaw of vision would not be detected",
+              "a fix has both",
+              "a wrong yaw of vision would not be detected; fixes are sent, but not with "
+              "bridge.injection.message odometry if ATTITUDE is missing (`no_attitude`), and not "
+              "if the yaw guard already blocks (`yaw_mismatch`)",
               "check the rates of ATTITUDE and the gimbal messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
@@ -193,6 +206,6 @@ INJECTION: tuple[AlertSpec, ...] = (
               "clock is set",
               f"{_SENT}, without a time", "set the companion's clock, for example by NTP"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": "name"},
-          "the .tlog cannot be written", f"{_SENT}; MAVLink messages are not recorded",
+          "the .tlog cannot be written", "MAVLink messages are not recorded",
           "check the disk after landing"),
 )  # fmt: skip

@@ -70,15 +70,18 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               "vision's roll and pitch differ from gimbal and autopilot by more than 3 sigma (2.7 "
               "deg or more) for 1 s",
               "the difference is below 2 sigma for 3 s",
-              f"{_WIDER}; a tilt error shifts the position by tilt times height; this shift (3 m "
-              "at most) was added to the protection level",
+              f"{_WIDER}; low over ground with little structure, a tilt and a shift of the camera "
+              "have the same effect on the image; a tilt error shifts the position by tilt times "
+              "height; this shift (3 m at most) was added to the protection level",
               "climb, or fly over buildings and roads", raise_s=1.0, clear_s=3.0,
               repeat_s=60.0),
     AlertSpec(A.GNSS_VISION_MISMATCH, WARNING, "GNSS/vision mismatch",
               "GNSS/vision mismatch {metres:.0f} m", {"metres": "m"},
               "their horizontal distance exceeds vision's protection level plus 4 times the "
-              "receiver's stated accuracy (1 to 3 m), for 2 s; not with gps_input",
-              "the distance is within the limit for 5 s",
+              "receiver's stated accuracy (1 to 3 m) plus 0.2 s times the speed, for 2 s; not with "
+              "gps_input",
+              "the distance is within the limit for 5 s; without GNSS or without fixes the alert "
+              "stays",
               f"{_SENT}; GNSS or vision is wrong; which one is not known",
               "compare with landmarks; select the source set that is right", raise_s=2.0,
               clear_s=5.0, repeat_s=10.0),
@@ -116,15 +119,16 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               {"percent": "%", "direction": CalibrationError},
               "the estimated focal length differs from the calibration by 2.5 % and 4 sigma for 2 "
               "s", "it is within the limit for 10 s",
-              f"{_WIDER}; positions are wrong by about this share of the height above ground",
+              f"if injection has started, {_WIDER}; positions are wrong by about this share of "
+              "the height above ground",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=2.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.BORESIGHT, WARNING, "boresight", "camera {degrees:.0f} deg off in {axis}",
               {"degrees": "deg", "axis": CalibrationError},
               "the attitude from vision differs from that of gimbal and autopilot by 3 deg and 4 "
               "sigma for 3 s", "it is within the limit for 10 s",
-              f"{_SENT}; the mounting angles in the deployment file, the gimbal or the compass "
-              "are wrong",
+              f"if injection has started, {_SENT}; the mounting angles in the deployment file, "
+              "the gimbal or the compass are wrong",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=3.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.TIME_OFFSET, WARNING, "time offset",
@@ -132,7 +136,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               {"milliseconds": "ms", "direction": CalibrationError},
               "vision's motion is late or early by 80 ms and 4 sigma for 1 s",
               "it is within the limit for 10 s",
-              f"{_WIDER}; positions are behind or ahead of the vehicle by speed times this value",
+              f"if injection has started, {_WIDER}; positions are behind or ahead of the vehicle "
+              "by speed times this value",
               "fly slowly; set `camera.settings.time_offset_ms` before the next flight",
               inhibits=Inhibits.INJECTION, raise_s=1.0, clear_s=10.0, repeat_s=60.0),
 )  # fmt: skip

@@ -55,7 +55,12 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "position",
           "do not take off unless this is planned"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
-          "another address sends to the MAVLink port", f"{_SENT}; its messages are ignored", _SIGN),
+          "UDP: MAVLink arrives from an address other than bridge.sender or, if that is not set, "
+          "the first autopilot's; on bridge.ground_connection: other than the first ground "
+          "station's",
+          "messages from this address are ignored; if it is the autopilot's address, no fix is "
+          "sent",
+          "if it is the autopilot's address, set bridge.sender to it; else find this sender"),
     event(A.GIMBAL_IGNORED, WARNING, "gimbal {component}, device {device} ignored",
           {"component": "id", "device": "id"}, "a second gimbal reports its attitude",
           f"{_SENT}; only the angles of the first gimbal are used",
@@ -106,28 +111,32 @@ VEHICLE: tuple[AlertSpec, ...] = (
     condition(A.MESSAGE_UNSUPPORTED, WARNING, "unsupported: {message}", {"message": "name"},
               "the firmware does not support bridge.injection.message",
               "AUTOPILOT_VERSION of a firmware that supports it",
-              f"{_SENT}, but the EKF does not use them",
+              "the EKF receives no fix that it can use",
               "set another bridge.injection.message; " + _BY_HAND),
     event(A.SOURCE_SET_UNKNOWN, WARNING, "EKF source set not known: met in flight", {},
           "ArduPilot is already armed at its first heartbeat, for example after a crash of the "
           "program",
-          f"{_SENT}; which source set the EKF uses is not known", "check the EKF source set"),
+          "which source set the EKF uses is not known", "check the EKF source set"),
     event(A.SOURCE_SET_SELECTED, WARNING, "EKF source set {source_set}: {cause}",
           {"source_set": "", "cause": (GnssProblem, ReturnCause), "metres": "m"},
-          "switch.enabled: the command is sent. To vision: GNSS was bad for 1.5 s. To GNSS: it is "
-          "good again (return_to_gnss), or vision was gone for 3 s while GNSS was good",
-          f"{_SENT}; the EKF uses the sensors of this set, unless `source_set_refused` follows",
+          "switch.enabled: the command is sent. To vision: GNSS was bad for 1.5 s, and fixes are "
+          "sent. To GNSS, unless the pilot selected the vision set: with return_to_gnss, GNSS "
+          "agrees with vision and IMU for 5 s; or no fix was sent for 3 s, and GNSS is good for "
+          "3 s, within 25 m of the EKF's position, and not refused (`gnss_refused`)",
+          "the EKF uses the sensors of this set, unless `source_set_refused` follows; *vision "
+          "lost*: no fix is sent",
           "compare the position with landmarks"),
     event(A.SOURCE_SET_REFUSED, WARNING, "source switch refused", {},
           "the autopilot refuses to select the source set",
-          f"{_SENT}; the EKF stays on its set",
+          "the EKF stays on its set; the command is repeated every second while its condition "
+          "holds",
           "select the source set yourself"),
     condition(A.SOURCE_SET_HELD, WARNING, "no switch: {cause}, {why}",
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
               "switch.enabled: GNSS is bad for 1.5 s, but the vision set must not be selected; "
               "again every 10 s",
               "GNSS is good, or vision is selected",
-              f"{_SENT}; the EKF stays on its source set; *not ready*: the shadow check has not "
+              "the EKF stays on its source set; *not ready*: the shadow check has not "
               "passed, or an alert inhibits; *EKF with GNSS*: the EKF's position is nearer to "
               "GNSS than to vision; *set N chosen*: the pilot selected it",
               "decide by landmarks which source is right, and select it"),
@@ -162,7 +171,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "the operator gives a position", "until the position is found, at most for 2 min, the "
           "map is searched within twice this radius", _NONE),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
-          "the operator gives a position farther from the map than twice its radius",
+          "the operator gives a position farther from the map than twice the radius given with it",
           "the search continues without it",
           "give a position on the map"),
 )  # fmt: skip

@@ -46,9 +46,8 @@ _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 class EncodedEstimate:
     """An estimate to send. position: as propagated; quaternion: body to NED, None where unknown.
 
-    fresh: the fix itself, not propagated. quality: 0..100. repeated: the same fix was sent before
-    for another time, so its velocity is no new measurement. protection_m: horizontal and vertical
-    level.
+    fresh: the fix itself, not propagated. quality: 0..100. velocity_is_new: the fix measured a
+    velocity, which was not sent before. protection_m: horizontal and vertical level.
     """
 
     position: PropagatedFix
@@ -57,7 +56,7 @@ class EncodedEstimate:
     quality: int
     reset_counter: int
     fresh: bool
-    repeated: bool = False
+    velocity_is_new: bool = False
     protection_m: tuple[float, float] | None = None
 
     @property
@@ -125,19 +124,18 @@ def odometry(
 ) -> Any:
     """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion.
 
-    A repeated velocity is sent as NaN ("unknown"), because the EKF would treat its error as
-    independent.
+    A velocity that is repeated or derived from the positions is sent as NaN ("unknown"), because
+    the EKF would treat its error as independent.
     """
-    vn, ve, vd = (float(v) for v in e.position.velocity_ned)
-    body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
-    Rbn = np.array([quat.rotate(quat.conjugate(q), tuple(row)) for row in np.eye(3)]).T
-    Pv = Rbn @ e.position.velocity_covariance_ned @ Rbn.T
-    velocity_covariance = [NAN] * 21
-    for k, i in enumerate(DIAGONAL[:3]):
-        velocity_covariance[i] = float(Pv[k, k])
-    if e.repeated:
-        body, velocity_covariance = (NAN, NAN, NAN), [NAN] * 21
+    body, velocity_covariance = (NAN, NAN, NAN), [NAN] * 21
+    if e.velocity_is_new:
+        vn, ve, vd = (float(v) for v in e.position.velocity_ned)
+        body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
+        Rbn = np.array([quat.rotate(quat.conjugate(q), tuple(row)) for row in np.eye(3)]).T
+        Pv = Rbn @ e.position.velocity_covariance_ned @ Rbn.T
+        for k, i in enumerate(DIAGONAL[:3]):
+            velocity_covariance[i] = float(Pv[k, k])
     return mavlink.MAVLink_odometry_message(
         e.position.time_ns // 1000,
         frame,

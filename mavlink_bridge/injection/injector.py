@@ -309,7 +309,7 @@ class Injector:
             fix.quality,
             counter,
             fresh,
-            repeated=fix.time_ns == self._sent_fix_ns,
+            velocity_is_new=fix.velocity_ned is not None and fix.time_ns != self._sent_fix_ns,
             protection_m=propagated_protection(fix, position),
         )
         outcome = self._maker.make(estimate, now_ns, context)

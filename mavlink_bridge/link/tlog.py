@@ -107,7 +107,9 @@ class TlogRecorder:
         self._waiting.append((time_us, frame))
 
     def close(self) -> None:
-        """Write the queue and close the file; a disk that hangs is not waited for."""
+        """Write the queue and close the file. If the disk hangs, this returns after 5 s and leaves
+        the file open.
+        """
         self._stop.set()
         if self._thread is not None:
             self._thread.join(_CLOSE_S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -18,6 +19,10 @@ from mavlink_bridge.vehicle.readings import is_autopilot
 
 _CONNECT_S = 15.0
 _FIRST_GUESS = 1
+_FIRMWARES = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot",
+    mavlink.MAV_AUTOPILOT_PX4: "PX4",
+}
 
 _Self = TypeVar("_Self", bound="VehicleClient")
 
@@ -74,7 +79,6 @@ class VehicleClient:
 
     def take(self, message: Any) -> None:
         """Process a message of the autopilot, other than its heartbeat."""
-        raise NotImplementedError
 
     def ask(self, message: Any) -> None:
         """Send a message as the companion."""
@@ -123,3 +127,18 @@ class VehicleClient:
             )
             link.send(message, self.config.companion_component)
         return now_ns + 100_000_000
+
+
+@dataclass(frozen=True)
+class DetectedAutopilot:
+    """MAVLink system id and firmware of a detected autopilot."""
+
+    system_id: int
+    firmware: str
+
+
+def meet(config: BridgeConfig) -> DetectedAutopilot:
+    """Detect the autopilot at `config.connection`; `ConnectionSilentError` without one."""
+    with VehicleClient(config, "meeting", ()) as client:
+        number = client.autopilot
+        return DetectedAutopilot(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))

@@ -123,7 +123,7 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
     injection = config.injection
     odometry = injection.message == "odometry"
     climb = (6.0, 0.0) if odometry else (0.0,)
-    why = "the message carries velocity" if odometry else "the message carries no velocity"
+    why = "the message can carry velocity" if odometry else "the message carries no velocity"
     delta = "3 refuses to arm ('require GPS'); with 0 the vehicle lands 8 s after the position"
     delta += " is withheld, with 6 odometry holds it (VISION_POSITION_DELTA)"
     rules = [
@@ -162,17 +162,7 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
         )
         for end, sigma in zip(("MIN", "MAX"), VELOCITY_SIGMA_MPS, strict=True)
     ]
-    if odometry:
-        rules.append(
-            ParameterRule(
-                ("VISO_VEL_M_NSE",),
-                (),
-                "velocity derived from positions is no better",
-                required=False,
-                minimum=0.3,
-            )
-        )
-    else:
+    if not odometry:
         rules.append(
             ParameterRule(
                 ("VISO_QUAL_MIN",), (0.0,), "the message has no quality; > 0 rejects all of it"
@@ -292,9 +282,8 @@ def px4_rules(config: BridgeConfig, read: Read) -> list[ParameterRule]:
         return [*_agp_rules(read), horizon]
     odometry = injection.message == "odometry"
     stamped = "stamps are exposure times, mapped by TIMESYNC: a delay would count twice"
-    why = "bit 0: horizontal position, bit 2: velocity"
     rules = [
-        ParameterRule(("EKF2_EV_CTRL",), (), why, bits=0b0101 if odometry else 0b0001),
+        ParameterRule(("EKF2_EV_CTRL",), (), "bit 0: horizontal position", bits=0b0001),
         ParameterRule(("EKF2_EV_DELAY",), (0.0,), stamped, tolerance=10.0, reboot=True),
         ParameterRule(
             ("EKF2_EV_NOISE_MD",), (0.0,), "1 ignores the covariance that is sent", False

@@ -144,7 +144,6 @@ class VehicleReadings:
             system_id=m.get_srcSystem(),
             component_id=m.get_srcComponent(),
             autopilot=autopilot,
-            vehicle_type=m.type,
             armed=armed,
             custom_mode=m.custom_mode,
             mode=mavutil.mode_string_v10(m),
@@ -233,25 +232,13 @@ class VehicleReadings:
         )
 
     def _ekf_status(self, m: Any, _: int) -> None:
-        self.state = replace(
-            self.state,
-            ekf_flags=m.flags,
-            ekf_velocity_variance=_known(m.velocity_variance),
-            ekf_horizontal_variance=_known(m.pos_horiz_variance),
-            ekf_vertical_variance=_known(m.pos_vert_variance),
-            ekf_compass_variance=_known(m.compass_variance),
-        )
+        variance = _known(m.pos_horiz_variance)
+        self.state = replace(self.state, ekf_flags=m.flags, ekf_horizontal_variance=variance)
 
     def _estimator_status(self, m: Any, _: int) -> None:
         # PX4's innovation test ratios; the flags share their first bits with EKF_STATUS_REPORT.
-        self.state = replace(
-            self.state,
-            ekf_flags=m.flags,
-            ekf_velocity_variance=_known(m.vel_ratio),
-            ekf_horizontal_variance=_known(m.pos_horiz_ratio),
-            ekf_vertical_variance=_known(m.pos_vert_ratio),
-            ekf_compass_variance=_known(m.mag_ratio),
-        )
+        variance = _known(m.pos_horiz_ratio)
+        self.state = replace(self.state, ekf_flags=m.flags, ekf_horizontal_variance=variance)
 
     def _gps(self, m: Any, time_ns: int) -> None:
         fixed = m.fix_type >= _FIX_3D
@@ -267,7 +254,6 @@ class VehicleReadings:
         self.state = replace(
             self.state,
             gps_fix_type=m.fix_type,
-            gps_satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
             gps_latitude_deg=m.lat * 1e-7 if fixed else None,
             gps_longitude_deg=m.lon * 1e-7 if fixed else None,
             gps_altitude_amsl_m=m.alt * 1e-3 if fixed else None,
@@ -276,9 +262,9 @@ class VehicleReadings:
             gps_time_ns=time_ns,
         )
 
-    def _rc(self, m: Any, time_ns: int) -> None:
+    def _rc(self, m: Any, _: int) -> None:
         channels = tuple(getattr(m, f"chan{i}_raw") for i in range(1, 19))
-        self.state = replace(self.state, rc_channels_us=channels, rc_time_ns=time_ns)
+        self.state = replace(self.state, rc_channels_us=channels)
 
     def _raw_imu(self, m: Any, time_ns: int) -> None:
         raw = (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro)
@@ -318,9 +304,6 @@ class VehicleReadings:
                 rangefinder_m=m.current_distance * 1e-2,
                 rangefinder_time_ns=time_ns,
             )
-
-    def _text(self, m: Any, _: int) -> None:
-        self.state = replace(self.state, last_text=str(m.text))
 
 
 def boot_time_ns(message: Any) -> int | None:
@@ -374,7 +357,6 @@ _HANDLERS = {
     "ESTIMATOR_STATUS": VehicleReadings._estimator_status,
     "GPS_RAW_INT": VehicleReadings._gps,
     "RC_CHANNELS": VehicleReadings._rc,
-    "STATUSTEXT": VehicleReadings._text,
     "RAW_IMU": VehicleReadings._raw_imu,
     "HIGHRES_IMU": VehicleReadings._highres_imu,
     "SCALED_PRESSURE": VehicleReadings._pressure,

@@ -58,7 +58,6 @@ class VehicleTracker:
             return replace(
                 self._readings.state,
                 connected=age_ns is not None and age_ns < _HEARTBEAT_LOST_NS,
-                heartbeat_age_s=None if age_ns is None else age_ns * 1e-9,
                 reboots=self.clock.reboots,
                 clock_offset_ns=self.clock.offset_ns,
                 clock_source=self.clock.source,

@@ -31,20 +31,6 @@ FRAME_COLUMNS = (
     "true_time_ns",
 )  # fmt: skip
 
-# A hazy late afternoon through a small sensor. The stream's own compression comes on top.
-HAZY_AFTERNOON = Appearance(
-    exposure=0.92,
-    contrast=0.95,
-    gamma=1.06,
-    saturation=0.85,
-    balance=(1.05, 1.0, 0.93),
-    extinction_per_m=3e-4,
-    vignetting=0.2,
-    shot_noise=0.015,
-    read_noise=0.006,
-    defocus_px=0.5,
-)
-
 
 @dataclass(frozen=True)
 class Exposure:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.planning.mission import MissionPlace, PlannedMission
+from companion.errors import MissionFileError
+from companion.planning import mission as saved
+from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
 from companion.preflight.coverage import covered
 from companion.settings_file import SettingsError, validated
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -18,7 +20,6 @@ from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import Scenario, ScenarioError, ScenarioLeg
-from sitl.rehearsal.mission import read_mission
 
 _PITCH_DEG = -75.0  # where the mission does not say
 _SIDE = 0.5  # of the map's shorter half extent: how far the flight without a mission goes
@@ -64,6 +65,21 @@ def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Sce
             notes.append(f"of the mission is not rehearsed: {', '.join(unknown)}")
     _require_covered(opened, world.frame, flown)
     return Rehearsal(FlightAssets(world, cache, live or cache), flown, tuple(notes))
+
+
+def read_mission(path: Path) -> PlannedMission:
+    """Read a saved mission. `ScenarioError` if it is invalid or cannot be rehearsed."""
+    try:
+        planned = saved.read_mission(path)
+    except MissionFileError as error:
+        raise ScenarioError(str(error)) from error
+    strange = {w.above.value for w in planned.path} - {HeightAbove.HOME.value}
+    if strange:
+        raise ScenarioError(
+            f"{path}: waypoints above {', '.join(sorted(strange))}; a rehearsal flies heights "
+            "above home (frame 3): save the mission with relative altitudes"
+        )
+    return planned
 
 
 def _require_covered(cache: TileCache, home: LocalFrame, scenario: Scenario) -> None:

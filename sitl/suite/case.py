@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
@@ -15,6 +14,7 @@ from mavlink_bridge import BridgeConfig
 from mavlink_bridge.config import StrictModel
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.checks import Check
+from sitl.suite.ramp import Ramp
 from sitl.suite.simulated_localizer import FixModel
 from sitl.vehicles.launch import (
     GPS_OFF,
@@ -81,22 +81,17 @@ class Flight(StrictModel):
         return self
 
 
-class CaseEvent(StrictModel):
+class CaseEvent(Ramp):
     """A fault or command, at_s seconds after the take-off height is reached.
 
     fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
-    vehicle: parameters set by the ground station; ramp: parameters that go from one value to
-    another in over_s; scattered: drawn at each step, up to the value that is due, of either sign.
-    source_set: ordered by the ground station.
+    vehicle: parameters set by the ground station. source_set: ordered by the ground station.
     """
 
     at_s: float = Field(ge=0)
     fixes: dict[str, Any] = Field(default_factory=dict)
     reset: bool = False
     vehicle: dict[str, float] = Field(default_factory=dict)
-    ramp: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    over_s: float = Field(0.0, ge=0, le=300)
-    scattered: tuple[str, ...] = ()
     source_set: int | None = Field(None, ge=1, le=3)
     reboot: bool = False
 
@@ -104,17 +99,7 @@ class CaseEvent(StrictModel):
     def _does_something(self) -> CaseEvent:
         if not (self.fixes or self.vehicle or self.ramp or self.source_set or self.reboot):
             raise ValueError("nothing happens: give fixes, vehicle, ramp, source_set or reboot")
-        if not set(self.scattered) <= set(self.ramp) or bool(self.ramp) != (self.over_s > 0):
-            raise ValueError("over_s belongs to a ramp, and `scattered` names parameters of it")
         return self
-
-    def ramped(self, share: float, rng: np.random.Generator) -> dict[str, float]:
-        """The ramp's parameters at a share (0 to 1) of over_s."""
-        due = {name: first + share * (last - first) for name, (first, last) in self.ramp.items()}
-        return {
-            name: value * float(rng.uniform(-1, 1)) if name in self.scattered else value
-            for name, value in due.items()
-        }
 
 
 class GroundSetup(StrictModel):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mavlink_bridge.alerts.catalogue import CATALOGUE
 from mavlink_bridge.alerts.ids import AlertId
-from sitl.suite.record import CaseRecord
+from sitl.suite.record import CaseRecord, Text
 
 FOREVER = math.inf
 
@@ -172,15 +173,19 @@ class AlertExpectation(_Span):
     these.
     """
 
-    check: Literal["alert"]
+    check: Literal["alert"] = "alert"
     alert: AlertId
     values: dict[str, str] = {}
     absent: bool = False
 
     def judge(self, record: CaseRecord) -> ExpectationResult:
         """See `_Expectation.judge`."""
+        return self.judge_texts(record.texts)
+
+    def judge_texts(self, texts: Iterable[Text]) -> ExpectationResult:
+        """As `judge`, of a record's texts."""
         times = [
-            t.at_s for t in record.texts
+            t.at_s for t in texts
             if t.alert is self.alert
             and self.values.items() <= t.values.items()
             and self.from_s <= t.at_s <= self.to_s

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
-import numpy as np
-
 from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge import Bridge, BridgeConfig
@@ -19,6 +17,7 @@ from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.suite.case import Case, CaseEvent
 from sitl.suite.doctor import run_doctor
+from sitl.suite.ramp import RunningRamp
 from sitl.suite.record import CaseRecord, Text, VehicleSample
 from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink
 from sitl.vehicles.launch import VehicleSetup, open_vehicle
@@ -32,7 +31,6 @@ _SETTLE_S = 3.0
 _REBOOT_S = 60.0  # within which the ports of the next boot are open; a tenth of a second is usual
 _NEAR_M = 3.0
 _STEP_S = 0.1
-_RAMP_STEP_S = 0.4
 _LONGEST_S = 240.0
 _ARMING_TRIES = 3
 
@@ -65,8 +63,7 @@ class _CaseFlight:
         side = case.flight.side_m
         self._corners = [(side, 0.0), (side, side), (0.0, side), (0.0, 0.0)] if side else []
         self._waiting = list(case.timeline)
-        self._ramp: tuple[CaseEvent, float, float] | None = None
-        self._rng = np.random.default_rng(seed)
+        self._ramp = RunningRamp(seed)
         self._ticks: list[tuple[float, float]] = []
 
     def run(self) -> CaseRecord:
@@ -83,7 +80,6 @@ class _CaseFlight:
         self._send_to_corner()
         while not self._over():
             self._happen()
-            self._ramp_on()
             self._sample()
             self._steer()
             self._pilot.link.sleep(_STEP_S)
@@ -181,14 +177,7 @@ class _CaseFlight:
     def _happen(self) -> None:
         while self._waiting and self._waiting[0].at_s <= self._now_s:
             self._do(self._waiting.pop(0))
-
-    def _ramp_on(self) -> None:
-        event, begun_s, due_s = self._ramp or (None, 0.0, math.inf)
-        if event is None or self._now_s < due_s:
-            return
-        share = min((self._now_s - begun_s) / event.over_s, 1.0)
-        self._ramp = (event, begun_s, due_s + _RAMP_STEP_S) if share < 1.0 else None
-        for name, value in event.ramped(share, self._rng).items():
+        for name, value in self._ramp.due(self._now_s).items():
             self._pilot.link.set_parameter(name, value)
 
     def _do(self, event: CaseEvent) -> None:
@@ -197,8 +186,7 @@ class _CaseFlight:
             self._feed.change(self._model, reset=event.reset)
         for name, value in event.vehicle.items():
             self._pilot.link.set_parameter(name, value)
-        if event.ramp:
-            self._ramp = (event, self._now_s, self._now_s)
+        self._ramp.begin(event, self._now_s)
         if event.source_set is not None:
             self._pilot.use_source_set(event.source_set)
         if event.reboot:

@@ -39,7 +39,6 @@ def refused(
         ("bridge --load", "--load"),
         ("rendering --size 512", "--size"),
         ("rendering --triangles inf", "--triangles"),
-        ("map_streaming --km 0", "--km"),
         ("optimizer --threads 0", "--threads"),
         ("basin ablation . --set nowhere", "nowhere"),
         ("basin axes . --processes 0", "--processes"),

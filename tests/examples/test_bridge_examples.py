@@ -156,13 +156,6 @@ def test_the_ekf_is_where_my_fixes_say(kind: Any, run: Callable[..., Example]) -
     assert refused[0].startswith("not a fix: hello: JSONDecodeError")
 
 
-@pytest.mark.parametrize("name", ["inject_my_fixes.py", "click_to_target.py"])
-def test_without_arguments_the_usage_is_told(name: str, run: Callable[..., Example]) -> None:
-    example = run(name)
-    assert example.end() == 1
-    assert any(line.strip().endswith(("GEOID", "[COUNT]")) for line in example.lines)
-
-
 # --- a click ------------------------------------------------------------------------------------
 
 FRAME = LocalFrame(Geodetic(HOME.latitude_deg, HOME.longitude_deg, HOME.altitude_m + GEOID))

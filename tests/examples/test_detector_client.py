@@ -64,10 +64,3 @@ def test_every_red_box_arrives_with_its_frames_time_and_nothing_else(tmp_path):
     assert [d.time_ns for d in got] == [10**8, 3 * 10**8]
     np.testing.assert_allclose([(d.u, d.v) for d in got], [(25.0, 35.0), (103.0, 63.0)])
     assert {d.target_id for d in got} == {"red"}
-
-
-def test_a_deployment_without_a_door_for_detections_is_told(tmp_path):
-    done = _run(_deployment(tmp_path, None, [None]))
-    assert done.returncode == 1
-    assert "set targets.detections" in done.stderr
-    assert "Traceback" not in done.stderr

@@ -43,12 +43,6 @@ def test_a_photo(run, small_assets, small_sequence):
     assert np.linalg.norm(LocalFrame(row.position).enu_from_geodetic(*found)) < 1.0
 
 
-def test_a_photo_takes_ten_lines():
-    code = (EXAMPLES / "localize_photo.py").read_text().split('"""')[2]
-    body = [x for x in code.splitlines() if x and not x.startswith(("import", "from"))]
-    assert len(body) <= 10
-
-
 def test_a_video(run, small_assets, small_sequence, tmp_path):
     rows = read_poses(small_sequence / "poses.txt")[:FRAMES]
     video = None

@@ -148,7 +148,7 @@ GOOD |= {"EKF2_EV_NOISE_MD": 0.0} | {f"EKF2_EV_POS_{axis}": 0.0 for axis in "XYZ
 def test_parameters_of_external_vision() -> None:
     assert rules("odometry", GOOD) == {}
     assert rules("vision_position_estimate", {**GOOD, "EKF2_EV_CTRL": 9.0}) == {}
-    assert rules("odometry", {**GOOD, "EKF2_EV_CTRL": 9.0}) == {"EKF2_EV_CTRL": 13.0}
+    assert rules("odometry", {**GOOD, "EKF2_EV_CTRL": 8.0}) == {"EKF2_EV_CTRL": 9.0}
     # The stamps are exposure times: a delay as well would count it twice.
     assert rules("odometry", {**GOOD, "EKF2_EV_DELAY": 150.0}) == {"EKF2_EV_DELAY": 0.0}
     assert rules("odometry", {**GOOD, "EKF2_DELAY_MAX": 100.0}) == {"EKF2_DELAY_MAX": 200.0}

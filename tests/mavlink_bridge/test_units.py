@@ -59,7 +59,7 @@ def estimate() -> EncodedEstimate:
         round(EXPOSURE_S * 1e9), LAT, LON, HEIGHT, np.diag([4.0, 4.0, 9.0]),
         np.array([NORTH, EAST, DOWN]), np.eye(3) * 0.25,
     )  # fmt: skip
-    return EncodedEstimate(position, NOSE, 0.02, 80, 1, True)
+    return EncodedEstimate(position, NOSE, 0.02, 80, 1, True, velocity_is_new=True)
 
 
 REPORT = TargetReport(

@@ -32,7 +32,7 @@ def flight_command(
     write: Annotated[bool, typer.Option(help="change that file and keep the old one")] = False,
     report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
 ) -> None:
-    """Estimate camera, boresight, lever arm, time offset and map offset from a shadow flight."""
+    """Estimate camera, mounting angles, lever arm, time and map offset from a shadow flight."""
     from companion.calibrate.flight import calibrate
     from companion.calibrate.proposal import (
         blind_spots,
@@ -122,7 +122,7 @@ def board_command(
     sheet: Annotated[
         Path | None, typer.Option("--print", help="write the board to print: .pdf or .png")
     ] = None,
-    paper: Annotated[Literal["a4", "a3", "letter"], typer.Option(help="of the board")] = "a4",
+    paper: Annotated[Literal["a4", "a3", "letter"], typer.Option(help="paper of the board")] = "a4",
     seconds: Annotated[
         float, typer.Option(min=1, max=3600, help="longest time of a stream")
     ] = 180.0,

@@ -179,7 +179,7 @@ def _model(
 
 def _with_vehicle(config: CompanionConfig, notes: list[str]) -> CompanionConfig:
     """With the system id of the autopilot that answers."""
-    from mavlink_bridge.preflight.meeting import meet
+    from mavlink_bridge.preflight.client import meet
 
     try:
         met = meet(config.bridge)

@@ -27,17 +27,22 @@ def try_command(
     ] = None,
     report: Annotated[Path, typer.Option(help="folder of the report")] = Path("try-report"),
     places: Annotated[
-        Path | None, typer.Option(help="CSV or text with the photos' places; else found beside")
+        Path | None,
+        typer.Option(help="CSV or text with the photos' positions; default: beside them"),
     ] = None,
     log: Annotated[
-        Path | None, typer.Option(help="ArduPilot .bin or .tlog of the flight; else found beside")
+        Path | None,
+        typer.Option(help="ArduPilot .bin or .tlog of the flight; default: beside the footage"),
     ] = None,
     camera: FootageCamera = None,
     fov: FieldOfView = None,
     mount_pitch: MountPitch = -90.0,
-    frames: Annotated[int, typer.Option(min=1, max=2000, help="that are used, at most")] = 100,
+    frames: Annotated[
+        int, typer.Option(min=1, max=2000, help="largest number of frames that are used")
+    ] = 100,
     searches: Annotated[
-        int, typer.Option(min=0, max=2000, help="frames that are searched without their place")
+        int,
+        typer.Option(min=0, max=2000, help="number of frames that are searched without position"),
     ] = 20,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
 ) -> None:

@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from localizer.geometry.pose import Array
 from localizer.map.cache.tile import TileMesh
-from localizer.types import RenderedView
 
-_JUMP = 0.02  # relative change of depth between neighbouring pixels that may be an edge
 # Between tiles, whose corners are rounded each to its own float32, nothing is open: metres, and the
 # same as a share of a triangle's side, by which it is widened for rays that meet nothing else.
 _SEAM_M, _SEAM = 1e-3, 1e-4
@@ -58,29 +56,6 @@ class Pyramid:
         corners = np.where(_CORNERS[None, :, :], high[:, None, :], low[:, None, :])
         meets: NDArray[np.bool_] = np.bitwise_and.reduce(self.beyond(corners), axis=1) == 0
         return meets
-
-
-def pick(
-    view: RenderedView, pixels: ArrayLike, meshes: Sequence[TileMesh] = ()
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Surface points (N, 3) in world metres under pixels (N, 2) of a rendered view, and a mask of
-    those that exist.
-
-    On a plane 1/z is linear in the image, so it is interpolated bilinearly. At a depth step (a
-    roof's edge, the skyline) this would give points in mid-air, so the nearest pixel's depth is
-    taken there. With `meshes`, from which the view was rendered, each ray is intersected with their
-    triangles. This is exact and takes about 0.3 ms a pixel.
-    """
-    pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-    rays = view.camera.rays(pixels)
-    if len(meshes):
-        directions = rays @ view.world_from_camera.rotation.T
-        z = cast_rays(meshes, view.world_from_camera.translation, directions)
-    else:
-        z = _interpolated_depth(view.depth, pixels)
-    valid = np.isfinite(z) & (z > 0)
-    points = view.world_from_camera.apply(rays * np.where(valid, z, np.nan)[:, None])
-    return points, valid
 
 
 def cast_rays(meshes: Sequence[TileMesh], origin: ArrayLike, directions: ArrayLike) -> Array:
@@ -159,26 +134,6 @@ def _normals(mesh: TileMesh, faces: NDArray[np.int32], directions: Array) -> Arr
     n = np.cross(q - p, s - p)
     n /= np.linalg.norm(n, axis=1)[:, None]
     return np.where(((n * directions).sum(axis=1) > 0)[:, None], -n, n)
-
-
-def _interpolated_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
-    """Depth (N,) at sub-pixel positions, 0 outside the image and where there is none."""
-    h, w = depth.shape
-    inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] <= w) & (pixels[:, 1] <= h)
-    x = np.clip(np.nan_to_num(pixels[:, 0]) - 0.5, 0, w - 1)
-    y = np.clip(np.nan_to_num(pixels[:, 1]) - 0.5, 0, h - 1)
-    x0, y0 = np.minimum(x.astype(int), w - 2), np.minimum(y.astype(int), h - 2)
-    fx, fy = x - x0, y - y0
-    corners = np.stack(
-        [depth[y0, x0], depth[y0, x0 + 1], depth[y0 + 1, x0], depth[y0 + 1, x0 + 1]]
-    ).astype(np.float64)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    smooth = (low > 0) & (high <= low * (1 + _JUMP))
-    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        interpolated = 1 / (weights / corners).sum(axis=0)
-    nearest = depth[np.rint(y).astype(int), np.rint(x).astype(int)]
-    return np.where(inside, np.where(smooth, interpolated, nearest), 0.0)
 
 
 @njit(cache=True, nogil=True)

@@ -205,7 +205,11 @@ def build_mips(image: Image, used: NDArray[np.bool_] | None = None) -> tuple[Ima
 def texel_coverage(
     uvs: Float32, faces: NDArray[np.int32], width: int, height: int
 ) -> NDArray[np.bool_]:
-    """(height, width) mask of the texels that the triangles show, borders included."""
+    """(height, width) mask of the texels that the triangles show, borders included.
+
+    uvs: (N, 2) texture coordinates, (0, 0) at the first texel's corner and (1, 1) at the last's;
+    faces: (M, 3) indices of uvs.
+    """
     mask = np.zeros((height, width), np.uint8)
     fixed = np.clip(uvs.astype(np.float64) * (width, height) - 0.5, -1, (width, height))
     triangles = np.rint(fixed).astype(np.int32)[faces]

@@ -46,8 +46,11 @@ class FoundSource:
 def source_in(folder: Path, georeference_given: bool) -> FoundSource:
     """The source in a folder, if there is only one way to read it.
 
-    It is a tileset, an OpenDroneMap result, one mesh with its georeference, or two rasters.
-    Otherwise `MapSourceError` lists the files found and the options to give.
+    A `tileset.json` directly in the folder is taken, whatever else is there. Otherwise the source
+    is another tileset, an OpenDroneMap result, one mesh with its georeference, or two rasters.
+    georeference_given: the user gave a file for the mesh, so none is needed in the folder.
+    `MapSourceError` if there are several ways, with a `map build` command for each; if there is
+    none, with the files found; or if the folder cannot be read.
     """
     if (folder / TILESET).is_file():
         return FoundSource((folder,))

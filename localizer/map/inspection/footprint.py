@@ -11,8 +11,8 @@ from localizer.map.cache.cache import Manifest
 
 
 def as_geojson(manifest: Manifest, name: str) -> str:
-    """One feature: the outline as a polygon, counter-clockwise, longitude first; as two where it
-    crosses the 180th meridian.
+    """GeoJSON text with one feature: the map's outline as a polygon, counter-clockwise, longitude
+    first. An outline across the 180th meridian becomes two polygons. name: a property of it.
     """
     rings = _rings(manifest)
     geometry: dict[str, Any] = {"type": "Polygon", "coordinates": rings}

@@ -144,7 +144,7 @@ def textured(
 
 
 def without(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
-    """The objects without a random share of them."""
+    """The objects; each one is left out with the probability `share`."""
     return [p for p in prisms if rng.random() >= share]
 
 

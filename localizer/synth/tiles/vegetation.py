@@ -135,7 +135,10 @@ def tree_meshes(
 
 
 def hedge_corners(hedge: Hedge, za: float, zb: float) -> list[Array]:
-    """The hedge's top and four sides as quads (4, 3), counter-clockwise from outside."""
+    """The hedge's top and four sides as quads (4, 3), counter-clockwise from outside.
+
+    za, zb: height of the ground at its ends `a` and `b`, metres.
+    """
     along = (hedge.b - hedge.a) / max(float(np.linalg.norm(hedge.b - hedge.a)), 1e-9)
     across = np.array([-along[1], along[0]]) * hedge.width / 2
     ring = [hedge.a - across, hedge.b - across, hedge.b + across, hedge.a + across]

@@ -18,7 +18,9 @@ _BUMPS_M = (0.03, 0.25)  # its vertical noise
 
 
 def coarse_mesh(scene: LitScene, rng: np.random.Generator) -> LitScene:
-    """The scene on the surface that photogrammetry gives: rounded edges, bumps, soft facades."""
+    """The scene's height field as photogrammetry gives it: rounded edges and bumps. Prisms stay as
+    they are. The side of the height field, in cells, must be a multiple of `BLOCK`.
+    """
     n, cell = scene.height.shape[0], scene.cell_m
     factor = float(np.exp(rng.uniform(*np.log(_MESH_M)))) / cell
     height = scene.height

@@ -15,6 +15,7 @@ from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import euler, matrix, quaternion
 
 _VISION_TIMEOUT_MS = 300
+_LEAST_DELTA_US = 12_000  # one step of EKF3 (EKF_TARGET_DT)
 _GPS_TIMEOUT_MS = 4000
 _GPS_MAX_GAP_MS = 215
 _GPS_MAVLINK = 14
@@ -91,11 +92,19 @@ class ExternalNavInput:
             self._estimator.add_external_velocity(velocity, stamp)
 
     def position_delta(self, message: Any, now_ms: int) -> None:
-        """VISION_POSITION_DELTA: a velocity in body axes, with the arrival time."""
+        """Take VISION_POSITION_DELTA as a velocity, stamped with its arrival time.
+
+        VISO_TYPE 0 ignores the message. Every other message marks vision as healthy. The EKF's own
+        attitude rotates the position delta from body axes to NED. The sigma falls linearly from
+        EK3_VIS_VERR_MAX at confidence 0 to EK3_VIS_VERR_MIN at 100. The angle delta is not used. A
+        delta over less than 12 ms gives no velocity, as in ArduPilot.
+        """
         p = self._parameters
         if p["VISO_TYPE"] == 0:
             return
         self._last_vision_ms = now_ms
+        if message.time_delta_usec < _LEAST_DELTA_US:
+            return
         moved = matrix(self._estimator.output[0:4]) @ np.array(message.position_delta)
         n, e, d = moved / (message.time_delta_usec * 1e-6)
         least, most = p["EK3_VIS_VERR_MIN"], p["EK3_VIS_VERR_MAX"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from math import asin, atan2, cos, sin, sqrt
+from math import atan2, cos, sin, sqrt
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from mavlink_bridge.quaternion import from_euler, to_euler
 
 Array = NDArray[np.float64]
 
@@ -60,27 +62,13 @@ def rotate_world(q: Array, rx: float, ry: float, rz: float) -> None:
 
 def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
     """Quaternion (4,) of aerospace Euler angles in radians."""
-    cr, sr = cos(roll_rad / 2), sin(roll_rad / 2)
-    cp, sp = cos(pitch_rad / 2), sin(pitch_rad / 2)
-    cy, sy = cos(yaw_rad / 2), sin(yaw_rad / 2)
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
+    return np.array(from_euler(roll_rad, pitch_rad, yaw_rad))
 
 
 def euler(q: Array) -> tuple[float, float, float]:
     """(roll, pitch, yaw) in radians of a quaternion (4,)."""
     w, x, y, z = (float(c) for c in q)
-    return (
-        atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-        atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
+    return to_euler((w, x, y, z))
 
 
 def wrap_pi(angle_rad: float) -> float:

@@ -14,6 +14,8 @@ from mavlink_bridge.config import StrictModel
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioError, ScenarioLeg
+from sitl.suite.checks import AlertExpectation
+from sitl.suite.ramp import Ramp
 
 LOOP_SCENARIOS = Path(__file__).parents[2] / "scenarios" / "loop"
 
@@ -44,14 +46,6 @@ class Zoom(StrictModel):
     over_s: float = Field(2.0, ge=0, le=60)
 
 
-class Drag(StrictModel):
-    """GNSS spoofing: the reported position moves away for some seconds, then stays."""
-
-    north_m_s: float = Field(0.0, ge=-10, le=10)
-    east_m_s: float = Field(0.0, ge=-10, le=10)
-    for_s: float = Field(gt=0, le=600)
-
-
 class Load(StrictModel):
     """CPU load: `processes` busy processes run on one processor with the companion."""
 
@@ -66,7 +60,7 @@ class OperatorHint(StrictModel):
     off_north_m: float = Field(0.0, ge=-2000, le=2000)
 
 
-class LoopEvent(StrictModel):
+class LoopEvent(Ramp):
     """A fault or command, at_s seconds after the recorded part began (and GNSS was denied).
 
     picture: a fault of the video. zoom: of the lens. kill: SIGKILL to the companion, started again
@@ -77,7 +71,6 @@ class LoopEvent(StrictModel):
     at_s: float = Field(ge=0)
     picture: VideoFault | None = None
     zoom: Zoom | None = None
-    drag: Drag | None = None
     load: Load | None = None
     hint: OperatorHint | None = None
     start: bool = False
@@ -113,8 +106,9 @@ class Expectation(StrictModel):
     be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
     injects: and some are injected. back_within_s: of a kill or a hang, injected again.
     repeats: how often the companion may say the same, figures aside. ends_tracking: the last health
-    is ok. reports: alerts that must come from the companion; warns_first: and this one before the
-    first text that localization is degraded or lost.
+    is ok. reports: alerts that must come from the companion; alerts: those that must come, or
+    must not, within a time; warns_first: one that must come before the first text that localization
+    is degraded or lost.
     silent: no warning text, no finding of the monitor, and a health that is ok throughout.
     """
 
@@ -127,6 +121,7 @@ class Expectation(StrictModel):
     back_within_s: float | None = Field(None, gt=0)
     ends_tracking: bool = False
     reports: tuple[AlertId, ...] = ()
+    alerts: tuple[AlertExpectation, ...] = ()
     warns_first: AlertId | None = None
     silent: bool = False
     repeats: int | None = Field(None, ge=1)

@@ -32,16 +32,16 @@ from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.companion import Health, LoopCompanion
-from sitl.suite.loop.disturbances import CpuLoad, GnssSpoofing
+from sitl.suite.loop.disturbances import CpuLoad
 from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText, RestartTimes
 from sitl.suite.loop.terrain_file import terrain_file
+from sitl.suite.ramp import RunningRamp
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
 _STEP_S = 0.25
 _TRACKING_S, _WRONG_S, _GO_S = 90.0, 15.0, 40.0
 _LOCALIZER = 197  # component
-_DRAG_STEP_S = 0.5
 _POSITION_FRESH_S = 1.0  # LOCAL_POSITION_NED comes 25 times a second, while there is a position
 
 
@@ -108,7 +108,7 @@ class _LoopFlight:
         self._samples: list[LoopSample] = []
         self._waiting = list(case.timeline)
         self._due: list[tuple[float, Callable[[], None]]] = []
-        self._drag: GnssSpoofing | None = None
+        self._ramp = RunningRamp(seed)
         self._reporting: ReportingCamera | None = None
         self._zooming = Zooming(1.0, 1.0, 0, 0)
         self._ticks: list[tuple[float, float]] = []
@@ -175,6 +175,8 @@ class _LoopFlight:
                     self._happen(self._waiting.pop(0))
                 while self._due and self._due[0][0] <= self._now_s:
                     self._due.pop(0)[1]()
+                for name, value in self._ramp.due(self._now_s).items():
+                    self._pilot.link.set_parameter(name, value)
                 self._sample()
                 self._pilot.link.sleep(_STEP_S)
         self._end_ns = time.monotonic_ns()
@@ -267,9 +269,7 @@ class _LoopFlight:
             self._later(event.picture.for_s, lambda: self._camera.fault(None))
         if event.zoom is not None:
             self._zoom_to(event.zoom)
-        if event.drag is not None:
-            self._drag = GnssSpoofing(event.drag, self._pilot.link, self._home, self._now_s)
-            self._drag_on()
+        self._ramp.begin(event, self._now_s)
         if event.load is not None:
             work = CpuLoad(event.load, self._companion)
             self._stack.callback(work.end)
@@ -315,11 +315,6 @@ class _LoopFlight:
         self._camera.zoom(self._zooming)
         if self._reporting is not None:
             self._reporting.set(self._zooming)
-
-    def _drag_on(self) -> None:
-        if self._drag is not None and not self._drag.is_over(self._now_s):
-            self._drag.step(self._now_s)
-            self._later(_DRAG_STEP_S, self._drag_on)
 
     def _later(self, seconds: float, do: Callable[[], None]) -> None:
         """Have something done by the flight's own loop, so many seconds from now."""

@@ -12,8 +12,10 @@ import numpy as np
 
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
+from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop.case import Expectation
 from sitl.suite.loop.companion import Health
+from sitl.suite.record import Text
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
 _AUTOPILOT = 1  # component id
@@ -120,11 +122,14 @@ class LoopFigures:
 
 @dataclass(frozen=True)
 class Held:
-    """Result of one expectation: its text, whether it holds, and the observed value."""
+    """Result of one expectation: its text, whether it holds, and the observed value. listed: the
+    table shows the value of one that holds, too.
+    """
 
     what: str
     ok: bool
     seen: str
+    listed: bool = False
 
 
 def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
@@ -209,6 +214,7 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
         held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
     held += [_reported(record.texts, of) for of in expect.reports]
+    held += [_timed(record.texts, of) for of in expect.alerts]
     if expect.warns_first is not None:
         held.append(_warned(record.texts, expect.warns_first))
     if expect.repeats is not None:
@@ -230,6 +236,15 @@ def _reported(texts: Sequence[LoopText], of: AlertId) -> Held:
     found = [t for t in texts if t.alert is of]
     at = f"at {found[0].at_s:.1f} s" if found else "never"
     return Held(f"reports {of.words}", bool(found), at)
+
+
+def _timed(texts: Sequence[LoopText], of: AlertExpectation) -> Held:
+    plain = (
+        Text(t.at_s, "vehicle" if t.component == _AUTOPILOT else "bridge", t.text) for t in texts
+    )
+    found = of.judge_texts(plain)
+    span = "never" if of.absent else f"from {of.from_s:g} to {of.to_s:g} s"
+    return Held(f"{of.alert.words} {span}", found.ok, found.what, listed=not of.absent)
 
 
 def _warned(texts: Sequence[LoopText], of: AlertId) -> Held:

@@ -48,6 +48,11 @@ class LoopRow:
         return not self.error and all(held.ok for held in self.held)
 
     @property
+    def valid(self) -> bool:
+        """Whether it was flown, in real time."""
+        return not self.error and not self.slow
+
+    @property
     def slow(self) -> bool:
         """Whether the vehicle did not run in real time; the result then says little."""
         return self.pace < PACE_LIMIT or self.stall_s > STALL_LIMIT_S
@@ -141,7 +146,8 @@ def _cells(row: LoopRow) -> tuple[str, ...]:
     flown = row.figures
     if flown is None:
         return (row.name, who, *["-"] * 6, f"NOT FLOWN: {row.error.splitlines()[0]}")
-    missed = "; ".join(f"MISSED {held.what}: {held.seen}" for held in row.held if not held.ok)
+    missed = [f"MISSED {held.what}: {held.seen}" for held in row.held if not held.ok]
+    listed = [held.seen for held in row.held if held.ok and held.listed]
     return (
         row.name,
         who,
@@ -151,7 +157,7 @@ def _cells(row: LoopRow) -> tuple[str, ...]:
         f"{flown.max_fix_m:.1f}" if flown.sent else "-",
         f"{flown.told_s:.0f}",
         f"{flown.rate_hz:.1f}",
-        missed.replace("|", "/") or "all",
+        "; ".join([*(missed or ["all"]), *listed]).replace("|", "/"),
     )
 
 

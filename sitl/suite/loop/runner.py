@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 
+from mavlink_bridge.atomic_file import replace_file
 from sitl.demo.assets import prepare
 from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
@@ -16,11 +17,12 @@ from sitl.suite.loop.case import LoopCase
 from sitl.suite.loop.flight import LoopAssets, fly
 from sitl.suite.loop.inner_map import inner_map
 from sitl.suite.loop.judge import false_alarms, figures, judge
-from sitl.suite.loop.report import LoopRow, as_data, markdown
+from sitl.suite.loop.report import LoopRow, as_data, markdown, read_rows
 from sitl.vehicles.process import VehicleKind
 
 _MOST_SEEDS = 1000
 _DIGITS = 9
+_READABLE = 0o644
 _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown world's seed
 
 
@@ -28,6 +30,7 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 class RunOptions:
     """Vehicles, seeds (world, light, errors), and folders of records and worlds. say: receives
     progress lines; building: receives the progress of world generation (step, share done).
+    resume: fly only what ``out`` does not hold yet, or holds as not flown or too slow.
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -36,23 +39,32 @@ class RunOptions:
     worlds: Path | None = None
     say: Callable[[str], None] = lambda _: None
     building: Callable[[str, float], None] = lambda _phase, _share: None
+    resume: bool = False
 
 
 def fly_loop(
     cases: Sequence[LoopCase], options: RunOptions, landed: Callable[[LoopRow], None]
 ) -> tuple[LoopRow, ...]:
     """Fly all scenarios with every seed. Each flight is kept in ``out/VEHICLE-NAME-SEED``, the
-    table in ``out/loop.json`` and ``out/loop.md``. landed: called with each result.
+    table in ``out/loop.json`` and ``out/loop.md``. landed: called with each result. Returned:
+    all rows of the table.
     """
     options.out.mkdir(parents=True, exist_ok=True)
-    rows: list[LoopRow] = []
+    kept = options.out / "loop.json"
+    rows = list(read_rows(kept)) if options.resume and kept.exists() else []
     for kind, seed, case in product(options.vehicles, options.seeds, cases):
+        flown = [
+            row for row in rows if (row.name, row.vehicle, row.seed) == (case.name, kind, seed)
+        ]
+        if any(row.valid for row in flown):
+            continue
+        rows = [row for row in rows if row not in flown]
         options.say(f"flying {case.name} on {kind}, seed {seed}: {case.title}")
         row = _flown(case, kind, seed, options)
         rows.append(row)
         landed(row)
         report = json.dumps(as_data(rows), indent=1, allow_nan=False)
-        (options.out / "loop.json").write_text(report, encoding="utf-8")
+        replace_file(kept, report, _READABLE)
         (options.out / "loop.md").write_text(markdown(rows), encoding="utf-8")
     return tuple(rows)
 

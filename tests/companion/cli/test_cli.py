@@ -5,7 +5,6 @@ import signal
 import socket
 import subprocess
 import sys
-from importlib import metadata
 
 import pytest
 import yaml
@@ -159,20 +158,3 @@ def test_an_option_that_is_no_finite_number_is_named(tmp_path, options):
     result = CliRunner().invoke(app, ["try", str(tmp_path), *options])
     assert isinstance(result.exception, ConfigError)
     assert re.fullmatch("--fov (nan|inf): give a finite number", str(result.exception))
-
-
-def test_the_version_is_that_of_the_package():
-    result = CliRunner().invoke(app, ["--version"])
-    assert result.exit_code == 0
-    assert result.output.strip() == f"companion {metadata.version('pilot-companion')}"
-
-
-@pytest.mark.parametrize(
-    "options",
-    [("--out", "view"), ("--width", "0"), ("--image-height", "1000000"), ("--fov", "200")],
-)
-def test_a_picture_of_the_map_that_cannot_be_made_is_wrong_usage(map_cache, options):
-    place = ("--latitude", "47.5", "--longitude", "8.5", "--height", "500")
-    result = CliRunner().invoke(app, ["map", "render", str(map_cache), *place, *options])
-    assert result.exit_code == 2
-    assert options[0] in result.output

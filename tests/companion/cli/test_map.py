@@ -99,16 +99,6 @@ def test_what_contradicts_a_flat_ground_is_named(ortho, tmp_path, ground, option
     assert why in str(result.exception)
 
 
-def test_errors_of_a_flat_map_name_the_orthophoto(ortho, tmp_path):
-    (tmp_path / "made").mkdir()
-    flat = ("--out", tmp_path / "made" / "c", "--flat-ground", 430)
-    assert str(run("build", ortho, *flat).exception).startswith(f"{ortho} does not say")
-    with rasterio.open(ortho, "r+") as file:
-        file.crs = rasterio.CRS()
-    assert str(run("build", ortho, *flat).exception).startswith(f"{ortho}: the raster has no CRS")
-    assert not list((tmp_path / "made").iterdir())
-
-
 def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
     def interrupted(*_args, **_options):
         raise KeyboardInterrupt
@@ -143,17 +133,6 @@ def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch
     else:
         assert result.exit_code == 2
         assert why in " ".join(result.output.replace("│", " ").split())
-
-
-def test_progress_is_told_from_the_start_to_all_tiles(source, tmp_path):
-    told = []
-    build.build_cache(
-        source,
-        tmp_path / "c",
-        BuildOptions(workers=1),
-        progress=lambda done, total: told.append((done, total)),
-    )
-    assert told == [(done, 21) for done in range(22)]
 
 
 def test_info_says_where_the_map_is_and_writes_its_outline(cache, tmp_path):

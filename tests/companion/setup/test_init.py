@@ -14,8 +14,8 @@ from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
 from companion.settings_file import settings
-from companion.setup.difference import differing
 from companion.setup.reference import reference
+from companion.setup.write import differing
 from localizer.errors import MapCacheError
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions

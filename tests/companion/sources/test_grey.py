@@ -12,9 +12,7 @@ import pytest
 from PIL import Image as PillowImage
 from pydantic import ValidationError
 
-from companion.config import RecordConfig
 from companion.errors import StreamDecodeError, StreamDepthError
-from companion.flight.recorder import RecordKeeper
 from companion.setup.asking import read_stream_size
 from companion.sources import SourceSettings, StreamState, av_source, open_source
 from companion.sources.folder_source import read_image
@@ -90,16 +88,6 @@ def test_other_kinds_of_grey_are_named(tmp_path: Path) -> None:
             read_image(tmp_path / f"{number}.tif", RANGE)
 
 
-def test_colour_is_read_as_before(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    colours = cv2.resize(rng.integers(0, 256, (6, 8, 3), np.uint8), (64, 48))
-    for name in ("a.jpg", "a.png", "b.png"):
-        cv2.imwrite(str(tmp_path / name), colours.astype(np.uint16) * 257 if name[0] == "b" else
-                    colours)  # fmt: skip
-        expected = np.asarray(cv2.imread(str(tmp_path / name), cv2.IMREAD_COLOR))[..., ::-1]
-        assert np.array_equal(read_image(tmp_path / name), expected)
-
-
 @pytest.mark.parametrize(("form", "scale"), [("gray", 1), ("gray10le", 4), ("gray12le", 16)])
 def test_monochrome_video_is_grey(tmp_path: Path, form: str, scale: int) -> None:
     picture = GREY if scale == 1 else GREY.astype(np.uint16) * scale
@@ -147,22 +135,3 @@ def test_the_librarys_frame_takes_grey_and_names_counts() -> None:
     assert _is_grey(Frame(GREY, 0, CAMERA, 0).image, GREY)
     with pytest.raises(GreyRangeError, match=r"frame 7.*uint16"):
         Frame(COUNTS, 0, CAMERA, 7)
-
-
-def test_a_grey_frame_is_recorded(tmp_path: Path, small_assets) -> None:  # type: ignore[no-untyped-def]
-    from companion.config import CompanionConfig
-    from localizer.map.cache.cache import TileCache
-
-    record = RecordConfig(folder=tmp_path / "flight", snapshot_interval_s=1.0)
-    model = {"width": 64, "height": 48, "fx": 50, "fy": 50, "cx": 32, "cy": 24}
-    config = CompanionConfig(
-        map=small_assets.map_cache, record=record,
-        camera={"source": str(tmp_path), "model": model},
-        bridge={"connection": "udpin:127.0.0.1:1"},
-    )  # fmt: skip
-    keeper = RecordKeeper(TileCache.open(small_assets.map_cache).frame, pytest.fail)
-    keeper.open(config, record, lambda _: None)
-    keeper.recorder.snapshot(Frame(np.full((48, 64), 90, np.uint8), 10**9, CAMERA, 0))
-    keeper.close()
-    (kept,) = (tmp_path / "flight").rglob("snapshots/*.jpg")
-    assert _is_grey(read_image(kept), np.full((48, 64), 90))

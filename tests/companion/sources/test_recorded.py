@@ -115,31 +115,6 @@ def test_a_cover_picture_is_not_the_video(tmp_path, video, cover_first, marked):
     assert [frame.image.shape for frame in frames] == [(120, 160, 3)] * COUNT
 
 
-def test_a_cover_picture_alone_is_no_video(tmp_path: Path) -> None:
-    path = tmp_path / "sound.mp4"
-    with av.open(str(path), "w") as container:
-        cover = container.add_stream("mjpeg")
-        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
-        cover.disposition = Disposition.attached_pic
-        picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
-        container.mux(cover.encode(picture) + cover.encode())
-    with pytest.raises(StreamOpenError, match="has no video stream"):
-        list(open_source(path, CAMERA).frames())
-
-
-def test_what_a_mac_leaves_beside_images_is_none(folder: Path) -> None:
-    (folder / "._img0.png").write_bytes(bytes(4096))
-    assert len(list(open_source(folder, CAMERA).frames())) == COUNT
-
-
-@pytest.mark.parametrize("kind", ["video", "folder"])
-def test_realtime_plays_at_the_recorded_pace(kind: str, request: pytest.FixtureRequest) -> None:
-    path = request.getfixturevalue(kind)
-    start = time.monotonic()
-    list(open_source(path, CAMERA, SourceSettings(rate_hz=20, realtime=True)).frames())
-    assert 0.5 < time.monotonic() - start < 30.0  # COUNT / 20 Hz, and the opening
-
-
 @pytest.mark.parametrize("kind", ["video", "folder"])
 def test_another_shape_than_the_cameras_is_named(kind: str, request: pytest.FixtureRequest) -> None:
     source = open_source(request.getfixturevalue(kind), Camera.from_fov(640, 360, 70.0))

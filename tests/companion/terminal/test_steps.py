@@ -49,25 +49,6 @@ def test_after_two_seconds_it_says_what_it_is_at_then_now_and_then_and_at_the_en
     ]
 
 
-def test_what_is_done_at_once_says_nothing(log):
-    state, console, file = log
-    with show_count(console, "localizing") as show:
-        show(1, 2)
-        state.now = 1.0
-        show(2, 2)
-    assert file.getvalue() == ""
-    assert state.timers[0].is_cancelled
-
-
-def test_what_counts_before_it_is_asked_is_told_by_its_count(log):
-    state, console, file = log
-    with show_count(console, "describing") as show:
-        state.now = 3.0
-        show(5, None)
-        state.timers[0].call()
-    assert file.getvalue() == "   3 s describing: 5\n"
-
-
 def test_work_that_cannot_be_counted_is_told_of_after_two_seconds_and_then_every_ten(log):
     state, console, file = log
     with show_work(console, "hashing [tiles]"):

@@ -19,7 +19,7 @@ from companion.recorded.flight import (
     Telemetry,
 )
 from companion.trial.localize import Localized
-from companion.trial.priors import Correction, priors_of
+from companion.trial.priors import Correction, Ground, priors_of
 from companion.trial.reasons import reasons
 from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, judge
 from companion.trial.wanted_map import wanted_map
@@ -71,6 +71,17 @@ def test_frames_without_the_height_that_others_have_are_counted(cache):
     found = priors_of(replace(flight, frames=tuple(frames)), cache)
     assert [p.height_known for p in found.priors] == [False, True, True, True]
     assert "no usable height in 1 of 4 frames: searched" in found.notes
+
+
+@pytest.mark.parametrize(("ground_m", "told"), [(30.0, 0), (300.0, 1)])
+def test_a_slope_by_the_sea_is_no_sign_of_feet(cache, monkeypatch, ground_m, told):
+    """The take-off was 0.7 of the ground's height below the photos: near the sea that is a hill."""
+    level_m = Ground(cache).height(0.0, 20.0) + cache.frame.origin.height_m
+    low = cache.manifest.model_copy(update={"geoid_separation_m": level_m - ground_m})
+    monkeypatch.setattr(cache, "manifest", low)
+    heights = Height(0.3 * ground_m + 80.0, Datum.AMSL, 3.0), Height(80.0, Datum.TAKEOFF, 2.0)
+    notes = priors_of(_flight(cache.frame, [(0.0, 20.0)] * 4, heights), cache).notes
+    assert sum("--height-unit ft" in note for note in notes) == told, notes
 
 
 def test_a_height_of_another_datum_that_disagrees_is_told(cache):
@@ -142,8 +153,11 @@ def test_a_search_is_wrong_where_neither_record_nor_registration_agree(cache):
 
 @pytest.mark.parametrize(
     ("count", "accepted", "kind"),
-    [(1, False, UNKNOWN), (3, True, UNKNOWN), (4, False, NOT), (4, True, WORKS)],
-)
+    [
+        (0, False, UNKNOWN), (1, False, UNKNOWN), (3, True, UNKNOWN), (4, False, NOT),
+        (4, True, WORKS),
+    ],
+)  # fmt: skip
 def test_too_few_frames_give_no_verdict(cache, count, accepted, kind):
     """One photo of a folder that works was judged as "does not work", another as "works"."""
     flight = _flight(cache.frame, [(0.0, 0.0)] * count, ())

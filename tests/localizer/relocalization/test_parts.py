@@ -17,7 +17,7 @@ from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import rectify, turned
-from localizer.relocalization.search import ground_of, scales
+from localizer.relocalization.search import ground_of, over_roofs, scales
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
 from localizer.render.topview import DOWN
@@ -41,7 +41,7 @@ def level(features):
 
 
 def test_a_region_is_an_ellipse():
-    region = SearchRegion.from_covariance(np.array([10.0, -5.0]), np.diag([4.0, 100.0]), 3.0)
+    region = SearchRegion(np.array([10.0, -5.0]), np.diag([36.0, 900.0]))
     assert region.contains(np.array([[10, 24], [15.9, -5], [16.1, -5], [10, 26]])).tolist() == [
         True, True, False, False,
     ]  # fmt: skip
@@ -179,6 +179,20 @@ def test_heights_cover_the_ground_and_its_error():
     assert found[-1] >= 107 / reach
     assert (found[1:] / found[:-1] <= CONFIG.scale_step + 1e-9).all()
     assert len(scales(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
+
+
+def test_the_height_is_above_roofs_that_the_map_lacks():
+    """Photos of a town over a flat satellite map show it 5 to 15 % larger than the heights say."""
+    flat = level(np.zeros((3, 32, 32), np.int8))
+    flat.ground[:] = ((0.0, 1.0), (np.nan, -1.0))
+    asked = query(height_m=120.0, height_sigma_m=3.0)
+    over = over_roofs(asked, flat, 8.0, CONFIG)
+    seen, bare = (scales(each, flat.ground, CONFIG) for each in (over, asked))
+    assert len(seen) == len(bare) == 1  # takes no longer
+    assert 120 / CONFIG.scale_step < seen[0] < bare[0] - 4  # bare ground stays within a step
+    assert over_roofs(asked, flat, 2.0, CONFIG).height_m == 118
+    flat.ground[:] = np.nan
+    assert over_roofs(asked, flat, 8.0, CONFIG).height_m == 120
 
 
 def test_the_shift_of_an_image_is_found_and_moves_the_camera():

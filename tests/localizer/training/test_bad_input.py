@@ -19,7 +19,6 @@ from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream 
 from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import read_shard, store  # noqa: E402
 from localizer.training.export.export import export, load_network  # noqa: E402
-from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
 from localizer.training.models.networks import build  # noqa: E402
 from tests.bounds import unbounded  # noqa: E402
@@ -35,28 +34,12 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path: Path, content: bytes) -
         load_network(path)
 
 
-@pytest.mark.parametrize("state", [[1], {"model": {}}, {"average": {}}])
-def test_a_foreign_checkpoint_is_named(tmp_path: Path, state: object) -> None:
-    path = tmp_path / "run.pt"
-    torch.save(state, path)
-    with pytest.raises(ModelError, match=r"run\.pt: (not a checkpoint|holds weights alone)"):
-        load_network(path)
-
-
 @pytest.mark.parametrize("content", [b"", b"junk", b"PK\x03\x04"])
 def test_a_file_that_is_no_shard_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "1.npz"
     path.write_bytes(content)
     with pytest.raises(SequenceError, match=r"1\.npz: cannot be read as a shard"):
         read_shard(path)
-
-
-@pytest.mark.parametrize("content", ["", "step,loss\n", "step,loss\n1,x\n", "a,b\n1,2\n"])
-def test_a_file_that_is_no_log_is_named(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "run.csv"
-    path.write_text(content)
-    with pytest.raises(SequenceError, match=r"run\.csv: not a run's CSV"):
-        plot(path)
 
 
 def test_a_run_ends_with_the_generation_that_it_waits_for(tmp_path: Path) -> None:
@@ -85,31 +68,16 @@ def test_the_command_says_it_in_a_line(tmp_path, monkeypatch, capsys):
         assert f"ModelError: {path}: " in capsys.readouterr().err
 
 
-def test_shards_that_give_no_sample_end_the_run(tmp_path: Path) -> None:
-    path = store(tmp_path / "1.npz", [], SceneConfig(width=64, height=48))
-    loader = LoaderConfig(batch=1, anchors=32, crop=(64, 48), appearance=False)
-    stream = ShardStream(Schedule((path,), 1, 0.0, (), 0.0), loader, 0)
-    with pytest.raises(SequenceError, match="hardly a pair"):
-        stream.batch(0)
-    stream.close()
-
-
 @pytest.mark.parametrize(
     ("line", "wrong"),
     [
         ("name: tiny", "name: ../tiny"),
         ("seed: 1", "seed: -1"),
-        ("channels: 32 ", "channels: 1000000000 "),
         ("dilations: [1, 1, 2, 1, 4, 2]", "dilations: []"),
-        ("dilations: [1, 1, 2, 1, 4, 2]", "dilations: [0]"),
         ("widths: [24, 48, 96]", "widths: [24, 48, 0]"),
-        ("crop: [160, 128]", "crop: [0, 0]"),
         ("crop: [160, 128]", "crop: [8, 8]"),
         ("learning_rate: 2.0e-3", "learning_rate: .inf"),
-        ("contrast_weight: 0.3", "contrast_weight: .nan"),
-        ("threads: 1", "threads: 100000000000"),
         ("seed: 1", "seed: true"),
-        ("widths: [24, 48, 96]", "widths: [24, 48, yes]"),
         ("seed: 1", "seed: 1\nseed: 2"),
     ],
 )
@@ -175,17 +143,3 @@ def test_a_stopped_generation_leaves_no_half_shard(tmp_path, monkeypatch):
 def test_every_number_of_a_run_has_its_bounds() -> None:
     others = {"data.active", "optimizer.anchors", "optimizer.decay_steps"}  # scenes, crop, steps
     assert unbounded(TrainConfig) == others
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("learning_rate", "1.0e+300"), ("contrast_weight", "-1.0"), ("batch", "1" + 30 * "0"),
-     ("weight_decay", ".inf"), ("threads", "-1")],
-)  # fmt: skip
-def test_absurd_numbers_of_a_run_are_named(tmp_path: Path, key: str, value: str) -> None:
-    lines = [f"  {key}: {value}" if line.startswith(f"  {key}:") else line
-             for line in SHIPPED.read_text().splitlines()]  # fmt: skip
-    path = tmp_path / "run.yaml"
-    path.write_text("\n".join(lines))
-    with pytest.raises(ModelError, match=rf"optimizer\.{key}: Input should be"):
-        load_config(path)

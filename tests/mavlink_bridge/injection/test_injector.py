@@ -396,11 +396,24 @@ def test_unknown_attitude_is_sent_as_nan() -> None:
 def test_each_velocity_is_sent_once(latency_ms: float) -> None:
     """Also of fixes that are too old to be sent as they are."""
     it = injector(message="odometry", rate_hz=20, delay_ms=0)
-    sent = fly(it, seconds=4, fix_hz=10, latency_ms=latency_ms, speed=5.0)
+
+    def measured(f: VisionFix) -> VisionFix:
+        return replace(f, velocity_ned=(5.0, 0.0, 0.0))
+
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=latency_ms, speed=5.0, change=measured)
     known = [math.isfinite(i.message.vx) for _, i in sent]
     assert known.count(True) == pytest.approx(40 - latency_ms // 100, abs=2)
     assert known.count(False) >= 25
     assert not any(i.message.vx == 0.0 for t, i in sent if t > 2 * SECOND)
+
+
+def test_a_velocity_that_is_derived_from_positions_is_not_sent() -> None:
+    """On PX4's interface the EKF passed a jump of 20 m by 1 m; on ArduPilot it ended in LAND."""
+    it = injector(message="odometry", delay_ms=0)
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, speed=5.0)
+    assert len(sent) > 30
+    assert all(math.isnan(v) for _, i in sent for v in (i.message.vx, i.message.vy, i.message.vz))
+    assert all(math.isnan(i.message.velocity_covariance[0]) for _, i in sent)
 
 
 def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
@@ -408,7 +421,8 @@ def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
     east = math.radians(90.0)
 
     def turned(f: VisionFix) -> VisionFix:
-        return fix(f.time_ns, north=10.0 * f.time_ns / SECOND, yaw_rad=east, quality=77)
+        north, velocity = 10.0 * f.time_ns / SECOND, (10.0, 0.0, 0.0)
+        return fix(f.time_ns, north, yaw_rad=east, quality=77, velocity_ned=velocity)
 
     sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, where=context(yaw=east), change=turned)
     m = sent[-1][1].message

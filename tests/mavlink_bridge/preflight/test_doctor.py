@@ -158,11 +158,6 @@ def test_a_vehicle_on_gnss_arms_without_vision(parameters, fixed):
     assert arming_rules(shadow, 1, parameters.get) == []  # takes off on vision: keeps the check
 
 
-def test_odometry_wants_velocity_noise_that_is_true() -> None:
-    parameters = {**GOOD, "EK3_SRC1_VELXY": 6.0, "EK3_SRC1_VELZ": 6.0, "VISO_VEL_M_NSE": 0.1}
-    assert failures(config(message="odometry"), parameters) == {"VISO_VEL_M_NSE"}
-
-
 @pytest.mark.parametrize(
     ("more", "fixes"),
     [

@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-import io
-
 import pytest
-from rich.console import Console
 
 from localizer.map.cache.cache import TileCache
 from localizer.synth.world import WorldInfo
 from sitl.demo import assets
-from sitl.demo.progress import LogProgress
-
-
-def test_a_log_gets_a_line_per_phase_and_every_ten_seconds() -> None:
-    out, now = io.StringIO(), [100.0]
-    show = LogProgress(Console(file=out, width=80), lambda: now[0])
-    for second in range(46):
-        now[0] = 100.0 + second
-        show("taking off" if second < 15 else "GNSS denied", second / 45)
-    lines = out.getvalue().splitlines()
-    assert lines[0] == "   0 s   0 % taking off"
-    assert [int(line.split()[0]) for line in lines] == [0, 10, 15, 25, 35, 45]
-    assert lines[-1] == "  45 s 100 % GNSS denied"
 
 
 def test_a_world_that_is_being_made_tells_how_far_it_is(tmp_path, monkeypatch) -> None:

@@ -171,23 +171,11 @@ VISION_ONLY = {
     "EK3_SRC1_VELXY": 0,
     "EK3_SRC1_VELZ": 0,
 }
-GPS_THEN_VISION = {
-    "VISO_TYPE": 1,
-    "VISO_POS_M_NSE": 0.5,
-    "VISO_DELAY_MS": 100,
-    "EK3_SRC2_POSXY": 6,
-    "EK3_SRC2_YAW": 1,
-}
 
 
 @pytest.fixture
 def vision_only() -> dict[str, float]:
     return dict(VISION_ONLY)
-
-
-@pytest.fixture
-def gps_then_vision() -> dict[str, float]:
-    return dict(GPS_THEN_VISION)
 
 
 @pytest.fixture

@@ -30,14 +30,6 @@ def test_gps_parameters_without_gps(bench):
     assert "Need Position Estimate" in b.failures()
 
 
-def test_arms_on_gps_after_its_start(bench):
-    b = guided(bench({}))
-    b.run(35)
-    assert "Need Position Estimate" in b.failures()
-    b.run(10)
-    assert b.failures() == []
-
-
 def test_no_origin(bench, vision_only):
     b = guided(bench(vision_only))
     b.vision()
@@ -84,19 +76,3 @@ def test_noise_far_above_what_is_claimed(bench, vision_only, home):
     seen = set()
     b.run(20, lambda: seen.update(b.failures()) or False)
     assert "EKF position variance" in seen
-
-
-def test_modes_that_do_not_arm(bench):
-    b = bench({})
-    b.run(45)
-    b.vehicle.modes.mode = Mode.RTL
-    assert b.failures() == ["RTL mode not armable"]
-
-
-def test_checks_can_be_masked(bench, vision_only, home):
-    b = guided(bench({**vision_only, "ARMING_CHECK": ((1 << 20) - 2) & ~(1 << 18)}), home)
-    feed = b.vision()
-    b.run(30)
-    feed.on = False
-    b.run(0.5)
-    assert b.failures() == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from sitl.embedded.ekf import navigation as nav
 from sitl.embedded.ekf.aided_filter import Aiding
 from sitl.embedded.ekf.estimator import Estimator
+from sitl.embedded.ekf.injection import ExternalNavInput
 from sitl.embedded.ekf.measurements import Baro, ExternalPosition, ExternalVelocity, GpsData
 from sitl.embedded.ekf.timesync import JitterCorrection
 from sitl.embedded.parameters import Parameters
@@ -170,6 +172,21 @@ def test_velocity_from_vision_keeps_position_for_10_s_and_then_never_takes_the_j
     assert still.filter.position_valid
     still.run(1.5, at(10.0), velocity=steady)
     assert not still.filter.position_valid
+
+
+@pytest.mark.parametrize(("over_us", "velocities"), [(0, 0), (11_999, 0), (12_000, 1)])
+def test_a_position_delta_over_less_than_a_step_is_no_velocity(over_us, velocities, monkeypatch):
+    parameters = Parameters({"VISO_TYPE": 1})
+    estimator = Estimator(parameters, lambda _severity, _text: None)
+    given = []
+    monkeypatch.setattr(estimator, "add_external_velocity", lambda v, _stamp: given.append(v))
+    vision = ExternalNavInput(parameters, estimator)
+    delta = SimpleNamespace(
+        time_delta_usec=over_us, position_delta=(0.1, 0.0, 0.0), confidence=100.0
+    )
+    vision.position_delta(delta, 1000)
+    assert len(given) == velocities
+    assert vision.healthy(1000)
 
 
 def test_yaw_from_vision_is_used_only_where_it_is_the_source():

@@ -254,18 +254,6 @@ def _check_gimbal(pilot):
     assert pilot.record.truth_at(newest.time_ns - 50_000_000) is not None
 
 
-def test_a_vehicle_comes_back_on_its_ports(kind):
-    with open_vehicle(kind, HOME, VehicleSetup(0.0, {}, SPEEDUP)) as vehicle:
-        endpoint = vehicle.gcs_endpoint
-        with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
-            pilot.link.sleep(5)
-            before = pilot.record.time_s
-        vehicle.restart()
-        assert vehicle.gcs_endpoint == endpoint
-        with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
-            assert 0 < pilot.record.time_s < before + 5
-
-
 def test_a_reboot_by_command_keeps_the_parameters(kind):
     with open_vehicle(kind, HOME, VehicleSetup(0.0, {}, SPEEDUP)) as vehicle:
         with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:

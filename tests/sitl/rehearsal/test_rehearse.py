@@ -12,8 +12,7 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.flight import home_of
 from sitl.demo.scenario import Scenario, ScenarioError
 from sitl.demo.targets import observed_targets
-from sitl.rehearsal.mission import read_mission
-from sitl.rehearsal.rehearse import rehearse
+from sitl.rehearsal.rehearse import read_mission, rehearse
 
 
 def _item(command: int, *numbers: float | None, frame: int = 3) -> dict:

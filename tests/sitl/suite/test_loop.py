@@ -13,7 +13,10 @@ from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Output
 from sitl.demo.scenario import ScenarioError
-from sitl.suite.loop.case import Expectation, load_loop_cases
+from sitl.errors import SimulationError
+from sitl.suite.checks import AlertExpectation
+from sitl.suite.loop import runner
+from sitl.suite.loop.case import Expectation, LoopCase, load_loop_cases
 from sitl.suite.loop.judge import (
     Held,
     LoopRecord,
@@ -26,7 +29,7 @@ from sitl.suite.loop.judge import (
     untold_s,
 )
 from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown, read_rows
-from sitl.suite.loop.runner import parse_seeds
+from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
 
 GOOD = LoopSample(0.0, 0.3, 0.0, 0.0, "AUTO", "ok", "localization tracking", 0.5)
 
@@ -168,6 +171,52 @@ def test_the_flights_of_several_runs_make_one_table(tmp_path: Path) -> None:
         path.write_text(damaged, encoding="utf-8")
         with pytest.raises(ScenarioError, match=r"not a loop\.json"):
             read_rows(path)
+
+
+def test_a_resumed_run_flies_what_is_missing_and_what_was_not_flown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[tuple[str, int]] = []
+    broken: set[tuple[str, int]] = {("killed", 2)}
+
+    def fly(case: LoopCase, _assets: Any, _kind: str, seed: int, out: Path) -> LoopRecord:
+        flown.append((case.name, seed))
+        out.mkdir(parents=True)
+        if (case.name, seed) in broken:
+            raise SimulationError("no arducopter")
+        return record(flight([0.5] * 4))
+
+    monkeypatch.setattr(runner, "fly", fly)
+    monkeypatch.setattr(runner, "loop_assets", lambda *_: None)
+    cases = load_loop_cases(["killed", "frozen-hover"])
+
+    def run(seeds: tuple[int, ...], *, resume: bool = True) -> list[tuple[str, int]]:
+        options = RunOptions(("embedded",), tmp_path, seeds, resume=resume)
+        flown.clear()
+        fly_loop(cases, options, lambda _row: None)
+        return list(flown)
+
+    assert run((1,)) == [("killed", 1), ("frozen-hover", 1)]
+    assert run((1, 2)) == [("killed", 2), ("frozen-hover", 2)]
+    assert run((2,)) == [("killed", 2)]  # it was not flown
+    broken.clear()
+    assert run((1, 2)) == [("killed", 2)]
+    assert run((1, 2)) == []
+    kept = {(row.name, row.seed, row.error) for row in read_rows(tmp_path / "loop.json")}
+    assert kept == {(case.name, seed, "") for case in cases for seed in (1, 2)}
+    assert len(run((1,), resume=False)) == 2
+
+
+def test_alerts_are_judged_by_their_time_and_listed() -> None:
+    back = AlertExpectation(alert=AlertId.VIDEO_FROZEN, from_s=0.5, to_s=1.5)
+    late, absent = (
+        back.model_copy(update={"from_s": 1.1}),
+        back.model_copy(update={"absent": True}),
+    )
+    held = judge(record(flight([0.5] * 4)), Expectation(alerts=(back, late, absent)))[-3:]
+    assert [(h.ok, h.listed) for h in held] == [(True, True), (False, True), (False, False)]
+    table = markdown([replace(row(None), held=held[:1])])
+    assert "| all; bridge: video frozen 1.0 s |" in table
 
 
 @pytest.mark.parametrize(("text", "seeds"), [("5", (5,)), ("1..3", (1, 2, 3))])

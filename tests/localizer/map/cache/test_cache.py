@@ -312,14 +312,6 @@ def test_two_builds_do_not_share_a_folder(source, tmp_path):
         build_cache(source, tmp_path / "c", BuildOptions(workers=1))
 
 
-def test_overwrite_replaces_the_cache(source, copy):
-    (copy / "mark").write_text("old")
-    build_cache(source, copy, BuildOptions(workers=1, overwrite=True))
-    assert not (copy / "mark").exists()
-    assert TileCache.open(copy).manifest.tiles == 21
-    assert [p.name for p in copy.parent.iterdir()] == ["copy"]
-
-
 def test_a_cache_that_a_flight_has_open_is_not_replaced(source, copy):
     """Its tiles are read for as long as it flies: another map's are not those of its index."""
     again = BuildOptions(workers=1, overwrite=True)

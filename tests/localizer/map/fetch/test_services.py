@@ -17,7 +17,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile, plan_files
-from localizer.map.fetch.fetch import estimate, fetch, make_plan
+from localizer.map.fetch.fetch import fetch, make_plan
 from localizer.map.fetch.mosaic import check_piece
 from localizer.map.fetch.polite import HttpClient, RequestLimits
 from localizer.map.fetch.raster import Piece
@@ -114,11 +114,6 @@ def test_a_catalogue_leads_to_the_newest_file_there_and_asks_nothing_elsewhere(s
     compare(fetched(source("stac", f"{server.url}/stac/catalog.json"), tmp_path), **PICTURE)
     assert not any("elsewhere-" in path for path in server.asked)
     assert any("ortho.tif" in path for path in server.asked)
-
-
-def test_another_collection_has_nothing_there(server, tmp_path):
-    with pytest.raises(MapFetchError, match="no file at"):
-        fetched(source("stac", f"{server.url}/stac/catalog.json", layer="elsewhere"), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -221,25 +216,6 @@ def test_a_cut_off_run_leaves_whole_pieces_only(server, tmp_path):
     compare(tmp_path / "out.tif", **PICTURE)
 
 
-def test_the_estimate_is_of_the_size_of_what_comes(server, tmp_path):
-    wanted = source("cog", f"{server.url}/ortho.tif")
-    client = HttpClient(RequestLimits(50.0))
-    plan = make_plan(wanted, AREA, 0.5, client)
-    expected = estimate(wanted, plan)
-    fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
-    assert expected.bytes / 5 < client.bytes < expected.bytes * 5
-    assert expected.requests / 5 < client.requests < expected.requests * 5
-
-
-def test_a_picture_where_heights_belong_is_refused(server, tmp_path):
-    wanted = source("cog", f"{server.url}/ortho.tif", role="surface")
-    wanted = wanted.model_copy(
-        update={"kind": "xyz", "url": f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"}
-    )
-    with pytest.raises(MapFetchError, match="no heights"):
-        fetched(wanted, tmp_path)
-
-
 def test_a_server_that_fails_in_the_middle_of_a_file_is_told_and_not_taken_for_a_hole(
     server, tmp_path
 ):
@@ -291,16 +267,6 @@ def test_a_degree_without_a_file_is_unknown_and_named_and_never_a_height_of_zero
     assert not mask[:, -64:].any()
     assert (heights[~mask] == file.nodata).all()
     assert make_plan(wanted, AREA, 1.0, client).lacking == ()
-
-
-def test_a_degree_that_was_there_and_is_gone_is_told_and_no_sea(server, tmp_path):
-    wanted = source("cog", f"{server.url}/surface.tif", role="surface")
-    client = HttpClient(RequestLimits(50.0), sleep=lambda _: None)
-    file = CloudFile(wanted.url, wanted.bounds, may_lack=True)
-    plan = plan_files(wanted, AREA, 1.0, [file], client)
-    server.broken = [(404, {})]
-    with pytest.raises(MapFetchError, match=r"surface\.tif: status 404"):
-        fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
 
 
 def test_where_every_degree_is_sea_it_is_told_by_name_and_a_named_file_must_be_there(server):

@@ -17,7 +17,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.pick import cast_rays, pick
+from localizer.map.cache.pick import cast_rays
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 
@@ -126,8 +126,9 @@ def check_known_points(tileset: Path, cache: TileCache) -> None:
             beyond = distance * (cast_rays(meshes, view.translation, offsets) - 1)
             seen = np.isfinite(beyond) & (beyond > -LIMIT_M)
             cast.append(np.abs(beyond[seen]))
-            found, valid = pick(picture, pixels[seen])
-            rendered.append(np.linalg.norm(found - points[seen], axis=1)[valid])
+            columns, rows = pixels[seen].astype(int).T
+            found = view.apply(camera.rays(pixels[seen]) * picture.depth[rows, columns, None])
+            rendered.append(np.linalg.norm(found - points[seen], axis=1))
     off, cast_off, rendered_off = (np.concatenate(x) for x in (apart, cast, rendered))
     assert min(len(cast_off), len(rendered_off)) > 100
     assert off.max() < LIMIT_M
