@@ -27,6 +27,7 @@ from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.config import BridgeConfig, StrictModel
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
+_MOST_PX = 8192  # of a side of a stream's picture
 _CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
 _SQUAREST = 1.5  # between fx and fy: pixels of 4:3 and 16:11 are the oddest in use
 
@@ -34,8 +35,8 @@ _SQUAREST = 1.5  # between fx and fy: pixels of 4:3 and 16:11 are the oddest in 
 class CameraModel(StrictModel):
     """Intrinsics in pixels of the stream as it arrives (pixel centres at + 0.5)."""
 
-    width: int = Field(ge=8, le=8192)
-    height: int = Field(ge=8, le=8192)
+    width: int = Field(ge=8, le=_MOST_PX)
+    height: int = Field(ge=8, le=_MOST_PX)
     fx: float = Field(gt=0)
     fy: float = Field(gt=0)
     cx: float
@@ -86,6 +87,14 @@ class CameraModel(StrictModel):
             whole_coefficients(self.distortion_model, self.distortion), self.readout_ms,
             self.distortion_model,
         )  # fmt: skip
+
+
+def of_stream_size(camera: Camera) -> Camera:
+    """A photo's camera, resampled if it has more pixels than a `CameraModel` may have."""
+    share = _MOST_PX / max(camera.width, camera.height)
+    if share >= 1.0:
+        return camera
+    return camera.resized(round(share * camera.width), round(share * camera.height))
 
 
 OLD_CALIBRATION_DAYS = 90

@@ -148,7 +148,11 @@ def _write_colmap(path: Path, poses: Sequence[StampedPose], place: MapReference)
 
 def _read_autopilot(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     poses = []
-    for number, row in enumerate(csv.DictReader(_lines(path)), start=2):
+    try:
+        rows = list(csv.DictReader(_lines(path)))
+    except csv.Error as error:
+        raise PoseFileError(f"{path}: not a table: {error}") from error
+    for number, row in enumerate(rows, start=2):
         angles = _autopilot_row(row, f"{path}:{number}")
         pose = pose_of_autopilot(angles, place.frame)
         poses.append(StampedPose(angles.name, pose, angles.time_ns))

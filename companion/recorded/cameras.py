@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.config import CameraModel, of_stream_size
 from companion.errors import FootageError
 from companion.recorded.flight import CameraGuess
 from companion.recorded.photo_tags import PhotoTags
@@ -31,15 +32,16 @@ _SENSOR_WIDTH_MM: Mapping[str, float] = {
 
 def camera_of_tags(tags: PhotoTags) -> CameraGuess:
     """Camera model of a photo at its present size, from its most accurate tag: the maker's
-    calibration first, the 35 mm equivalent last. `FootageError` if no tag gives the lens.
+    calibration first, the 35 mm equivalent last. `FootageError` if no tag gives a possible lens.
     """
     for guess in (_dewarp, _calibrated, _perspective, _by_sensor, _equivalent):
         try:
             found = guess(tags)
-        except CameraError:  # nan, or no lens: the next tag may hold
+            if found is not None:
+                CameraModel(**of_stream_size(found.camera).to_dict())
+                return found
+        except (CameraError, ValueError):  # nan, or no lens: the next tag may hold
             continue
-        if found is not None:
-            return found
     raise FootageError(
         f"{tags.path}: no tag says the focal length; give the camera's model as --camera FILE or "
         "its horizontal field of view as --fov DEGREES"

@@ -89,7 +89,7 @@ def read_footage(
         return _read_video(path, options, progress)
     if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES:
         return _read_photos(path.parent, [path], options, progress)
-    if path.is_file():
+    if not path.is_dir():
         raise FootageError(f"{path}: neither a photo ({_list(PHOTO_SUFFIXES)}) nor a video "
                            f"({_list(VIDEO_SUFFIXES)})")  # fmt: skip
     if options.places is None and options.log is None and is_sequence(path):
@@ -183,7 +183,7 @@ def _read_photos(
             f"{zero} of {len(tags)} photos have gimbal angles that are exactly zero: these are "
             "taken as not measured"
         )
-    turned = sum(int(t.exif.get("Orientation") or 1) not in (0, 1) for t in tags)
+    turned = sum((t.exif_number("Orientation") or 1) != 1 for t in tags)
     if turned:
         notes.append(f"{turned} photos are marked as rotated; they are used as the sensor saw them")
     frames = _with_places(frames, _places_file(folder, tags, options, notes), notes)

@@ -38,6 +38,7 @@ _GNSS_M, _RTK_M = 3.0, 0.1
 _ABSOLUTE_M = 30.0  # of DJI's altitude without RTK: barometer and model of the atmosphere
 _GNSS_HEIGHT_M = 8.0
 _BAROMETER_M, _BAROMETER_SHARE = 2.0, 0.02
+_LARGEST_SIGMA_M = 1e5  # as in a file of places
 _TILT_DEG, _HEADING_DEG = 2.0, 6.0  # of a gimbal that is not calibrated; of its compass
 _DOWN_DEG = 10.0  # of a camera of which nothing is said: survey photos look down
 
@@ -86,7 +87,7 @@ class PhotoTags:
             return None
         seconds = day.replace(tzinfo=timezone.utc).timestamp()
         part = str(self.exif.get("SubsecTimeOriginal") or "").strip("\x00 ")
-        fraction = float(f"0.{part}") if part.isdigit() else 0.0
+        fraction = float(f"0.{part}") if part.isdecimal() else 0.0
         return round((seconds + fraction) * 1e9)
 
     @property
@@ -139,10 +140,14 @@ class PhotoTags:
                 f"{self.path}: its tags say latitude {latitude:g}, longitude {longitude:g}: no "
                 "place on Earth"
             )
-        spread = [self.number(name) for name in ("RtkStdLat", "RtkStdLon")]
-        told = [s for s in spread if s is not None and s > 0.0]
-        sigma = max(_RTK_M, *told) if told else self.number("GPSXYAccuracy") or _GNSS_M
+        told = [s for name in ("RtkStdLat", "RtkStdLon") if (s := self._sigma(name)) is not None]
+        sigma = max(_RTK_M, *told) if told else self._sigma("GPSXYAccuracy") or _GNSS_M
         return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
+
+    def _sigma(self, name: str) -> float | None:
+        """A standard deviation in metres; None if it is missing or cannot be one."""
+        value = self.number(name)
+        return value if value is not None and 0.0 < value <= _LARGEST_SIGMA_M else None
 
     @property
     def _exif_place(self) -> tuple[float | None, float | None]:
@@ -222,7 +227,7 @@ def read_photo_tags(path: Path) -> PhotoTags:
             more = {ExifTags.TAGS.get(k, str(k)): v for k, v in inner.items()}
             gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
             width, height = image.size
-    except (OSError, ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise FootageError(f"{path}: not an image that can be read: {error}") from error
     return PhotoTags(path, width, height, base | more, gps, _read_xmp(path))
 

@@ -49,9 +49,9 @@ def read_places(path: Path) -> dict[str, Telemetry]:
     """Telemetry by photo name. `FootageError` if the file has no position."""
     try:
         lines = plain_text(path).removeprefix("\ufeff").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        rows = list(_rows(lines))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FootageError(f"{path}: cannot be read: {error}") from error
-    rows = list(_rows(lines))
     columns = _columns(rows[0][1]) if rows else None
     if columns is not None:
         rows = rows[1:]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.config import parse_config
+from companion.config import of_stream_size, parse_config
 from companion.errors import ReportError
 from companion.preflight.map_pin import map_hash
 from companion.setup.write import deployment_text, write_deployment
@@ -72,7 +72,7 @@ def footage_settings(
 
 def _model(camera: Camera) -> dict[str, Any]:
     """Rounded to what footage can tell."""
-    model = camera.to_dict()
+    model = of_stream_size(camera).to_dict()
     rounded = {name: round(model[name], 2) for name in ("fx", "fy", "cx", "cy")}
     return model | rounded | {"distortion": [round(k, 5) for k in model["distortion"]]}
 

@@ -141,8 +141,10 @@ def judge(trial: Trial) -> Judgement:
 
 
 def _kind(share: float, trial: Trial, known: Array) -> str:
+    if len(trial.best) < LEAST_FRAMES:
+        return UNKNOWN
     if share < _SOME_SHARE:
-        return NOT if len(trial.best) >= LEAST_FRAMES else UNKNOWN
+        return NOT
     wrong = trial.search_outcome()[2]
     spread = spread_limit_m(trial)
     scattered = len(known) > 0 and float(np.median(known)) > spread

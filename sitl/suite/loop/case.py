@@ -215,6 +215,8 @@ def load_loop_cases(
     ``normal`` names all flights in which nothing is wrong.
     """
     files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    if not files:
+        raise ScenarioError(f"{folder}: holds no flights (NAME.yaml)")
     cases = {name: _load(path) for name, path in files.items()}
     groups = {"normal": tuple(name for name, case in cases.items() if case.is_normal)}
     chosen = list(names) or list(files)

@@ -351,7 +351,7 @@ def test_a_flights_record_becomes_a_trajectory(tmp_path):
         ("tum", "inf 0 0 0 0 0 0 1\n"), ("tum", "# nothing\n"),
         ("colmap", "1 1 0 0 0 0 0 1 a.jpg\n"), ("colmap", "1 2 0 0 0 0 0 0 1 a.jpg\n\n"),
         ("colmap", "\n"), ("autopilot", "name,time_ns\na,1\n"), ("autopilot", "name\n"),
-        ("poses", "a 1 2 3\n"), ("record", "exposure_time_ns,seq"),
+        ("autopilot", "x" * 200_000), ("poses", "a 1 2 3\n"), ("record", "exposure_time_ns,seq"),
     ],
 )  # fmt: skip
 def test_what_is_no_pose_is_named_with_its_file(tmp_path, of, text):

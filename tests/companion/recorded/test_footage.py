@@ -130,6 +130,8 @@ def test_what_cannot_be_used_is_left_out_or_refused(tmp_path):
         read_footage(folder, FootageOptions(tmp_path / "w"))
     with pytest.raises(FootageError, match="give one of its folders: p"):
         read_footage(tmp_path, FootageOptions(tmp_path / "w"))
+    with pytest.raises(FootageError, match="/dev/null: neither a photo"):
+        read_footage(Path("/dev/null"), FootageOptions(tmp_path / "w"))
 
 
 def test_a_repeated_photo_counts_once(tmp_path):

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from companion.config import of_stream_size
 from companion.errors import FootageError
 from companion.recorded.cameras import camera_of_tags
 from companion.recorded.flight import Datum
-from companion.recorded.photo_tags import looking_down, read_photo_tags
+from companion.recorded.photo_tags import PhotoTags, looking_down, read_photo_tags
 from tests.companion.recorded.photos import dji, elements, write_photo
 
 _FOCAL, _FOCAL_35, _MAKE, _MODEL = 0x920A, 0xA405, 0x010F, 0x0110
@@ -90,12 +91,22 @@ def test_a_position_that_is_no_place_is_named_and_none_is_none(tmp_path):
     assert read_photo_tags(write_photo(tmp_path / "b.jpg")).telemetry().position is None
     zero = write_photo(tmp_path / "c.jpg", dji(GpsLatitude="0.0", GpsLongitude="0.0"))
     assert read_photo_tags(zero).telemetry().position is None
+    for tag in ("GPSXYAccuracy", "RtkStdLat"):
+        for told in ("-1", "0", "1e300", "nan"):
+            xmp = dji(GpsLatitude="47.0", GpsLongitude="8.0", **{tag: told})
+            position = read_photo_tags(write_photo(tmp_path / "f.jpg", xmp)).telemetry().position
+            assert position.sigma_m == 3.0
     wrong = write_photo(tmp_path / "d.jpg", dji(GpsLatitude="124.0", GpsLongitude="8.0"))
     with pytest.raises(FootageError, match="no place on Earth"):
         read_photo_tags(wrong).telemetry()
     (tmp_path / "e.jpg").write_bytes(b"\xff\xd8 cut off")
     with pytest.raises(FootageError, match="not an image"):
         read_photo_tags(tmp_path / "e.jpg")
+    data = photo.read_bytes()
+    size = data.index(b"\xff\xc0") + 5  # in the start of the frame: an orthophoto's 65500x65500
+    photo.write_bytes(data[:size] + b"\xff\xdc\xff\xdc" + data[size + 4 :])
+    with pytest.raises(FootageError, match="not an image that can be read: Image size"):
+        read_photo_tags(photo)
 
 
 def test_the_focal_length_by_the_best_tag(tmp_path):
@@ -113,6 +124,14 @@ def test_the_focal_length_by_the_best_tag(tmp_path):
     spoilt = dji(DewarpData="a;nan,311,-2,3,0,0,0,0,0", CalibratedFocalLength="300.5")
     damaged = read_photo_tags(write_photo(tmp_path / "f.jpg", spoilt, size=(400, 300)))
     assert camera_of_tags(damaged).camera.fx == pytest.approx(300.5)
+    for lens in ("9e9,9e9,0,0,0,0,0,0,0", "300,300,9e9,0,0,0,0,0,0", "300,300,0,0,-5,0,0,0,0"):
+        spoilt = dji(DewarpData=f"a;{lens}", CalibratedFocalLength="300.5")
+        impossible = read_photo_tags(write_photo(tmp_path / "g.jpg", spoilt, size=(400, 300)))
+        assert camera_of_tags(impossible).camera.fx == pytest.approx(300.5)
+    large = PhotoTags(tmp_path, 9504, 6336, {"FocalLengthIn35mmFilm": 35})
+    camera = camera_of_tags(large).camera
+    assert camera.width == 9504
+    assert of_stream_size(camera).width == 8192
     sensor = write_photo(tmp_path / "d.jpg", exif={_MODEL: "FC6310", _FOCAL: 8.8}, size=(400, 300))
     assert camera_of_tags(read_photo_tags(sensor)).camera.fx == pytest.approx(8.8 / 13.2 * 400)
     with pytest.raises(FootageError, match="--camera FILE"):

@@ -34,6 +34,7 @@ def test_places_that_cannot_be_are_named(tmp_path):
         ("a.jpg 47.3 108.5 500\n", "longitude comes before latitude"),
         ("a.jpg here there\n", "expected a name"),
         ("\n", "holds no place"),
+        (f'name,lat,lon\n"a.jpg{"x" * 200_000},47.3,8.5\n', "cannot be read: field larger"),
         ("a.jpg 8.5 47.3\na.jpg 8.5 47.4\n", r":2: a second line of a\.jpg"),
         ("name,lat,lon\na.jpg,149.2,-35.4\n", "are they swapped"),
         ("lat,lon,name\n47.48,8.13\n", "txt:2: expected a name"),

@@ -21,7 +21,7 @@ from companion.recorded.flight import (
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, Ground, priors_of
 from companion.trial.reasons import _map_reason, reasons
-from companion.trial.result import NOT, UNKNOWN, Trial, because, judge
+from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, because, judge
 from companion.trial.wanted_map import wanted_map
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -163,14 +163,20 @@ def test_a_flat_map_is_named_with_what_to_use_instead(cache):
     assert why == flat
 
 
-@pytest.mark.parametrize(("count", "kind"), [(0, UNKNOWN), (1, UNKNOWN), (4, NOT)])
-def test_too_few_frames_give_no_verdict_against_a_place(cache, count, kind):
-    """One photo of a folder that works was judged as "does not work"."""
+@pytest.mark.parametrize(
+    ("count", "accepted", "kind"),
+    [
+        (0, False, UNKNOWN), (1, False, UNKNOWN), (3, True, UNKNOWN), (4, False, NOT),
+        (4, True, WORKS),
+    ],
+)  # fmt: skip
+def test_too_few_frames_give_no_verdict(cache, count, accepted, kind):
+    """One photo of a folder that works was judged as "does not work", another as "works"."""
     flight = _flight(cache.frame, [(0.0, 0.0)] * count, ())
-    failed = (Localized("a", None, problem="no"),) * count
-    trial = Trial(flight, priors_of(flight, cache).priors, failed, failed, {}, None, {}, ())
+    done = (Localized("a", None, accepted=accepted),) * count
+    trial = Trial(flight, priors_of(flight, cache).priors, done, done, {}, None, {}, ())
     assert judge(trial).kind == kind
-    assert judge(trial).exit_code == 1
+    assert judge(trial).exit_code == (0 if kind == WORKS else 1)
 
 
 @pytest.mark.parametrize(

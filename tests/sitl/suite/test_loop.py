@@ -230,7 +230,7 @@ def test_other_seeds_are_refused(text: str) -> None:
         parse_seeds(text)
 
 
-def test_the_shipped_flights_hold_together() -> None:
+def test_the_shipped_flights_hold_together(tmp_path: Path) -> None:
     cases = {case.name: case for case in load_loop_cases()}
     assert {"normal-60s", "frozen-hover", "covered-30s", "killed", "other-map"} <= set(cases)
     flown_always = {name for name, case in cases.items() if case.ci}
@@ -239,5 +239,7 @@ def test_the_shipped_flights_hold_together() -> None:
     assert len(normal) >= 6
     assert all(case.name.startswith("normal") for case in normal)
     assert all(case.expect.silent for case in normal)
+    with pytest.raises(ScenarioError, match="holds no flights"):
+        load_loop_cases(folder=tmp_path / "nowhere")
     with pytest.raises(ScenarioError, match="no nowhere"):
         load_loop_cases(["nowhere"])
