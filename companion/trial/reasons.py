@@ -76,7 +76,7 @@ def reasons(
         k: _image_reason(states[k], usual)
         or _place_reason(priors[k], localized[k])
         or _setup_reason(estimated)
-        or _map_reason(kind)
+        or map_reason(kind)
         for k in failed
     }  # fmt: skip
 
@@ -124,7 +124,8 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
     return ""
 
 
-def _map_reason(kind: MapKind | None) -> str:
+def map_reason(kind: MapKind | None) -> str:
+    """Why a good image in the right place fails over such a map."""
     if kind is not None and not kind.has_buildings:
         what = "flat" if kind.heights == "flat" else "bare terrain"
         return f"the map is {what} without buildings and trees; use a surface model, which has them"

@@ -20,7 +20,7 @@ from companion.recorded.flight import (
 )
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, Ground, priors_of
-from companion.trial.reasons import _map_reason, reasons
+from companion.trial.reasons import map_reason, reasons
 from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, because, judge
 from companion.trial.wanted_map import wanted_map
 from localizer.geometry.camera import Camera
@@ -159,7 +159,7 @@ def test_a_flat_map_is_named_with_what_to_use_instead(cache):
     flat = "the map is flat without buildings and trees; use a surface model, which has them"
     trial = Trial(flight, (), (), (), {}, None, {0: "blurred", 1: flat, 2: flat}, ())
     assert because(trial).endswith(flat)
-    why = _map_reason(MapKind("flat", 6.0, 0.5))
+    why = map_reason(MapKind("flat", 6.0, 0.5))
     assert why == flat
 
 
