@@ -81,12 +81,13 @@ class Curve:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves over one abscissa. limit: horizontal line."""
+    """Curves over one abscissa. limit: horizontal line; joined: lines, not only points."""
 
     title: str
     x: np.ndarray
     curves: tuple[Curve, ...]
     limit: float | None = None
+    joined: bool = True
 
 
 @dataclass(frozen=True)

@@ -211,6 +211,7 @@ def _plot_data(plot: Plot) -> dict[str, Any]:
     return {
         "title": plot.title,
         "limit": plot.limit,
+        "joined": plot.joined,
         "x": [round(float(v), 4) for v in plot.x[keep]],
         "curves": [
             {"label": c.label, "values": [_number(v) for v in c.values[keep]]} for c in plot.curves
@@ -257,7 +258,8 @@ def _stanford(data: Stanford) -> str:
     return (
         f"<p>{len(error)} fixes: {int(usable.sum())} within the alert limit of "
         f"{data.alert_limit_m:g} m; {misleading} of them are further off than their level "
-        f"(misleading), {dangerous} beyond the limit (hazardous).</p>"
+        f"(misleading), {dangerous} beyond the limit (hazardous). A misleading "
+        "fix is worse than the program states; a hazardous one is also too far off to fly on.</p>"
         f'<svg class=stanford viewBox="-50 -10 {side + 70:.0f} {side + 55:.0f}" role=img '
         'aria-label="Stanford diagram">'
         f'<rect class=bad x=0 y="{side - limit:.1f}" width="{side}" height="{limit:.1f}"/>'
@@ -292,8 +294,8 @@ def _overlays(report: Report) -> str:
         f"<p class=sub>{escape(report.overlays_of)}. The second slider uncovers the map as the "
         "estimated pose sees it: if the pose is right, edges run on.</p>"
         "<div class=controls><label>frame <input type=range id=which min=0 "
-        f"max={len(sheets) - 1} value=0></label> <label>video | map <input type=range id=share "
-        "min=0 max=100 value=50></label></div>" + "".join(sheets)
+        f"max={len(sheets) - 1} value=0></label> <label>map <input type=range id=share "
+        "min=0 max=100 value=50> video</label></div>" + "".join(sheets)
     )
 
 

@@ -30,7 +30,7 @@ from companion.reporting.layout import write_report
 from companion.reporting.pictures import MapPictures, ShownFrame, map_pictures, silent
 from companion.reporting.record import VISION
 from companion.terminal.steps import Say
-from companion.trial.result import Judgement, Trial, spread_limit_m
+from companion.trial.result import Judgement, Trial, because, spread_limit_m
 from companion.versions import made_by
 from companion.writing import writing
 from localizer.geometry.pose import Array
@@ -59,6 +59,7 @@ def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report
     errors, levels = trial.errors_m(), trial.levels_m()
     is_placed = bool(np.isfinite(errors).any())
     number = np.arange(len(trial.best), dtype=np.float64)
+    is_joined = trial.flight.kind != "photos"  # between photos nothing is known
     camera = trial.flight.camera
     return Report(
         f"{trial.flight.name}: {judgement.kind}",
@@ -71,11 +72,12 @@ def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report
         (
             *([Plot(
                 "horizontal distance from GNSS, m, the map's offset taken off", number,
-                (Curve("distance", errors), Curve("protection level", levels)),
+                (Curve("distance", errors), Curve("protection level", levels)), joined=is_joined,
             )] if is_placed else []),
             Plot("quality of the registration, 0 to 1", number,
                  (Curve("as recorded", np.array([x.quality for x in trial.first])),
-                  Curve("corrected", np.array([x.quality for x in trial.second])))),
+                  Curve("corrected", np.array([x.quality for x in trial.second]))),
+                 joined=is_joined),
         ),
         Stanford(errors, levels, _ALERT_M) if is_placed else None,
         overlays=_overlays(trial, pictures),
@@ -100,7 +102,8 @@ def _verdicts(trial: Trial, errors: Array) -> tuple[CriterionResult, ...]:
     count = len(trial.best)
     share = 100.0 * sum(one.accepted for one in trial.best) / count
     rows = [CriterionResult("frames localized", f"{share:.0f} %", ">= 80 %", share >= 80.0,
-                    "no position for the others", "the table of failed frames")]  # fmt: skip
+                    f"no position for the others{because(trial)}",
+                    "the overlays of failed frames")]  # fmt: skip
     known = errors[np.isfinite(errors)]
     if len(known):
         own = float(np.median([p.sigma_m for p in trial.priors if p.pose is not None]))
@@ -168,8 +171,11 @@ def _estimates(trial: Trial) -> ReportTable:
     if found is None:
         return ReportTable(("quantity", "value"), (("too few frames agree to estimate", "-"),))
     up, right = found.mount_deg[1], found.mount_deg[2]
+    is_assumed = sum(p.measured for p in trial.priors) <= len(trial.priors) / 2
+    against = "than straight down, which was assumed" if is_assumed else "than recorded"
     rows = [
-        ("camera looks further up (ahead)", f"{up:+.1f}", f"{found.mount_sigma_deg[1]:.1f}", "deg"),
+        (f"camera looks further up (ahead) {against}", f"{up:+.1f}",
+         f"{found.mount_sigma_deg[1]:.1f}", "deg"),
         ("camera looks further right", f"{right:+.1f}", f"{found.mount_sigma_deg[2]:.1f}", "deg"),
         ("camera is turned about its axis", f"{found.mount_deg[0]:+.1f}",
          f"{found.mount_sigma_deg[0]:.1f}", "deg"),
@@ -239,13 +245,15 @@ def _overlays(trial: Trial, pictures: MapPictures) -> tuple[Overlay, ...]:
 
 def _write_frames(path: Path, trial: Trial) -> None:
     errors, levels = trial.errors_m(), trial.levels_m()
-    columns = ("name", "accepted", "searched", "quality", "from_gnss_m", "level_m", "reason")
+    columns = ("name", "accepted", "without_position", "quality", "from_gnss_m", "level_m",
+               "reason")  # fmt: skip
+    results = trial.search_results()
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         for k, one in enumerate(trial.best):
             figures = (f"{x:.2f}" if np.isfinite(x) else "" for x in (errors[k], levels[k]))
-            row = (one.name, int(one.accepted), int(one.searched), f"{one.quality:.3f}", *figures)
+            row = (one.name, int(one.accepted), results.get(k, ""), f"{one.quality:.3f}", *figures)
             writer.writerow([*row, trial.reasons.get(k, "")])
 
 

@@ -14,7 +14,7 @@ from companion.sources.folder_source import read_image
 from companion.trial.estimate import Estimated
 from companion.trial.localize import Localized, horizontal_m
 from companion.trial.priors import FramePrior
-from localizer.map.kind import HEIGHTS_HOLD, MapKind
+from localizer.map.kind import MapKind
 from localizer.types import Image
 
 _WIDTH_PX = 640
@@ -76,7 +76,7 @@ def reasons(
         k: _image_reason(states[k], usual)
         or _place_reason(priors[k], localized[k])
         or _setup_reason(estimated)
-        or _map_reason(kind)
+        or map_reason(kind)
         for k in failed
     }  # fmt: skip
 
@@ -124,9 +124,11 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
     return ""
 
 
-def _map_reason(kind: MapKind | None) -> str:
+def map_reason(kind: MapKind | None) -> str:
+    """Why a good image in the right place fails over such a map."""
     if kind is not None and not kind.has_buildings:
-        return f"map of another kind than the image: {HEIGHTS_HOLD[kind.heights]}"
+        what = "flat" if kind.heights == "flat" else "bare terrain"
+        return f"the map is {what} without buildings and trees; use a surface model, which has them"
     return "image and map agree too little: a map of another season, date or sensor"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +17,7 @@ from localizer.geometry.pose import Array
 WORKS, PARTLY, NOT, UNKNOWN = (
     "works", "works partly", "does not work", "cannot be judged"
 )  # fmt: skip
+FOUND, ELSEWHERE = "found", "elsewhere"
 _GOOD_SHARE, _SOME_SHARE = 0.8, 0.3
 _SAME_PLACE_SIGMAS, _LEAST_SAME_M = 4.0, 10.0
 _STILL_MPS = (0.0, 0.0)  # of photos: time stamps are no part of their positions' error
@@ -78,7 +78,12 @@ class Trial:
         """Numbers of frames that were searched without position, found correctly, and found far
         from both the recorded and the telemetry-based position.
         """
-        right = wrong = 0
+        results = list(self.search_results().values())
+        return len(results), results.count(FOUND), results.count(ELSEWHERE)
+
+    def search_results(self) -> dict[int, str]:
+        """Result of each search without position, by frame."""
+        results = dict.fromkeys(self.searched, "not found")
         for k, one in self.searched.items():
             if not one.accepted or one.pose is None:
                 continue
@@ -90,9 +95,8 @@ class Trial:
                 for pose, limit in (*known, (prior.pose, limit_m))
                 if pose is not None
             ]
-            near = any(away) or not away  # where nobody says otherwise
-            right, wrong = right + near, wrong + (not near)
-        return len(self.searched), right, wrong
+            results[k] = FOUND if any(away) or not away else ELSEWHERE  # found if nobody objects
+        return results
 
 
 @dataclass(frozen=True)
@@ -127,13 +131,13 @@ def judge(trial: Trial) -> Judgement:
         parts[0] += f", {np.median(known):.1f} m from GNSS in the median"
         if trial.estimated is not None and trial.estimated.has_shift:
             offset = float(np.hypot(*trial.estimated.shift_m[:2]))
-            parts[0] += f" after a map offset of {offset:.1f} m"
+            parts[0] += f" after a horizontal map offset of {offset:.1f} m"
     if searched:
         found = f"without positions {right} of {searched} are found"
         parts.append(found + (f" and {wrong} at a wrong place" if wrong else ""))
     if kind == UNKNOWN:
         parts.append(f"give {LEAST_FRAMES} or more, so that a wrong angle or focal length shows")
-    return Judgement(kind, f"Vision {kind} here: {'; '.join(parts)}{_because(trial)}.")
+    return Judgement(kind, f"Vision {kind} here: {'; '.join(parts)}{because(trial)}.")
 
 
 def _kind(share: float, trial: Trial, known: Array) -> str:
@@ -154,13 +158,9 @@ def spread_limit_m(trial: Trial) -> float:
     return float(np.hypot(2.0 * own, 3.0))
 
 
-def _because(trial: Trial) -> str:
+def because(trial: Trial) -> str:
+    """The most frequent reason of failures, as the end of a sentence."""
     if not trial.reasons:
         return ""
-    common = _most_common(list(trial.reasons.values()))
-    return f"; likely reason of most failures: {common}"
-
-
-def _most_common(texts: Sequence[str]) -> str:
-    heads = [text.split(":", maxsplit=1)[0] for text in texts]
-    return max(set(heads), key=heads.count)
+    heads = [text.split(":", maxsplit=1)[0] for text in trial.reasons.values()]
+    return f"; likely reason of most failures: {max(sorted(set(heads)), key=heads.count)}"

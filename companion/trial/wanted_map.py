@@ -64,6 +64,29 @@ def wanted_map(flight: RecordedFlight) -> WantedMap:
     return WantedMap(south - up, west - across, north + up, east + across, gsd)
 
 
+def flat_ground(flight: RecordedFlight) -> str:
+    """How to build a flat map at the take-off's height; empty if the footage does not tell it."""
+    heights = [
+        {h.datum: h.value_m for h in f.telemetry.position.heights}
+        for f in flight.frames
+        if f.telemetry.position is not None
+    ]
+    for datum, option, above in (
+        (Datum.AMSL, "amsl", "the sea"), (Datum.ELLIPSOID, "ellipsoidal", "the ellipsoid")
+    ):  # fmt: skip
+        ground = [
+            h[datum] - h[Datum.TAKEOFF] for h in heights if {datum, Datum.TAKEOFF} <= h.keys()
+        ]
+        if ground:
+            ground_m = float(np.median(ground))
+            return (
+                f"By the tags the ground at the take-off is {ground_m:.0f} m above {above}. Over "
+                "even ground an orthophoto alone gives a first answer: companion map build "
+                f"ORTHO.tif --flat-ground {ground_m:.0f} --vertical-datum {option} --out area"
+            )
+    return ""
+
+
 def _height_m(told: Sequence[Telemetry]) -> float:
     """Above the ground as far as it is known without a map: above the take-off, or the sea."""
     for datum in (Datum.TAKEOFF, Datum.AMSL):

@@ -68,7 +68,7 @@ def try_command(
 
 
 def _tell_map(flight: RecordedFlight) -> None:
-    from companion.trial.wanted_map import wanted_map
+    from companion.trial.wanted_map import flat_ground, wanted_map
 
     _tell_notes(flight, flight.notes)
     wanted = wanted_map(flight)
@@ -78,7 +78,9 @@ def _tell_map(flight: RecordedFlight) -> None:
         f"{wanted.sentence}.",
         soft_wrap=True, highlight=False,
     )  # fmt: skip
-    out.print(f"Where open data exist: {wanted.command('area')}", soft_wrap=True, highlight=False)
+    for line in (f"Where open data exist: {wanted.command('area')}", flat_ground(flight)):
+        if line:
+            out.print(line, soft_wrap=True, highlight=False)
 
 
 def _tell_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:

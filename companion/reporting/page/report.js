@@ -8,7 +8,9 @@ function draw(box) {
   const values = [plot.x];
   plot.curves.forEach((curve, i) => {
     series.push({ label: curve.label, stroke: COLOURS[i % COLOURS.length], width: 1.4,
-      points: { show: plot.x.length < 400, size: 4 }, spanGaps: false });
+      spanGaps: false,
+      ...(plot.joined ? {} : { paths: () => null }),
+      points: { show: !plot.joined || plot.x.length < 400, size: plot.joined ? 4 : 8 } });
     values.push(curve.values);
   });
   if (plot.limit !== null) {

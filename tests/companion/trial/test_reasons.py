@@ -20,12 +20,13 @@ from companion.recorded.flight import (
 )
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, Ground, priors_of
-from companion.trial.reasons import reasons
-from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, judge
+from companion.trial.reasons import map_reason, reasons
+from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, because, judge
 from companion.trial.wanted_map import wanted_map
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
+from localizer.map.kind import MapKind
 
 _HEIGHT = Height(80.0, Datum.ELLIPSOID, 0.1)
 CAMERA = CameraGuess(Camera.from_fov(640, 480, 60.0), 2.0, "test")
@@ -149,6 +150,17 @@ def test_a_search_is_wrong_where_neither_record_nor_registration_agree(cache):
     searched = {k: found(p, m) for k, (p, m) in enumerate(zip(priors, (3, 20, -30), strict=True))}
     trial = Trial(flight, priors, second, second, searched, None, {}, ())
     assert trial.search_outcome() == (3, 2, 1)
+    assert trial.search_results() == {0: "found", 1: "found", 2: "elsewhere"}
+
+
+def test_a_flat_map_is_named_with_what_to_use_instead(cache):
+    """The verdict said "map of another kind than the image", and nothing that could be done."""
+    flight = _flight(cache.frame, [(0.0, 0.0)], ())
+    flat = "the map is flat without buildings and trees; use a surface model, which has them"
+    trial = Trial(flight, (), (), (), {}, None, {0: "blurred", 1: flat, 2: flat}, ())
+    assert because(trial).endswith(flat)
+    why = map_reason(MapKind("flat", 6.0, 0.5))
+    assert why == flat
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """``companion try`` on photos of a generated world whose tags are wrong by known amounts."""
 
+import csv
 import json
 from contextlib import nullcontext
 from dataclasses import replace
@@ -76,6 +77,11 @@ def test_photos_tell_what_is_wrong_with_their_tags(small_assets, small_sequence,
     page = (report / "report.html").read_text()
     assert "Vision works here" in page
     assert "Estimated camera and map" in page
+    assert "looks further up (ahead) than recorded" in page
+    with (report / "frames.csv").open(newline="") as file:
+        searched = [r["without_position"] for r in csv.DictReader(file) if r["without_position"]]
+    assert searched.count("found") == figures["found"]
+    assert len(searched) == figures["searched"] == 1
     config = load_config(report / "deployment.yaml")
     assert config.bridge.camera.mount == "gimbal"
     assert config.bridge.camera.mount_pitch_deg == pytest.approx(_UP_DEG, abs=1.0)
@@ -230,12 +236,19 @@ def test_a_map_with_heights_in_feet_is_named(small_assets, tmp_path, factor, tol
 
 
 def test_without_a_map_the_needed_one_is_named(tmp_path):
-    xmp = dji(GpsLatitude=47.3, GpsLongitude=8.5, RelativeAltitude="+60.0")
-    photo = write_photo(tmp_path / "a.jpg", xmp, exif={_FOCAL_35: 24})
-    result = _run(photo, "--report", tmp_path / "r")
-    assert result.exit_code == 1
-    assert "needs a map of latitude" in result.output
-    assert "companion map fetch --rectangle" in result.output
+    for told, ground in (
+        ({}, ""),
+        ({"AbsoluteAltitude": "+316.2"}, "256 m above the sea"),
+        ({"AbsoluteAltitude": "+316.2", "AltitudeType": "RtkAlt"}, "256 m above the ellipsoid"),
+    ):
+        xmp = dji(GpsLatitude=47.3, GpsLongitude=8.5, RelativeAltitude="+60.0", **told)
+        photo = write_photo(tmp_path / "a.jpg", xmp, exif={_FOCAL_35: 24})
+        result = _run(photo, "--report", tmp_path / "r")
+        assert result.exit_code == 1
+        assert "needs a map of latitude" in result.output
+        assert "companion map fetch --rectangle" in result.output
+        assert ("--flat-ground 256 --vertical-datum" in result.output) == bool(ground)
+        assert ground in result.output
 
 
 def test_without_map_and_position_the_file_of_other_photos_is_named(tmp_path):
