@@ -83,7 +83,7 @@ class CalibrationWatch:
         if self._limits.enabled:
             self._waiting.append(sighting)
 
-    def distrust(self, since_ns: int) -> None:
+    def exclude_since(self, since_ns: int) -> None:
         """Exclude frames from this time on, because they are frozen or repeated, and undo what the
         filters learned from them. Call it as long as this lasts.
         """
@@ -97,7 +97,7 @@ class CalibrationWatch:
         self._position, self._attitude = known.position, known.attitude
         self._last, self._last_ns = None, since_ns
 
-    def doubt_stamps(self, since_ns: int) -> None:
+    def suspect_timestamps(self, since_ns: int) -> None:
         """The timestamps may change at this time: discard the estimated time offset."""
         self._doubted_ns = since_ns
 

@@ -42,7 +42,7 @@ from companion.klv.relay import KlvRelay
 from companion.live.orders import OrderContext, OrderError, Orders
 from companion.live.protocol import socket_path
 from companion.live.publisher import Publisher
-from companion.live.shown import Instruments, Shown
+from companion.live.shown import ConsoleData, Instruments
 from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import readable_map_hash, require_pinned
 from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
@@ -404,7 +404,7 @@ def _console(making: BuildContext) -> Publisher:
         "delay_ms": config.bridge.injection.delay_ms,
         "alert_limit_m": config.bridge.injection.alert_limit_m,
     }
-    shown = Shown(cache.frame, geoid_m, instruments, about)
+    shown = ConsoleData(cache.frame, geoid_m, instruments, about)
 
     def hint(latitude_deg: float, longitude_deg: float, radius_m: float) -> None:
         place = place_on_map(cache, latitude_deg, longitude_deg, radius_m)
@@ -418,8 +418,8 @@ def _console(making: BuildContext) -> Publisher:
     def track(request: TrackRequest) -> None:
         bridge.track(replace(request, time_ns=request.time_ns + late_ns))
 
-    helm = OrderContext(bridge.report_alert, track, hint)
-    orders = Orders(config.console.control, helm)
+    context = OrderContext(bridge.report_alert, track, hint)
+    orders = Orders(config.console.control, context)
     record = None if config.record is None else config.record.folder
     path = socket_path(config.map, record, config.console.listen)
     publisher = Publisher(path, shown, orders, config.console.frames_hz)
@@ -468,7 +468,7 @@ def _engine(making: BuildContext) -> DualThreadEngine:
         channels.frames.subscribe(engine.submit)
         return engine
     zoomed = ZoomedFrames(table, bridge.zoom_at, bridge.report_alert)
-    channels.frames.subscribe(zoomed.before(engine.submit))
+    channels.frames.subscribe(zoomed.zoom_filter(engine.submit))
     channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))
     return engine
 

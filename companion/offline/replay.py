@@ -18,7 +18,7 @@ from companion.flight.priors import AutopilotPose
 from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import MIN_IMAGES, FlightRecord, RecordedEstimate
 from companion.recorded.flight import RecordedFrame
-from companion.sources.zoom import ZoomTable, longer
+from companion.sources.zoom import ZoomTable, with_focal_factor
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -94,7 +94,7 @@ def replay(
                 frames.append(ReplayedFrame(recorded, None))
                 continue
             try:
-                again = _localize(localizer, longer(camera, factor), recorded, one)
+                again = _localize(localizer, with_focal_factor(camera, factor), recorded, one)
             except StreamDecodeError as error:  # power may have gone while it was written
                 _log.warning("left out: %s", error)
                 continue
@@ -136,7 +136,7 @@ def _localize(
     if recorded.focal_px is not None:
         factor = recorded.focal_px / frame.camera.fx
         if abs(factor - 1.0) > _ALIKE:
-            frame = replace(frame, camera=longer(frame.camera, factor))
+            frame = replace(frame, camera=with_focal_factor(frame.camera, factor))
     try:
         return localizer.track(frame)
     except OutsideMapError:

@@ -17,7 +17,7 @@ import numpy as np
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
-from companion.sources.zoom import longer
+from companion.sources.zoom import with_focal_factor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler, so3_exp, so3_log
 from localizer.types import Frame
@@ -124,7 +124,7 @@ class RecordedFrame:
         """
         image = read_image(self.path)
         camera = fitted_camera(image.shape[1], image.shape[0], camera, self.name)
-        return Frame(image, time_ns, longer(camera, self.telemetry.zoom), sequence)
+        return Frame(image, time_ns, with_focal_factor(camera, self.telemetry.zoom), sequence)
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def try_command(
 
 
 def _tell_map(flight: RecordedFlight) -> None:
-    from companion.trial.wanted_map import flat_ground, wanted_map
+    from companion.trial.wanted_map import flat_map_advice, wanted_map
 
     _tell_notes(flight, flight.notes)
     wanted = wanted_map(flight)
@@ -78,7 +78,7 @@ def _tell_map(flight: RecordedFlight) -> None:
         f"{wanted.sentence}.",
         soft_wrap=True, highlight=False,
     )  # fmt: skip
-    for line in (f"Where open data exist: {wanted.command('area')}", flat_ground(flight)):
+    for line in (f"Where open data exist: {wanted.command('area')}", flat_map_advice(flight)):
         if line:
             out.print(line, soft_wrap=True, highlight=False)
 
@@ -91,7 +91,7 @@ def _tell_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
 def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, searches: int) -> None:
     from companion.trial.deployment import write_trial_deployment
     from companion.trial.page import write_trial
-    from companion.trial.result import judge
+    from companion.trial.result import trial_verdict
     from companion.trial.run import TrialOptions, run_trial
     from localizer.map.cache.cache import TileCache
 
@@ -102,7 +102,7 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
         return show_count(console, what, begins=COMPILES if what == "localizing" else "begun")
 
     trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
-    judgement = judge(trial)
+    judgement = trial_verdict(trial)
     _tell_notes(flight, trial.notes)
     with show_steps(console) as say:
         page = write_trial(report, trial, judgement, map_cache, say)
