@@ -226,13 +226,13 @@ def _targets(making: BuildContext) -> TargetReporter:
     )
 
     def report(target: TargetEstimate) -> None:
-        camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
+        camera, number = target.estimate.camera, numbers.number_of(target.fix.target_id)
         bridge.report(target_report(target.fix, camera, cache.frame, number))
 
     channels.frames.subscribe(reporter.add_frame)
     channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
     channels.targets.subscribe(report)
-    channels.gone.subscribe(lambda name: bridge.forget(numbers.of(name)))
+    channels.gone.subscribe(lambda name: bridge.forget(numbers.number_of(name)))
     return reporter
 
 

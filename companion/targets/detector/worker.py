@@ -37,9 +37,10 @@ _MOST_AWAY_M = 5000.0
 class BoxDetector:
     """Detects objects in the camera's frames and passes them on as detections.
 
-    on_detection: takes each detection; must not block. report: reports an alert to the operator. A
-    model that cannot be loaded, or fails three times in a row, ends the detector; the flight
-    continues. looked, seen, failed: numbers of frames, boxes and errors.
+    cast: intersects rays with the map. on_detection: receives each detection; must not block.
+    report: sends an alert to the operator. A model that cannot be loaded, or fails three times in a
+    row, ends the detector; the flight continues. looked, seen, failed: numbers of frames, boxes and
+    errors.
     """
 
     def __init__(
@@ -75,12 +76,12 @@ class BoxDetector:
         joined(self._thread)
 
     def add_frame(self, frame: Frame) -> None:
-        """Offer a frame. Never blocks."""
+        """Keep a frame until its estimate arrives. Never blocks."""
         with self._condition:
             self._frames.append(frame)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Offer a pose; only accepted ones count. Never blocks."""
+        """Add a frame's pose; only accepted ones are used. Never blocks."""
         if estimate.accepted:
             with self._condition:
                 self._estimates.append(estimate)
@@ -121,7 +122,7 @@ class BoxDetector:
         self._report(alert(AlertId.DETECTOR_OFF))
 
     def _newest_pair(self) -> tuple[Frame, PoseEstimate] | None:
-        """The newest picture with its pose that was not looked at yet; waits for half a second."""
+        """Newest unprocessed frame with its pose; None after waiting half a second."""
         with self._condition:
             pair = self._pair()
             if pair is None:
