@@ -61,9 +61,11 @@ def run_command(
     changes = {key: value for key, value in given.items() if value is not None}
     localizer = settings.localizer.model_copy(update=changes)
     settings = settings.model_copy(update={"localizer": localizer})
-    from companion.flight.standby import ready
+    from companion.flight.standby import released_companion
 
-    companion = ready(settings, standby=standby, pulse=pulse, restart=restart, lost_settings=lost)
+    companion = released_companion(
+        settings, standby=standby, pulse=pulse, restart=restart, lost_settings=lost
+    )
     if companion is None:
         return
 

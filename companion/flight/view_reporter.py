@@ -1,4 +1,4 @@
-"""Report the camera's view a few times a second, as `CameraView` of the newest estimate."""
+"""Reports the camera's view a few times a second, as `CameraView` of the newest estimate."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _log = logging.getLogger(__name__)
 
 
 class ViewReporter:
-    """Computes the ground point on its own thread, at most `rate_hz` times a second.
+    """Computes the view and its ground point on its own thread, at most `rate_hz` times a second.
 
-    look: takes the view; must not block.
+    cast: intersects rays with the map. look: receives the view; must not block.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class ViewReporter:
         joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Submit an estimate; only accepted ones are reported. Never blocks."""
+        """Add an estimate; only accepted ones are reported. Never blocks."""
         if estimate.accepted:
             self._newest = estimate
             self._came.set()
