@@ -112,7 +112,7 @@ class FlightControllerEnd:
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
         if self._shared.config.injection.message in unswitched and (
-            current is None or self.sender.fed(now_ns)
+            current is None or self.sender.may_feed_ekf(now_ns)
         ):
             return False
         return None if current is None else self.sources.on_gnss
@@ -213,7 +213,7 @@ class FlightControllerEnd:
             if not getattr(message, "chunk_seq", 0):  # a longer text's middle begins anyhow
                 self.sources.on_text(str(message.text))
         elif kind == "RC_CHANNELS" and self._shared.enable is not None:
-            self._shared.enable.channels(self._tracker.snapshot(time_ns).rc_channels_us)
+            self._shared.enable.on_rc_channels(self._tracker.snapshot(time_ns).rc_channels_us)
 
     def _acknowledged(self, link: Link, message: Any, now_ns: int) -> None:
         if message.command == PLACE_HINT:
@@ -275,7 +275,7 @@ class FlightControllerEnd:
         self._connected = state.connected
         if state.connected:
             self.requests.reset()
-            self.sources.met(state)
+            self.sources.on_first_message(state)
         else:
             self.counters["lost"] += 1
             # It may come back as another: after a reboot, with another origin.
@@ -283,21 +283,21 @@ class FlightControllerEnd:
 
     def _inject(self, link: Link, state: VehicleState, now_ns: int) -> int:
         sender = self.sender
-        sender.take(now_ns)
+        sender.drain_queue(now_ns)
         shared = self._shared
         mode = self._mode = self._interlock.mode(
             shared.mode(), state, now_ns, by_pilot=shared.enable is not None
         )
         if mode == "off" or not state.connected:
-            sender.injector.skip()
+            sender.injector.clear()
             return now_ns + _IDLE_NS
         profile = select_profile(state.autopilot, state.version)
-        self._warnings.firmware(state, profile)
+        self._warnings.check_firmware(state, profile)
         sender.step(link, state, mode, now_ns)
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + _IDLE_NS
             self._check(link, state, now_ns)
-            self._warnings.fixes(profile, now_ns)
+            self._warnings.check_fixes(profile, now_ns)
         return sender.injector.next_due_ns(now_ns)
 
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:

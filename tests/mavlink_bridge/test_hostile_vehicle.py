@@ -351,7 +351,7 @@ def test_a_signed_stamp_of_another_age_does_not_run_ours_over(stamp: int) -> Non
 
 def test_a_click_never_has_a_detected_targets_number() -> None:
     numbers, clicks = TargetNumbers(), clicked_numbers()
-    detected = {numbers.of(f"car {n}") for n in range(1500)}
+    detected = {numbers.number_of(f"car {n}") for n in range(1500)}
     assert detected.isdisjoint(next(clicks) for _ in range(3000))
 
 
@@ -359,7 +359,7 @@ def test_a_gate_that_chatters_ends_as_the_channel_stands(monkeypatch: pytest.Mon
     enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
     for turn in range(101):
         pulses = [0, 65535, 1, 1900][turn % 4]
-        enable.channels([pulses] * 18)
+        enable.on_rc_channels([pulses] * 18)
         enable.command(mavlink.MAV_CMD_USER_1, (math.nan, math.inf, 0.5, -1.0)[turn % 4])
     assert enable.open
 
