@@ -26,7 +26,7 @@ from mavlink_bridge.messages import Figures, VehicleState
 from mavlink_bridge.place_hint import PLACE_HINT
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
-from mavlink_bridge.vehicle.commands import Commander, accepted
+from mavlink_bridge.vehicle.commands import Commander, is_accepted
 from mavlink_bridge.vehicle.mission import MISSION_IN
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
@@ -195,7 +195,7 @@ class FlightControllerEnd:
         if not self._tracker.accepts(message):
             self._strangers.on_message(link, message)
             return
-        self.requests.streams.seen(kind, time_ns)
+        self.requests.streams.on_message(kind, time_ns)
         if kind == "HEARTBEAT":
             link.keep_peer()
         if kind == "TIMESYNC":
@@ -221,10 +221,10 @@ class FlightControllerEnd:
             return
         if not self._commander.is_ours(link, message):
             return
-        if not accepted(message):
+        if not is_accepted(message):
             self.counters["commands_refused"] += 1
         if message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
-            self.sources.acknowledged(accepted(message))
+            self.sources.acknowledged(is_accepted(message))
         elif message.command in LOOKS:
             self._shared.look.answered(message.result)
 

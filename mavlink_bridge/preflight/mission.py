@@ -16,7 +16,7 @@ from mavlink_bridge.errors import MissionError
 from mavlink_bridge.mission.items import FRAMES
 from mavlink_bridge.mission.path import fly
 from mavlink_bridge.preflight.client import VehicleClient
-from mavlink_bridge.vehicle.mission import MissionWaypoint, item_of, place_of
+from mavlink_bridge.vehicle.mission import MissionWaypoint, mission_item, waypoint_of
 
 _RETRIES = 5
 _ANSWER_S = 1.0
@@ -86,8 +86,8 @@ class MissionDownloader(VehicleClient):
 
 def _as_flown(messages: Sequence[Any]) -> list[MissionWaypoint]:
     """Of MISSION_ITEM_INT messages, the first of which is home. Places in metres are left out."""
-    home = place_of(messages[0]) if messages else None
-    items = [item_of(m) for m in messages[1:] if not _is_local(m)]
+    home = waypoint_of(messages[0]) if messages else None
+    items = [mission_item(m) for m in messages[1:] if not _is_local(m)]
     place = None if home is None else (home.latitude_deg, home.longitude_deg)
     flown = fly(items, place).path
     places = [MissionWaypoint(p.item, p.latitude_deg, p.longitude_deg) for p in flown if p.item > 0]

@@ -467,7 +467,7 @@ def test_streams_are_asked_once_while_they_flow_and_again_when_they_stop() -> No
     keeper, config = StreamKeeper(), BridgeConfig()
     assert "ATTITUDE" in names(keeper, config, 10.0)
     for t in range(11, 20):
-        keeper.seen("ATTITUDE", t * SECOND)
+        keeper.on_message("ATTITUDE", t * SECOND)
         assert "ATTITUDE" not in names(keeper, config, t + 0.5)
     assert "ATTITUDE" in names(keeper, config, 25.0)
 
@@ -481,7 +481,7 @@ def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() ->
     assert sum(old in a for a in asked) == 2
     flowing = StreamKeeper()
     for t in range(10, 30):
-        flowing.seen(new, t * SECOND)
+        flowing.on_message(new, t * SECOND)
         assert old not in names(flowing, config, t + 0.1)
 
 
