@@ -145,7 +145,7 @@ class VehicleTracker:
         if boot_ns is not None and message.get_srcComponent() == self._readings.state.component_id:
             rebooted = self.clock.observe(boot_ns, received_ns)
             stamp_ns = self.clock.to_monotonic(boot_ns, received_ns)
-            if self.clock.doubts:
+            if self.clock.is_stamp_doubtful:
                 stamp_ns = received_ns - 2 * _OLD_NS  # of which time it is, nobody knows
         if rebooted:
             self._forget()

@@ -209,7 +209,7 @@ def test_where_it_is_allowed_another_host_takes_over_after_silence(speakers: Spe
 
 
 def test_a_configured_sender_is_heard_from_the_start_and_nobody_else(speakers: Speakers) -> None:
-    speakers.ours.hear_only("127.0.0.1", None)
+    speakers.ours.accept_only("127.0.0.1", None)
     assert not speakers.is_heard(speakers.stranger)
     assert speakers.is_heard(speakers.vehicle)
 
