@@ -71,7 +71,7 @@ def shift_of(name: str) -> tuple[float, float]:
     return SHIFT_M if name == "shifted" else (0.0, 0.0)
 
 
-def waypoint_of(view: BasinView) -> Path:
+def place_of(view: BasinView) -> Path:
     """What tells places apart: the folder of the map, or of the one that it was made from."""
     home = view.map_cache.parent
     return home.parent / "portugal" if home.name in ("shifted", "outdated") else home

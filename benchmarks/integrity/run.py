@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.basin.views import BasinView
 from benchmarks.integrity.beginnings import RegistrationStart, beginnings
-from benchmarks.integrity.maps import waypoint_of, shift_of
+from benchmarks.integrity.maps import place_of, shift_of
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
 from localizer.features import load_extractor
@@ -245,8 +245,8 @@ def _around(
     views: Sequence[BasinView], k: int, places: Sequence[BasinView]
 ) -> tuple[list[BasinView], list[BasinView]]:
     """The views of a view's own map, and those of other places."""
-    own, at = views[k].map_cache, waypoint_of(views[k])
-    return [v for v in views if v.map_cache == own], [v for v in places if waypoint_of(v) != at]
+    own, at = views[k].map_cache, place_of(views[k])
+    return [v for v in views if v.map_cache == own], [v for v in places if place_of(v) != at]
 
 
 def read(path: Path) -> list[StartOutcome]:

@@ -29,7 +29,7 @@ _FEW = 100  # frames suffice for the sigmas
 
 @dataclass(frozen=True)
 class GaussMarkovProcess:
-    """Independent along three axes. sigma, memory_s (correlation time): (3,)."""
+    """Error process, independent along three axes. sigma, memory_s (correlation time): (3,)."""
 
     sigma: Array
     memory_s: Array
@@ -182,7 +182,7 @@ class Likelihood:
 
 
 def _covariances(logs: Array, memory_s: float, up: Array, times_s: Array) -> list[Array]:
-    """(3 K, 3 K) of each of the five sources."""
+    """Covariance (3 K, 3 K) of each of the five sources."""
     gaps = np.abs(times_s[:, None] - times_s)
     quick, slow = np.exp(-gaps / memory_s), np.exp(-gaps / _COMPASS_S)
     upright = up.reshape(-1, 1) @ up.reshape(1, -1)

@@ -50,7 +50,7 @@ def replay_command(
     table.add_row("position differs, m", *_spread(summary.translation_m, 2))
     table.add_row("rotation differs, °", *_spread(summary.rotation_deg, 3))
     console = Console()
-    if doubt := loaded.tables.flown.doubt(TileCache.open(loaded.config.map)):
+    if doubt := loaded.tables.flown.mismatch(TileCache.open(loaded.config.map)):
         console.print(f"[yellow]warning:[/] {escape(doubt)}", highlight=False, soft_wrap=True)
     console.print(table)
     console.print(

@@ -189,10 +189,10 @@ class IntegrityChecks:
         admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
         self._update_steps(fix, state, admitted=admitted)
         height_m = self._ground.height_m(state, fix.time_ns)
-        known_m = self._estimated_error_m(state, height_m)
+        position_error_m = self._estimated_error_m(state, height_m)
         moving = _moving_now(state, fix.time_ns)
         self._level = level = protection_level(
-            fix, moving, self._config.protection, known_m, height_m
+            fix, moving, self._config.protection, position_error_m, height_m
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
@@ -211,7 +211,7 @@ class IntegrityChecks:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The
         # checks above keep the noise: what they look for is what it does not explain.
-        covariance = fix.position_covariance_ned + known_m**2 * np.eye(3)
+        covariance = fix.position_covariance_ned + position_error_m**2 * np.eye(3)
         resets = fix.reset_count + self._wrong
         return replace(fix, reset_count=resets, position_covariance_ned=covariance)
 
@@ -323,8 +323,8 @@ class IntegrityChecks:
             self._debouncers[AlertId.FOCAL_LENGTH].raised,
             self._debouncers[AlertId.TIME_OFFSET].raised,
         )
-        focal_m = self._calibration.known_m(speed, focal=focal, time=False)
-        late_m = self._calibration.known_m(speed, focal=False, time=late)
+        focal_m = self._calibration.position_error_m(speed, focal=focal, time=False)
+        late_m = self._calibration.position_error_m(speed, focal=False, time=late)
         # Late stamps are how a step is explained, and a tilt shifts as a step does.
         return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(height_m))
 
@@ -408,8 +408,8 @@ class IntegrityChecks:
 def _beyond(
     figure: CalibrationEstimate, limit: float, scale: float, word: CalibrationError
 ) -> CheckResult:
-    """Bad if surely above the limit, good if surely below, otherwise no evidence. scale: to the
-    unit of the alert; word: for the alert.
+    """Bad if the estimate `exceeds` the limit, good if it `is_within`, otherwise no evidence.
+    scale: to the unit of the alert; word: for the alert.
     """
     bad = figure.exceeds(limit)
     if not bad and not figure.is_within(limit):

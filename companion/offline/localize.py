@@ -52,7 +52,7 @@ def sensors_of(poses: Mapping[int, Pose]) -> AuxiliarySensors:
 
 @dataclass(frozen=True)
 class LocalizedImage:
-    """Result of one image. estimate: None if there is none; `problem` says why."""
+    """Result of one image. estimate: None if there is none; then `problem` says why."""
 
     name: str
     estimate: PoseEstimate | None

@@ -88,7 +88,7 @@ def replay(
                 prior = pose.prior(recorded.exposure_time_ns)
                 if prior is not None:
                     localizer.offer(prior)
-            factor = _told_factor(config.camera.zoom, autopilot, recorded)
+            factor = _logged_zoom_factor(config.camera.zoom, autopilot, recorded)
             if factor is None:  # a fix of it would be metres off and look as good as any
                 unzoomed += 1
                 frames.append(ReplayedFrame(recorded, None))
@@ -117,7 +117,7 @@ def replay(
         stack.close()
 
 
-def _told_factor(
+def _logged_zoom_factor(
     zoom: ZoomTable | None, autopilot: RecordedAutopilot, recorded: RecordedEstimate
 ) -> float | None:
     """Multiple of the model's focal length by the log, for a frame whose row has none, as in older
@@ -144,7 +144,7 @@ def _localize(
 
 
 def summarize(frames: list[ReplayedFrame]) -> ReplaySummary:
-    """Compare both results of every frame."""
+    """Compare the recorded and the replayed result of every frame."""
     again = [f.replayed is not None and f.replayed.accepted for f in frames]
     differences = [
         f.recorded.world_from_camera.distance_to(f.replayed.world_from_camera)

@@ -77,7 +77,7 @@ class RecordedView:
         *,
         measured: bool = True,
     ) -> RecordedView:
-        """From a gimbal's angles relative to north and the horizon."""
+        """From a gimbal's angles relative to north and the horizon; see the module."""
         angles = (float(a) for a in np.radians([roll_deg, pitch_deg, yaw_deg]))
         attitude = np.asarray(matrix_from_euler(*angles) @ GIMBAL_FROM_CAMERA)
         return cls(attitude, tilt_sigma_deg, heading_sigma_deg, measured)
@@ -162,7 +162,7 @@ class RecordedFlight:
 
     @property
     def located(self) -> int:
-        """Number of frames with a position."""
+        """Number of frames with a recorded position."""
         return sum(frame.telemetry.position is not None for frame in self.frames)
 
 
@@ -184,7 +184,7 @@ class Track:
         return self._times
 
     def at(self, time_ns: int) -> Telemetry | None:
-        """Telemetry at a time; None outside the record and in gaps."""
+        """Telemetry at a time (ns), interpolated; None outside the record and in gaps."""
         if not len(self._times):
             return None
         after = int(np.searchsorted(self._times, time_ns))

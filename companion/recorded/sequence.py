@@ -67,7 +67,7 @@ def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
 
 
 def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Sequence:
-    """The flight as a `Sequence` with the recorded poses as truth, else `SequenceError`."""
+    """As a `Sequence` with recorded poses as truth in this frame; `SequenceError` without them."""
     truth = [_pose(one.telemetry, frame, geoid_m) for one in flight.frames]
     whole = tuple(pose for pose in truth if pose is not None)
     if len(whole) < len(truth) or not whole:

@@ -117,15 +117,15 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               action=OutputAction.HOLD, raise_s=1.0, clear_s=3.0),
     AlertSpec(A.FOCAL_LENGTH, WARNING, "focal length", "focal length {percent:.1f} % {direction}",
               {"percent": "%", "direction": CalibrationError},
-              "the estimated focal length differs from the calibration by 2.5 % + 4 sigma for 2 "
-              "s", "it is within the limit for 10 s",
+              "the estimated focal length differs from the calibration by more than 2.5 % and 4 "
+              "sigma for 2 s", "it is within the limit for 10 s",
               f"{_WIDER}; positions are wrong by about N % of the height above ground",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=2.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.BORESIGHT, WARNING, "boresight", "camera {degrees:.0f} deg off in {axis}",
               {"degrees": "deg", "axis": CalibrationError},
-              "the attitude from vision differs from that of gimbal and autopilot by 3 deg + 4 "
-              "sigma for 3 s", "it is within the limit for 10 s",
+              "the attitude from vision differs from that of gimbal and autopilot by more than 3 deg "
+              "and 4 sigma for 3 s", "it is within the limit for 10 s",
               f"{_SENT}; the mounting angles in the deployment file, the gimbal or the compass are "
               "wrong",
               _CALIBRATE,
@@ -133,7 +133,7 @@ INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.TIME_OFFSET, WARNING, "time offset",
               "video timestamps {milliseconds:.0f} ms {direction}",
               {"milliseconds": "ms", "direction": CalibrationError},
-              "vision's motion is 80 ms + 4 sigma late or early for 1 s",
+              "vision's motion is late or early by more than 80 ms and 4 sigma for 1 s",
               "it is within the limit for 10 s",
               f"{_WIDER}; positions are behind (late) or ahead of (early) the vehicle by speed "
               "times N",

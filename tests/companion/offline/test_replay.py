@@ -193,7 +193,7 @@ def test_a_map_that_was_built_again_about_another_origin_is_refused(record):
     loaded = load_record(record)
     flown = TileCache.open(loaded.config.map)
     loaded.tables.flown.require_frame(flown)
-    assert not loaded.tables.flown.doubt(flown)
+    assert not loaded.tables.flown.mismatch(flown)
     origin = replace(
         flown.manifest.origin, longitude_deg=flown.manifest.origin.longitude_deg + 1e-4
     )
@@ -215,8 +215,10 @@ def test_a_map_that_was_built_again_about_the_same_origin_is_doubted(record, tmp
     )
     built = TileCache.open(again)
     loaded.tables.flown.require_frame(built)
-    assert "not the map that was flown over: was it built again" in loaded.tables.flown.doubt(built)
-    assert not replace(loaded.tables.flown, sha256=None).doubt(built)  # an older record
+    assert "not the map that was flown over: was it built again" in loaded.tables.flown.mismatch(
+        built
+    )
+    assert not replace(loaded.tables.flown, sha256=None).mismatch(built)  # an older record
     tables = read_record(record)
     with map_pictures(again, flown=tables.flown) as pictures:
         assert any("built again" in note for note in pictures.notes)
