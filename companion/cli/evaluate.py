@@ -178,7 +178,7 @@ def evaluate_command(
 def place_finder(
     stack: MapStack, config: LocalizerConfig, known: KnownOfPlace | None
 ) -> Iterator[PlaceFinder | None]:
-    """The search for a position without a prior, if the option selects it."""
+    """The search for a position without a prior; yields None if the option does not select it."""
     opened = None if known is None else open_relocalizer(stack.cache, config)
     if known is None or opened is None:
         yield None
@@ -197,7 +197,7 @@ def _print_problems(frames: list[EvaluatedFrame]) -> None:
 
 
 def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
-    """The columns of the paper's Table 2, and how many images could not be used."""
+    """Print the columns of the paper's Table 2, and how many images could not be used."""
     caption = "medians of localized frames; recalls and completeness of all"
     m = metrics
     table = Table(title=title, caption=caption)
@@ -249,7 +249,7 @@ def _write_report(
 def _write_trajectories(
     folder: Path, frames: list[EvaluatedFrame], data: Sequence, local: LocalFrame
 ) -> None:
-    """What was localized, and the truth beside it: ``evo_ape tum truth.tum trajectory.tum``."""
+    """Write localized poses and the truth, for ``evo_ape tum truth.tum trajectory.tum``."""
     estimates = [(f.name, f.estimate) for f in frames if f.estimate is not None]
     write_trajectory(folder, [stamped(n, e) for n, e in estimates if e.accepted], local)
     names = (path.name for path in data.images)
@@ -258,7 +258,7 @@ def _write_trajectories(
 
 
 def _shown(frames: list[EvaluatedFrame]) -> list[int]:
-    """The worst frames; at most half of them rejected, if others were localized."""
+    """Indices of the worst frames; at most half of them rejected, if others were localized."""
     order = worst_first(frames)
     rejected = [i for i in order if frames[i].translation_error_m is None]
     localized = [i for i in order if frames[i].translation_error_m is not None]
@@ -273,7 +273,7 @@ def _write_overlays(
     renderer: MapRenderer,
     camera: Camera,
 ) -> None:
-    """The worst frames beside the map rendered at their estimated poses."""
+    """Write images of the worst frames beside the map rendered at their estimated poses."""
     undistort = Undistorter(data.camera, camera)
     for i in _shown(frames):
         estimate = frames[i].estimate

@@ -162,7 +162,7 @@ def _print(found: Sequence[LocalizedImage], frame: LocalFrame) -> int:
 
 
 def _sigmas(estimate: PoseEstimate) -> list[float]:
-    """East, north and up in metres; the largest of the attitude in degrees."""
+    """Sigmas: east, north, up (m), and the largest of the attitude (degrees)."""
     sigma = np.sqrt(estimate.covariance.diagonal())
     return [*(float(x) for x in sigma[:3]), float(np.degrees(sigma[3:].max()))]
 

@@ -69,7 +69,7 @@ def _spread(values: Array, digits: int) -> tuple[str, ...]:
 
 
 def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
-    """Serve the page on this machine with the record, and its neighbours to download."""
+    """Serve the page with the record on this machine; records beside it can be downloaded."""
     require_extra()
     from companion.console.records import Records
     from companion.console.replay_source import ReplaySource

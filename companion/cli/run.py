@@ -87,7 +87,7 @@ def run_command(
 
 
 def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
-    """The exit code of the flight process, or of the last one."""
+    """Run the supervisor; returns the exit code of the last flight process."""
     from companion.supervision.processes import FlightProcess
     from companion.supervision.service_manager import ServiceManager
     from companion.supervision.supervisor import Supervisor, mark_dead

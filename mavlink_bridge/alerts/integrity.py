@@ -124,8 +124,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               inhibits=Inhibits.INJECTION, raise_s=2.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.BORESIGHT, WARNING, "boresight", "camera {degrees:.0f} deg off in {axis}",
               {"degrees": "deg", "axis": CalibrationError},
-              "the attitude from vision differs from that of gimbal and autopilot by more than 3 deg "
-              "and 4 sigma for 3 s", "it is within the limit for 10 s",
+              "the attitude from vision differs from that of gimbal and autopilot by more than 3 "
+              "deg and 4 sigma for 3 s", "it is within the limit for 10 s",
               f"{_SENT}; the mounting angles in the deployment file, the gimbal or the compass are "
               "wrong",
               _CALIBRATE,
