@@ -48,7 +48,7 @@ class VitalSigns:
         joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Note an estimate. Never blocks."""
+        """Add an estimate, accepted or not. Never blocks."""
         self._state = estimate.state
         if estimate.accepted:
             self._accepted.append(estimate)
