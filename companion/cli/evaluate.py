@@ -23,9 +23,9 @@ from companion.recorded.sequence import sequence_of
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, tally
-from companion.trajectory import stamped, write_trajectory
+from companion.trajectory import to_stamped_pose, write_trajectory
 from companion.versions import made_by
-from companion.writing import made_folder, writing
+from companion.writing import make_folder, writing
 from localizer.config import LocalizerConfig
 from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -224,7 +224,7 @@ def _text(value: float | None, digits: int) -> str:
 
 def _prepare(folder: Path) -> None:
     """Create the report's folder and check that it is writable, before the long computation."""
-    with writing(made_folder(folder, "--report"), "--report"), TemporaryFile(dir=folder):
+    with writing(make_folder(folder, "--report"), "--report"), TemporaryFile(dir=folder):
         pass
 
 
@@ -251,7 +251,7 @@ def _write_trajectories(
 ) -> None:
     """Write localized poses and the truth, for ``evo_ape tum truth.tum trajectory.tum``."""
     estimates = [(f.name, f.estimate) for f in frames if f.estimate is not None]
-    write_trajectory(folder, [stamped(n, e) for n, e in estimates if e.accepted], local)
+    write_trajectory(folder, [to_stamped_pose(n, e) for n, e in estimates if e.accepted], local)
     names = (path.name for path in data.images)
     truth = map(StampedPose, names, data.truth, data.times_ns)
     write_tum(folder / "truth.tum", truth)

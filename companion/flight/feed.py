@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.sources import FrameSource
 from localizer.types import Frame
 
@@ -36,7 +36,7 @@ class Feed:
     def stop(self) -> None:
         """Close the source and wait for the thread."""
         self._source.close()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     @property
     def last_tick_ns(self) -> int:

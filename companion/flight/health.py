@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.sources import StreamState
 from companion.writing import NewestFile
@@ -130,7 +130,7 @@ class HealthMonitor:
     def stop(self) -> None:
         """Stop the thread, after one last report."""
         self._stop.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
         if self._file is not None:
             self._file.stop()
 

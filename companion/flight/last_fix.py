@@ -21,7 +21,7 @@ import numpy as np
 
 from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
@@ -163,7 +163,7 @@ class FixMemory:
     def stop(self) -> None:
         """Stop. After a clean shutdown the file is removed. Does not wait for a disk that hangs."""
         self._stop.set()
-        if joined(self._thread) and self._path is not None and not self._leaves:
+        if wait_for_end(self._thread) and self._path is not None and not self._leaves:
             try:
                 self._path.unlink(missing_ok=True)
             except OSError as error:  # its age and the boot still tell the next process

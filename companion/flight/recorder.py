@@ -21,7 +21,7 @@ from companion.errors import DiskFaultError, ReportError
 from companion.ground.target_files import write_target_files
 from companion.preflight.map_pin import readable_map_hash
 from companion.redaction import redacted
-from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
+from companion.trajectory import TrajectoryFiles, snapshot_name, to_stamped_pose
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import quaternion_from_matrix
@@ -277,7 +277,7 @@ class Recorder:
         if self._trajectory is None:
             self._trajectory = TrajectoryFiles(self._folder, self._frame)
             self._files.append(self._trajectory)
-        self._trajectory.append(stamped(snapshot_name(estimate.exposure_time_ns), estimate))
+        self._trajectory.append(to_stamped_pose(snapshot_name(estimate.exposure_time_ns), estimate))
 
     def _run(self) -> None:
         flushed = time.monotonic()

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 
 from companion.conversions import camera_view
-from companion.ending import joined
+from companion.ending import wait_for_end
 from localizer.geometry.geo import LocalFrame
 from localizer.targets.locate import RayCaster
 from localizer.types import PoseEstimate
@@ -46,7 +46,7 @@ class ViewReporter:
         """Stop the thread."""
         self._stop.set()
         self._came.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Add an estimate; only accepted ones are reported. Never blocks."""

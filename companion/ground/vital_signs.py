@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from localizer.types import PoseEstimate, TrackingState
 
 _log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class VitalSigns:
     def stop(self) -> None:
         """Stop the thread."""
         self._stop.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Add an estimate, accepted or not. Never blocks."""

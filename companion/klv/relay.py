@@ -17,7 +17,7 @@ from fractions import Fraction
 import av
 
 from companion.config import KlvConfig
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.errors import StreamError
 from companion.klv.local_set import encode
 from companion.klv.metadata import KlvContext, picture_fields
@@ -80,7 +80,7 @@ class KlvRelay:
         with self._condition:
             self._stopping = True
             self._condition.notify()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def begin(self, stream: av.VideoStream) -> None:
         """A connection was opened: its packets go into a stream of their own."""

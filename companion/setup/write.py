@@ -39,8 +39,8 @@ def write_deployment(text: str, path: Path, overwrite: bool) -> None:
 
 
 def differing(model: BaseModel, default: BaseModel | None = None) -> dict[str, Any]:
-    """The settings of a model that differ, as plain data: from `default`, or else from the
-    defaults of its kind; those that have none are all given.
+    """The settings of a model that differ from `default`, or else from the defaults of its class,
+    as plain data. Settings without a default are all given.
     """
     found: dict[str, Any] = {}
     for name, field in settings(type(model)).items():
@@ -57,7 +57,7 @@ def differing(model: BaseModel, default: BaseModel | None = None) -> dict[str, A
 
 
 def _plain(value: Any) -> Any:
-    """As YAML holds it."""
+    """The value as YAML's types."""
     if isinstance(value, BaseModel):
         return differing(value)
     if isinstance(value, tuple | list):

@@ -397,7 +397,7 @@ class LiveVideoSource:
                 connections += 1
             except StreamError as error:
                 self._report(StreamState.FAILED, str(error))
-                self._newest.close(error.retold(redacted(str(error))))
+                self._newest.close(error.with_text(redacted(str(error))))
                 return
             except av.error.ExitError:  # the open time-out
                 reason = _nothing_came()

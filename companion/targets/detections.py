@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import isfinite
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.errors import ConfigError, DetectionError
 from companion.targets.senders import Senders
 
@@ -141,7 +141,7 @@ class DetectionListener:
     def close(self) -> None:
         """Stop listening."""
         self._stop.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
         self._socket.close()
 
     def _run(self) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 
 from companion.config import TargetConfig
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.targets.detections import Detection
 from companion.targets.pictures import RecentPictures
 from companion.targets.target_manager import Click, TargetEstimate, TargetManager
@@ -83,7 +83,7 @@ class TargetReporter:
         with self._condition:
             self._stopping = True
             self._condition.notify()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Add an estimate; only accepted ones are used. Never blocks."""

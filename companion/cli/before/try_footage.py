@@ -14,7 +14,7 @@ from rich.markup import escape
 from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, show_steps
-from companion.writing import made_folder, refuse_input
+from companion.writing import make_folder, refuse_input
 
 if TYPE_CHECKING:
     from companion.recorded.flight import RecordedFlight
@@ -55,7 +55,7 @@ def try_command(
 
     for name in ("report.html", "trial.json", "frames.csv", "deployment.yaml"):
         refuse_input(report / name, "--report", footage, places, log, camera)
-    made_folder(report, "--report")
+    make_folder(report, "--report")
     refuse_edited(report / "deployment.yaml")
     console = Console(stderr=True)
     options = FootageOptions(report, frames, places, log, camera, fov, mount_pitch)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.config import DetectorConfig
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.targets.detections import DETECTED, Detection
 from companion.targets.detector.boxes import Box
 from companion.targets.detector.names import LocatedBox, ObjectNames
@@ -73,7 +73,7 @@ class BoxDetector:
         self._stopping.set()
         with self._condition:
             self._condition.notify()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_frame(self, frame: Frame) -> None:
         """Keep a frame until its estimate arrives. Never blocks."""
