@@ -65,7 +65,7 @@ def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
 
 
 class FlightControllerEnd:
-    """Runs in the flight-controller link's thread; only `sender.put` is called from others.
+    """Handles the flight controller's link, in its thread; only `sender.put` is called from others.
 
     Above 200 lines: it passes each message and each clock tick to one of a dozen components.
     """
@@ -118,20 +118,20 @@ class FlightControllerEnd:
         return None if current is None else self.sources.on_gnss
 
     def set_map_id(self, map_id: str) -> None:
-        """Before `recall`: the id of the map."""
+        """Set the id of the map; called before `recall`."""
         if self._no_go is not None:
             self._no_go.about = map_id
 
     def recall(self) -> None:
-        """Before the link starts: restore the state of a process that was killed."""
+        """Restore the state of a process that was killed; called before the link starts."""
         self._interlock.recall()
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """Call after the link has ended; for a restart, before it."""
+        """End the memories: after the link has ended, or for a restart before it."""
         self._interlock.end(clean_shutdown=clean_shutdown)
 
     def inhibit(self, of: AlertId) -> None:
-        """Until `clear`, what the alert inhibits does not start."""
+        """Prevent what the alert inhibits from starting, until `clear`."""
         if Inhibits.INJECTION in CATALOGUE[of].inhibits:
             self._interlock.inhibited_by |= {of}
         if Inhibits.EKF_OK in CATALOGUE[of].inhibits:
@@ -180,7 +180,7 @@ class FlightControllerEnd:
         return result
 
     def waiting(self) -> dict[str, int]:
-        """Lengths of all queues, by name."""
+        """Number of entries in each queue, by name."""
         parts = (self.sender, self.outcome, self.components, self.time_sync)
         return {name: length for part in parts for name, length in part.waiting().items()}
 
@@ -239,13 +239,13 @@ class FlightControllerEnd:
     # --- the clockwork --------------------------------------------------------------------------
 
     def on_open(self, link: Link) -> None:
-        """Announce at once, and request everything again."""
+        """Announce our components at once, and request everything again."""
         self.components.announce()
         self.requests.reset()
         self.time_sync.reset()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Do everything that is due; returns when the next is."""
+        """Do everything that is due; returns the time of the next, CLOCK_MONOTONIC ns."""
         config = self._shared.config
         state = self._tracker.snapshot(now_ns)
         link.system_id = config.system_id or state.system_id or 0
@@ -319,5 +319,5 @@ class FlightControllerEnd:
                 link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
             )
         held = came and may_inject
-        self.news.held(self._interlock.reason if held else None, now_ns)
-        self.news.look(state, now_ns, injecting=good, refused=self.sources.gnss_refused)
+        self.news.set_hold_reason(self._interlock.reason if held else None, now_ns)
+        self.news.update(state, now_ns, injecting=good, refused=self.sources.gnss_refused)

@@ -1,4 +1,4 @@
-"""Detects changes of the vehicle that concern the operator: GNSS lost, arming."""
+"""Reports changes of the vehicle that concern the operator: GNSS lost, arming."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class VehicleEvents:
         self._armed = False
         self._held_ns: int | None = None
 
-    def look(
+    def update(
         self, state: VehicleState, now_ns: int, *, injecting: bool, refused: bool = False
     ) -> None:
         """Process the vehicle's state. injecting: positions are being sent. refused: GNSS
@@ -39,7 +39,7 @@ class VehicleEvents:
             self._notifier.report(alert(AlertId.ARMED_WITHOUT_GNSS, output=_output(injecting)))
         self._armed = state.armed
 
-    def held(self, reason: Alert | None, now_ns: int) -> None:
+    def set_hold_reason(self, reason: Alert | None, now_ns: int) -> None:
         """Set the interlock's reason for not sending available fixes; None without one.
 
         The shadow check needs some seconds, so a reason that passes soon is not reported.

@@ -284,13 +284,13 @@ def _target_counts(context: BuildContext) -> Callable[[], dict[str, int]]:
 def _view(context: BuildContext) -> ViewReporter:
     cache, bridge = context[MapStack].cache, context[Bridge]
     rate_hz = context.config.bridge.targets.rate_hz
-    view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.look)
+    view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.report_view)
     context.channels.estimates.subscribe(lambda estimate, _: view.add_estimate(estimate))
     return view
 
 
 def _vital_signs(context: BuildContext) -> VitalSigns:
-    signs = VitalSigns(context[Bridge].tell_figures)
+    signs = VitalSigns(context[Bridge].send_named_values)
     context.channels.estimates.subscribe(lambda estimate, _: signs.add_estimate(estimate))
     return signs
 

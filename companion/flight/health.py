@@ -23,7 +23,7 @@ from companion.writing import NewestFile
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
-from mavlink_bridge.alerts.catalogue import alert, body, named
+from mavlink_bridge.alerts.catalogue import alert, body, values_by_name
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel
@@ -265,7 +265,7 @@ class HealthMonitor:
         report: dict[str, Any] = {
             "level": level,
             "text": text,
-            "alerts": {a.id.value: named(a) for a in alerts},
+            "alerts": {a.id.value: values_by_name(a) for a in alerts},
             "time_ns": time.monotonic_ns(),
             "pid": os.getpid(),
             "engine": asdict(self._engine_health()),

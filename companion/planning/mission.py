@@ -16,7 +16,7 @@ from companion.errors import MissionFileError
 from localizer.plain_files import plain_text
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.mission.items import HeightAbove, MissionItem, MissionVehicle, UnreadItem
-from mavlink_bridge.mission.path import MissionPlace, PlannedMission, fly
+from mavlink_bridge.mission.path import MissionPlace, PlannedMission, planned_path
 
 __all__ = ["HeightAbove", "MissionPlace", "PlannedMission", "read_mission"]
 
@@ -42,7 +42,7 @@ def read_mission(path: Path) -> PlannedMission:
                 f"{path}: holds {len(items):,} items; an autopilot counts {_MOST_ITEMS:,} at the "
                 "most: split the mission"
             )
-        mission = fly(items, home, vehicle, speed)
+        mission = planned_path(items, home, vehicle, speed)
     except OSError as error:
         raise MissionFileError(f"{path}: cannot be read: {error.strerror}") from error
     except MissionError as error:

@@ -197,7 +197,7 @@ class SourceSwitch:
         if self.current == self._config.gnss_set:
             self.returning.reset()
         else:
-            self.returning.look(state, vision if fresh and good else None, now_ns)
+            self.returning.update(state, vision if fresh and good else None, now_ns)
         if not self._config.enabled:
             return None
         fault = gnss_fault(

@@ -16,7 +16,7 @@ _FOREVER = -1
 
 
 class Jumps:
-    """Counts jumps. notes: differences from the flight, such as a limited number of repetitions."""
+    """Follows jumps. notes: differences from the flight, such as limited repetitions."""
 
     def __init__(self, items: Sequence[MissionItem | UnreadItem]) -> None:
         self._items = items

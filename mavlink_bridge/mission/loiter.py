@@ -1,4 +1,4 @@
-"""Loiter circles as the firmware flies them."""
+"""Computes loiter circles as the firmware flies them."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class MissionPlace:
 
     @property
     def pitch_deg(self) -> float | None:
-        """Gimbal pitch, None if not commanded."""
+        """Gimbal pitch above the horizon, degrees; None if not commanded."""
         return self.gimbal.pitch_deg
 
     @property
@@ -119,7 +119,7 @@ class PlannedMission:
         return bool(self.waypoints) and self.path[-1].name == "home"
 
 
-def fly(
+def planned_path(
     items: Sequence[MissionItem | UnreadItem],
     home: tuple[float, float] | None,
     vehicle: MissionVehicle = UNKNOWN_VEHICLE,
@@ -135,7 +135,7 @@ def fly(
 
 
 class _Flight:
-    """The state of a mission that is followed item by item."""
+    """Follows a mission item by item, and collects the path."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class _Flight:
         self._jumps = Jumps(items)
 
     def run(self) -> None:
-        """From the first item to the end."""
+        """Follow the items from the first to the end."""
         index = commands = 0
         while index < len(self._items):
             item = self._items[index]
@@ -180,7 +180,7 @@ class _Flight:
                 return
 
     def result(self) -> PlannedMission:
-        """What was followed."""
+        """The mission that was followed."""
         path = list(self._path)
         start = self._start()
         if start is not None:
@@ -196,7 +196,7 @@ class _Flight:
         )
 
     def _start(self) -> MissionPlace | None:
-        """Over home, or over the take-off where home is not set."""
+        """Position above home, or above the take-off if home is unknown; None without both."""
         if self._launch is not None:
             return self._launch
         if self._home is None or not self._path:
@@ -240,7 +240,7 @@ class _Flight:
         self._gap |= gap
 
     def _take_off(self, item: MissionItem) -> None:
-        """Straight up; ArduPilot leaves a take-off's coordinates aside, PX4 flies there."""
+        """Climb straight up; ArduPilot ignores a take-off's coordinates, PX4 flies there."""
         altitude = item.altitude_m
         if altitude is not None:
             self._level = (altitude, _above(item))
@@ -289,7 +289,7 @@ class _Flight:
             self._notes[f"{item.named} holds until the pilot goes on."] = None
 
     def _descend(self, item: MissionItem) -> None:
-        """To its coordinates at the height of before, then down; an aeroplane glides there."""
+        """Fly to its coordinates at the present height, then down; an aeroplane glides there."""
         if item.place is None:
             return
         _above(item)
@@ -309,7 +309,7 @@ class _Flight:
 
 
 def _takes_off_next(items: Sequence[MissionItem | UnreadItem]) -> bool:
-    """Only a take-off goes on after a landing (AP_Mission::is_takeoff_next)."""
+    """Whether a take-off follows: only that continues a landing (AP_Mission::is_takeoff_next)."""
     for item in items:
         if not isinstance(item, MissionItem):
             return False
@@ -321,7 +321,7 @@ def _takes_off_next(items: Sequence[MissionItem | UnreadItem]) -> bool:
 
 
 def _is_off(item: MissionItem) -> bool:
-    """A command whose parameter says that nothing is to be done."""
+    """Whether the command's parameter disables it."""
     mode = item.parameters[0]
     if item.command == mavlink.MAV_CMD_NAV_GUIDED_ENABLE:
         return not mode > 0.5
@@ -331,7 +331,7 @@ def _is_off(item: MissionItem) -> bool:
 
 
 def _speed_after(item: MissionItem, before: float | None, usual: float | None) -> float | None:
-    """Over the ground or through the air; -1 leaves it, -2 is the vehicle's usual one."""
+    """Speed after DO_CHANGE_SPEED, m/s; -1 keeps `before`, -2 is the vehicle's `usual` one."""
     kind, speed = item.parameters[:2]
     if kind not in (mavlink.SPEED_TYPE_AIRSPEED, mavlink.SPEED_TYPE_GROUNDSPEED):
         return before

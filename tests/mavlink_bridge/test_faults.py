@@ -367,7 +367,7 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
     """A hundred targets at once, and a ground station that orders without end."""
     for i in range(100):
         report = TargetReport(flight.now_ns, *HOME, 500.0, target_id=i, pixel=(0.5, 0.5))
-        flight.end.components.show(report)
+        flight.end.components.queue_item(report)
     told: dict[int, int] = {}
     begun_ns = flight.now_ns
     flight.run(1.0)
@@ -442,7 +442,7 @@ def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int
 
 def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> None:
     hour = 3600 * SECOND
-    flight.end.components.show(TargetReport(flight.now_ns + hour, *HOME, 500.0))
+    flight.end.components.queue_item(TargetReport(flight.now_ns + hour, *HOME, 500.0))
     flight.run(1.0)
     assert flight.waiting()["targets"] == 0
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]

@@ -179,10 +179,10 @@ def _model(
 
 def _with_vehicle(config: CompanionConfig, notes: list[str]) -> CompanionConfig:
     """The settings with the system id of the autopilot that answers; notes, if none does."""
-    from mavlink_bridge.preflight.client import meet
+    from mavlink_bridge.preflight.client import detect_autopilot
 
     try:
-        met = meet(config.bridge)
+        met = detect_autopilot(config.bridge)
     except BridgeError as error:
         notes.append(f"no vehicle was heard ({error})")
         return config

@@ -346,7 +346,7 @@ def returned(
             local_velocity_ned=(speed if ekf_speed is None else ekf_speed, 0.0, 0.0),
         )
         seen = position(now - 100 * MS, speed * (t - 0.1) + float(rng.normal(0, 0.3)), speed=speed)
-        check.look(state, seen, now)
+        check.update(state, seen, now)
     return check
 
 
