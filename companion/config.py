@@ -123,7 +123,7 @@ class FeedConfig(StrictModel):
         """Whether the camera model is from a recent calibration: focus, temperature and shocks
         change a camera.
 
-        False if the computer's clock is not set.
+        False if the computer's clock (`today`) is before it.
         """
         if self.calibrated is None:
             return False
@@ -194,7 +194,7 @@ class TargetConfig(StrictModel):
     # time outside the image after which a clicked target ends
     timeout_s: float = Field(300.0, exclude=True)
 
-    def over(self, kind: MapKind) -> TargetConfig:
+    def for_map(self, kind: MapKind) -> TargetConfig:
         """The settings over a map of this kind, which may lack roofs on which targets stand."""
         sigma_m = max(self.map_sigma_m, kind.unknown_height_sigma_m)
         return self.model_copy(update={"map_sigma_m": sigma_m})

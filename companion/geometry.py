@@ -102,7 +102,8 @@ def world_from_camera(
     lever_arm_m: ArrayLike,
     ned_from_world: Array = NED_FROM_ENU,
 ) -> Pose:
-    """The camera's pose of a vehicle at `position` (3,), world metres.
+    """The camera's pose. position: (3,) of the vehicle, world metres; ned_from_body,
+    ned_from_camera: (3, 3) attitudes; lever_arm_m: (3,) autopilot to camera, body axes.
 
     ned_from_world: from the function of that name; by default as at the map's origin.
     """

@@ -123,7 +123,7 @@ class InertialTrack:
         lean = 2.0 * np.array(error) * (1.0 if w >= 0.0 else -1.0)
         self._bias -= lean * dt / (_LEAN_S * _BIAS_S)
         rates = np.array(sample.rates) - self._bias + lean / _LEAN_S
-        return quat.turn(q, (float(rates[0]), float(rates[1]), float(rates[2])), dt)
+        return quat.rotated(q, (float(rates[0]), float(rates[1]), float(rates[2])), dt)
 
     def _integrate(self, time_ns: int, acceleration: Array, dt: float) -> None:
         if self._last is None or not self._track:

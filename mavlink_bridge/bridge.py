@@ -258,8 +258,8 @@ class Bridge:
         self._status.report(alert)
 
     def send_named_values(self, figures: Mapping[str, float]) -> None:
-        """Send NAMED_VALUE_FLOAT for each value, with names of at most 10 characters, if
-        `named_values` is set; never blocks.
+        """Send NAMED_VALUE_FLOAT for each value, if the setting `named_values` is on; never blocks.
+        figures: value by name, at most 10 characters.
         """
         if self._config.named_values:
             uptime_ms = self._shared.uptime_ms(self._clock())
@@ -380,13 +380,13 @@ class Bridge:
         result["ekf_source_set"] = self._fc.sources.current
         return result
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Number of queued messages or bytes, by queue."""
-        result = {"alerts": len(self._status.alerts()), **self._fc.waiting()}
+        result = {"alerts": len(self._status.alerts()), **self._fc.queue_lengths()}
         if self._ground is not self._fc.components:
-            result.update({f"ground {name}": n for name, n in self._ground.waiting().items()})
+            result.update({f"ground {name}": n for name, n in self._ground.queue_lengths().items()})
         for link in self._links:
-            result.update({f"{link.name} {name}": n for name, n in link.waiting().items()})
+            result.update({f"{link.name} {name}": n for name, n in link.queue_lengths().items()})
         return result
 
 

@@ -80,7 +80,7 @@ class Components:
         """Queue an item for the ground station; the oldest is dropped if the queue is full."""
         self._outbound.append(item)
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Number of entries in each queue, by name."""
         return {"outbound": len(self._outbound), "targets": self._camera.targets}
 

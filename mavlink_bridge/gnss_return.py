@@ -157,8 +157,8 @@ class GnssReturnCheck:
 
 
 def _motion(times: _Array, positions: _Array) -> tuple[float, float, float, float]:
-    """Speed of the straight line through positions (n, 2), its sigma, the rms distance to it, and
-    the length of its end; m/s and m.
+    """Speed of the straight line through positions (n, 2), its sigma, the rms distance of the
+    positions to the line, and the distance of the line's end from zero; m/s and m.
     """
     t = times - times.mean()
     spread = float(t @ t)

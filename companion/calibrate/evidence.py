@@ -116,7 +116,7 @@ class CalibrationProblem:
         return turned
 
     def places(self, guess: Guess) -> Array:
-        """(K, 3): estimated minus reported, metres; NaN where nothing was reported."""
+        """(K, 3): estimated minus reported position, metres; NaN where none was reported."""
         late_s, s = float(guess.shared[u.LATE]), guess.shared
         place = at(self._place, -late_s)
         arm = at(self._body, -late_s) @ (self.arm_m + s[u.ARM])

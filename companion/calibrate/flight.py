@@ -96,7 +96,7 @@ def calibrate(
     config = record.config
     stack = MapStack(config.map, config.localizer)
     try:
-        record.tables.flown.require_frame(stack.cache)
+        record.tables.flown_map.require_frame(stack.cache)
         mount = mount_matrix(config)
         pictures, bias_m = _chosen(record, stack, mount, frames)
         camera = _stream_camera(record, pictures)

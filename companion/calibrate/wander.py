@@ -68,11 +68,11 @@ class GaussMarkovProcess:
         return cls(sigmas, memories)
 
     def over_long_steps(self, left: Array, times_s: Array) -> GaussMarkovProcess:
-        """The same correlation times, with sigmas that are at least those of steps over
+        """The same correlation times, with sigmas at least those of the residuals' changes over
         `_LONG_STEP_S`.
 
         An EKF smooths its receiver's errors from frame to frame, so short steps underestimate its
-        drift. left: residuals (K, 3).
+        drift. left: residuals (K, 3); times_s: (K,) their times.
         """
         spacing_s = max(float(np.median(np.diff(times_s))), 1e-3)
         stride = max(1, round(_LONG_STEP_S / spacing_s))

@@ -13,7 +13,7 @@ import typer
 
 from companion.cli.interrupts import end_at_once
 from companion.config import CompanionConfig
-from companion.supervision.kept_settings import keep, settings_of
+from companion.supervision.kept_settings import keep_settings, settings_of
 from companion.terminal.console_log import console_log
 from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice
@@ -99,7 +99,7 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     def tell(alert: Alert) -> None:
         report_without_bridge(settings.bridge, alert)
 
-    begun, kept = count(), keep(settings)
+    begun, kept = count(), keep_settings(settings)
 
     def spawn(standby: bool) -> FlightProcess:
         if not next(begun):

@@ -179,7 +179,7 @@ class Views:
                 "control": self._site.config.control and not self._site.replay,
                 "replay": self._site.replay,
                 "deployment": self._site.deployment is not None,
-                "map": tiles.about(),
+                "map": tiles.map_position(),
             }
         )
 

@@ -65,7 +65,7 @@ class TopTiles:
         self._streamer: TileStreamer | None = None
         self._renderer: NumbaRenderer | None = None
 
-    def about(self) -> dict[str, Any]:
+    def map_position(self) -> dict[str, Any]:
         """Position of the map for the page. Across the 180th meridian, longitudes continue beyond
         180 degrees.
         """

@@ -44,7 +44,7 @@ class Heights:
 
     @property
     def lift_m(self) -> float:
-        """Value to add to a tag's height to obtain the ellipsoidal height, m."""
+        """Metres to add to a tag's height to obtain the ellipsoidal height."""
         return self.separation_m if self.datum == "amsl" else 0.0
 
 

@@ -68,7 +68,7 @@ class McapFile:
         self.put("/camera/image", messages.image(jpeg, time_ns), time_ns)
 
     def put(self, topic: str, message: Any, time_ns: int) -> None:
-        """Write a message of Foxglove's schemas at a CLOCK_MONOTONIC time."""
+        """Write a message of Foxglove's schemas. time_ns: UTC."""
         kind = type(message)
         name = kind.DESCRIPTOR.full_name
         if name not in self._schemas:

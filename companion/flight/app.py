@@ -172,7 +172,7 @@ class Companion:
             events.send("info", f"record {keeper.folder}")
         if keeper is not None and lost:
             events.send("warning", f"left out, since it was gone at the restart: {lost}")
-            keeper.failed("disk gone")
+            keeper.mark_incomplete("disk gone")
         bridge = self._parts.get(Bridge)
         if bridge is not None and self._lost_settings:
             bridge.report_alert(alert(AlertId.DEPLOYMENT_LOST))

@@ -218,7 +218,7 @@ def _targets(context: BuildContext) -> TargetReporter:
     channels, bridge = context.channels, context[Bridge]
     cache, numbers = context[MapStack].cache, TargetNumbers()
     reporter = TargetReporter(
-        context.config.targets.over(map_kind(cache)),
+        context.config.targets.for_map(map_kind(cache)),
         MapSurface(cache).cast,
         channels.targets.send,
         channels.gone.send,

@@ -293,7 +293,7 @@ def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
         return None
     level = monitor.level
     return {
-        "findings": monitor.standing(),
+        "findings": monitor.active_values(),
         "hpl_m": None if level is None else level.horizontal_m,
         "vpl_m": None if level is None else level.vertical_m,
     }

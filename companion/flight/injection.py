@@ -47,7 +47,7 @@ class JumpCounter:
         self.count = 1
         self._state = TrackingState.INITIALIZING
 
-    def note(self, state: TrackingState) -> None:
+    def add_state(self, state: TrackingState) -> None:
         """Add the tracking state of the next frame."""
         before, self._state = self._state, state
         is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
@@ -83,7 +83,7 @@ class FixInjection:
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
         """Convert an estimate, inject the fix if all checks pass, call observers. Never blocks."""
-        self._jumps.note(estimate.state)
+        self._jumps.add_state(estimate.state)
         if not is_for_injection(estimate):
             return
         time_ns = estimate.exposure_time_ns

@@ -327,11 +327,11 @@ class RecordKeeper:
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
-            self.recorder = Recorder(record, self._frame, self.failed)
+            self.recorder = Recorder(record, self._frame, self.mark_incomplete)
             self.folder = record.folder
             write_manifest(record.folder, config)
         except DiskFaultError as error:
-            self.failed(str(error.__cause__))
+            self.mark_incomplete(str(error.__cause__))
         except BaseException:
             self.close()
             raise
@@ -360,7 +360,7 @@ class RecordKeeper:
             except OSError as error:
                 _log.warning("no maps of the targets: %s", error)
 
-    def failed(self, why: str) -> None:
+    def mark_incomplete(self, why: str) -> None:
         """Mark the record as incomplete and tell the operator why."""
         self.is_complete = False
         self._say_incomplete(why)

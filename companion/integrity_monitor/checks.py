@@ -148,7 +148,7 @@ class IntegrityChecks:
         """Protection level of the newest fix; None before the first."""
         return self._level
 
-    def standing(self) -> dict[str, float]:
+    def active_values(self) -> dict[str, float]:
         """The active alerts by identifier, with their values (0.0 if an alert has none)."""
         return {one.spec.id.value: one.figure for one in self._active()}
 

@@ -147,10 +147,10 @@ class IntegrityMonitor:
         with self._locked() as answers:
             return self._monitor.level if answers else None
 
-    def standing(self) -> dict[str, float]:
+    def active_values(self) -> dict[str, float]:
         """The active alerts by identifier, with their values; empty if the monitor hangs."""
         with self._locked() as answers:
-            return self._monitor.standing() if answers else {}
+            return self._monitor.active_values() if answers else {}
 
     @contextmanager
     def _locked(self) -> Iterator[bool]:

@@ -83,7 +83,7 @@ class KlvRelay:
         wait_for_end(self._thread)
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A connection was opened: its packets go into a stream of their own."""
+        """A connection was opened: packets after it go into a new stream."""
         try:
             writer = TransportWriter(self._config.output, stream)
         except StreamError as error:

@@ -113,7 +113,7 @@ class Publisher:
         with contextlib.suppress(OSError):
             self.path.unlink()
 
-    def waiting(self) -> list[int]:
+    def pending_bytes(self) -> list[int]:
         """Bytes not yet sent to each console."""
         return [len(c.sending) for c in tuple(self._consoles.values())]
 

@@ -97,7 +97,7 @@ class RecordTables:
         return Path(named) if isinstance(named, str) else None
 
     @property
-    def flown(self) -> FlownMap:
+    def flown_map(self) -> FlownMap:
         """The record's data about its map."""
         named = self.manifest.get("map_sha256")
         sha256 = named if isinstance(named, str) else None

@@ -73,7 +73,7 @@ def replay(
     try:
         camera = config.camera.model.camera()
         cache = stack.cache
-        record.tables.flown.require_frame(cache)
+        record.tables.flown_map.require_frame(cache)
         arm = np.array(config.camera.lever_arm_m)
         extrinsics = CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
         pose = AutopilotPose(autopilot, extrinsics, config.prior)

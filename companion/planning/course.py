@@ -51,7 +51,7 @@ class Course:
 
 
 def straight(start: Array, end: Array) -> Course:
-    """A straight course between two positions (3,)."""
+    """A straight course between two positions (3,), world metres."""
     return Course(np.stack([start, end]), end - start)
 
 

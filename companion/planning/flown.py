@@ -62,7 +62,7 @@ def recorded_frames(record: Path, cache: TileCache) -> tuple[Array, np.ndarray]:
     """Positions (F, 3) of a record's frames, world metres, and whether each was localized.
     `RecordError` if the folder is no record, or of another map.
     """
-    read_record(record).flown.require_frame(cache)
+    read_record(record).flown_map.require_frame(cache)
     estimates = read_estimates(record / "estimates.csv")
     places = np.array([e.world_from_camera.translation for e in estimates]).reshape(-1, 3)
     return places, np.array([e.accepted for e in estimates], bool)

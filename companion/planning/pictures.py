@@ -45,7 +45,7 @@ class MapSquare:
 
 
 def sheet_of(plan: MissionForecast, cache: TileCache) -> MapSquare:
-    """Render the map square around the plan's path."""
+    """Render the map in a square around the plan's path, north up."""
     places = _places(_all(plan))
     low, high = places.min(axis=0), places.max(axis=0)
     half = max(float((high - low).max()) * (0.5 + _MARGIN), _LEAST_HALF_M)

@@ -44,9 +44,9 @@ class Question:
 
 @dataclass(frozen=True)
 class MissionForecast:
-    """The result. length_m: of all legs; verdicts: of each leg once, however often it is flown;
-    not_judged: MAVLink names of the mission's commands that the forecast cannot include; notes:
-    limits of the forecast for this mission, as sentences.
+    """Forecast of a mission. length_m: of all legs; verdicts: of each leg once, however often it is
+    flown; not_judged: MAVLink names of the mission's commands that the forecast cannot include;
+    notes: limits of the forecast for this mission, as sentences.
     """
 
     question: Question

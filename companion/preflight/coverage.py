@@ -25,7 +25,7 @@ _FIX_3D = 3
 _NEEDED = "inside the map"
 
 
-def covered(cache: TileCache, points: Array) -> np.ndarray:
+def is_covered(cache: TileCache, points: Array) -> np.ndarray:
     """Whether a finest tile covers each point (N, 2), ENU metres: (N,) bool."""
     index = cache.index
     leaves = (index.child_count == 0) & (index.tile_count > 0)
@@ -57,9 +57,9 @@ def check_mission(cache: TileCache, waypoints: Sequence[MissionWaypoint]) -> Doc
     if not [w for w in waypoints if w.number > 0]:
         return DoctorFinding(_NAME, "none in the vehicle", _NEEDED, "nothing to check", True, False)
     points = _enu(cache.frame, waypoints)
-    outside = [w.number for w, inside in zip(waypoints, covered(cache, points), strict=True)
+    outside = [w.number for w, inside in zip(waypoints, is_covered(cache, points), strict=True)
                if not inside]  # fmt: skip
-    way = covered(cache, _path_points(points))
+    way = is_covered(cache, _path_points(points))
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     found = f"{len(waypoints)} places, {length / 1000:.1f} km"
     if way.all() and not outside:

@@ -91,7 +91,7 @@ def decode(packet: bytes) -> Fields:
 
 
 def telemetry(fields: Fields, time_ns: int) -> Telemetry:
-    """Position and camera direction of the fields."""
+    """Position and camera direction of a packet's fields, at time_ns."""
 
     def number(name: int) -> float | None:
         value = fields.get(name)

@@ -69,7 +69,7 @@ def demo_report(folder: Path, say: Say = silent) -> Report:
     off = np.flatnonzero(accepted & (errors["3-D"] > _LARGE_M) & (time_s >= 0))
     large = f"{time_s[off[0]]:.3f} the position was {errors['3-D'][off[0]]:.1f} m off" \
         if len(off) else ""  # fmt: skip
-    with map_pictures(record.map_path, say, record.flown) as pictures:
+    with map_pictures(record.map_path, say, record.flown_map) as pictures:
         vision = figures.track("vision (camera)", VISION, INNER, estimates)
         tracks = [
             figures.track("truth", _TRUTH, OUTER, vehicle),

@@ -157,7 +157,7 @@ def target_marks(targets: Columns) -> tuple[MapMark, ...]:
 
 
 def by_name(targets: Columns) -> dict[str, np.ndarray]:
-    """Row indices of each target, in order of first appearance."""
+    """Row indices of each target by its name, in order of first appearance."""
     if not targets:
         return {}
     names = np.asarray(targets["target_id"])

@@ -67,7 +67,7 @@ def describe_recording(
     if out.resolve() == video.resolve():
         raise RecordError(f"{out}: is the video itself; give another file as --out")
     cache = TileCache.open(map_path)
-    tables.flown.require_frame(cache)
+    tables.flown_map.require_frame(cache)
     with ExitStack() as stack:
         scene = KlvContext(
             cache.frame, MapSurface(cache).cast, cache.manifest.geoid_separation_m, mission

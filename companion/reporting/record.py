@@ -47,7 +47,7 @@ def record_report(folder: Path, say: Say = silent) -> Report:
             versions=tables.versions,
         )  # fmt: skip
     time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
-    with map_pictures(tables.map_path, say, tables.flown) as pictures:
+    with map_pictures(tables.map_path, say, tables.flown_map) as pictures:
         autopilot = read_autopilot(tables.tlog, tables.start_ns, tables.utc_ns, pictures)
         tracks = _tracks(estimates, autopilot)
         sheet = pictures.sheet(tracks, figures.target_marks(tables.targets))

@@ -434,7 +434,7 @@ class LiveVideoSource:
             for picture, arrival_ns in decoder.pictures():
                 if self._closing.is_set():
                     return "closed"
-                self._take(picture, arrival_ns, clock)
+                self._process_frame(picture, arrival_ns, clock)
             return "the sender ended the stream"
         except av.error.ExitError:  # the read time-out
             return f"no data for {self._settings.stall_timeout_s:g} s"
@@ -445,7 +445,9 @@ class LiveVideoSource:
         finally:
             decoder.close()
 
-    def _take(self, picture: av.VideoFrame | None, arrival_ns: int, clock: ExposureClock) -> None:
+    def _process_frame(
+        self, picture: av.VideoFrame | None, arrival_ns: int, clock: ExposureClock
+    ) -> None:
         if picture is None:
             self._count(undecodable=1)
             # A receiver that has just joined waits for a key frame: no stall yet.

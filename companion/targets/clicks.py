@@ -52,7 +52,7 @@ class ClickPolicy:
             return
         with self._lock:
             self._waiting = [
-                r for r in self._waiting if not self._place(r, estimate.exposure_time_ns)
+                r for r in self._waiting if not self._try_begin(r, estimate.exposure_time_ns)
             ]
 
     def on_request(self, request: TrackRequest) -> None:
@@ -60,7 +60,7 @@ class ClickPolicy:
         with self._lock:
             if request.kind == "stop":
                 self._stop(request.number)
-            elif not self._place(request, request.time_ns):
+            elif not self._try_begin(request, request.time_ns):
                 self._waiting.append(request)
 
     def on_gone(self, name: str) -> None:
@@ -75,7 +75,7 @@ class ClickPolicy:
         self._alive = [c for c in self._alive if number not in (0, c.number)]
         self._targets.forget(tuple(c.name for c in ended))
 
-    def _place(self, request: TrackRequest, now_ns: int) -> bool:
+    def _try_begin(self, request: TrackRequest, now_ns: int) -> bool:
         """Begin or refuse the request's target; False while its frame's pose may still arrive."""
         wanted_ns = request.time_ns - self._delay_ns
         newest = self._history.newest

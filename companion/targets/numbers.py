@@ -26,7 +26,7 @@ class TargetNumbers:
         self._lock = threading.Lock()
 
     @property
-    def known(self) -> int:
+    def known_count(self) -> int:
         """Number of remembered names of detected targets."""
         return len(self._numbers)
 

@@ -162,9 +162,8 @@ class CameraComponent:
             send(message, self._component)
 
     def _reported_targets(self) -> list[int]:
-        """The target for the camera protocol, which has room for one target without a number.
-
-        It is the last clicked target. Without a click, the detected targets are reported in turn.
+        """Numbers of the targets for the camera protocol, which has room for one: the last clicked
+        target; without a click all detected targets, which are reported in turn.
         """
         clicked = [number for number, target in self._targets.items() if target.clicked]
         return [max(clicked)] if clicked else list(self._targets)

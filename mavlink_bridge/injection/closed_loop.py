@@ -101,7 +101,7 @@ class ClosedLoopCheck:
             self._repeats = 0  # another jump may be missed as often
         return LoopVerdict(reason is None, reason, difference)
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Number of entries in each queue, by name."""
         return {
             "sent": len(self._sent),

@@ -190,7 +190,7 @@ class FixSender:
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Number of entries in each queue, by name."""
         return {"fixes": len(self._fixes), "due": self.injector.waiting}
 

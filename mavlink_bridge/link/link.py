@@ -203,7 +203,7 @@ class Link:
         mine = {**asdict(self.counters), "rx_of_strangers": refused}
         return {**mine, **asdict(self._reader.counters)}
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Lengths of the queues: messages of other threads, bytes received and to send."""
         return {
             "outbox": len(self._outbox),

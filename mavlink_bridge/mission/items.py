@@ -109,7 +109,7 @@ class MissionItem:
         return None if math.isnan(altitude) or altitude == 0 else altitude
 
     @property
-    def named(self) -> str:
+    def label(self) -> str:
         """MAVLink name and number of the item."""
         return f"{command_name(self.command)} (item {self.number})"
 
@@ -133,7 +133,7 @@ class UnreadItem:
     name: str
 
     @property
-    def named(self) -> str:
+    def label(self) -> str:
         """Name and number of the item."""
         return f"{self.name} (item {self.number})"
 

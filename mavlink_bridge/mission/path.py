@@ -206,7 +206,7 @@ class _Flight:
 
     def _take(self, item: MissionItem | UnreadItem) -> None:
         if isinstance(item, UnreadItem):
-            self._leave_out(item.named, "the ground station works it out at the upload", gap=True)
+            self._leave_out(item.label, "the ground station works it out at the upload", gap=True)
             return
         command = item.command
         if command in TAKEOFFS:
@@ -224,18 +224,18 @@ class _Flight:
             self._gimbal, why = gimbal_after(item, self._gimbal, self._vehicle)
             if why:
                 turned = command not in ROI_COMMANDS  # a region turns a vehicle without gimbal
-                self._leave_out(item.named, why, gimbal_only=turned)
+                self._leave_out(item.label, why, gimbal_only=turned)
         elif command in NO_EFFECT or _is_off(item):
             self._no_effect[command_name(command)] = None
         else:
             flies = command <= mavlink.MAV_CMD_NAV_LAST or command in FLY_TOO
             gimbal_only = command in GIMBAL_ONLY
-            self._leave_out(item.named, gap=flies and command not in VIEW, gimbal_only=gimbal_only)
+            self._leave_out(item.label, gap=flies and command not in VIEW, gimbal_only=gimbal_only)
 
     def _leave_out(
-        self, named: str, why: str = "", *, gap: bool = False, gimbal_only: bool = False
+        self, label: str, why: str = "", *, gap: bool = False, gimbal_only: bool = False
     ) -> None:
-        text = f"{named}: {why}" if why else named
+        text = f"{label}: {why}" if why else label
         self._not_judged[NotJudged(text, gimbal_only, gap)] = None
         self._gap |= gap
 
@@ -286,7 +286,7 @@ class _Flight:
     def _note_place(self, item: MissionItem) -> None:
         _above(item)  # a local frame's coordinates are no latitude and longitude
         if item.command == mavlink.MAV_CMD_NAV_LOITER_UNLIM:
-            self._notes[f"{item.named} holds until the pilot goes on."] = None
+            self._notes[f"{item.label} holds until the pilot goes on."] = None
 
     def _descend(self, item: MissionItem) -> None:
         """Fly to its coordinates at the present height, then down; an aeroplane glides there."""
@@ -301,10 +301,10 @@ class _Flight:
 
     def _return(self, item: MissionItem) -> None:
         if self._home is None:
-            self._leave_out(item.named, "the mission has no home")
+            self._leave_out(item.label, "the mission has no home")
             return
         if self._vehicle.has_rally_points:
-            self._leave_out(item.named, "it may return to a rally point")
+            self._leave_out(item.label, "it may return to a rally point")
         self._add("home", item, self._home)
 
 
@@ -343,7 +343,7 @@ def _speed_after(item: MissionItem, before: float | None, usual: float | None) -
 def _above(item: MissionItem) -> HeightAbove:
     if item.frame not in FRAMES:
         raise MissionError(
-            f"{item.named} is in frame {item.frame}; known are {sorted(FRAMES)} (MAV_FRAME): save "
+            f"{item.label} is in frame {item.frame}; known are {sorted(FRAMES)} (MAV_FRAME): save "
             "the mission with global coordinates"
         )
     return FRAMES[item.frame]

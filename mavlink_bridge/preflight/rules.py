@@ -44,7 +44,7 @@ class ParameterRule:
 
     @property
     def needed(self) -> str:
-        """The allowed values as text."""
+        """The allowed values, the bound or the bits as text."""
         if self.bits:
             return f"bits {self.bits:#x} set"
         if math.isfinite(self.minimum):
@@ -69,7 +69,7 @@ class ParameterRule:
 
 
 def find_source_set(config: BridgeConfig, read: Read) -> int:
-    """The EK3 source set that uses the injected positions, or that should."""
+    """Number (1 to 3) of the EK3 source set that uses the injected positions, or should."""
     if config.switch.enabled:
         return config.switch.vision_set
     if config.injection.message == "external_position_estimate":

@@ -198,7 +198,7 @@ class AttitudeBuffer:
             if ahead > _MAX_EXTRAPOLATION_NS:
                 return None
             seconds = ahead * 1e-9
-            q = quat.turn(newest.quaternion, newest.rates, seconds)
+            q = quat.rotated(newest.quaternion, newest.rates, seconds)
             heading = newest.gyro_heading_rad + heading_rate(newest) * seconds
             return attitude(time_ns, q, newest.rates, heading)
         before, after, t = _neighbours(samples, time_ns)

@@ -77,6 +77,6 @@ class TimeSync:
             problem = alert(AlertId.TIMESYNC_UNANSWERED) if is_silent else None
             self._notifier.notify("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Number of unanswered requests, as the length of a queue."""
         return {"timesync": len(self._sent)}

@@ -250,7 +250,7 @@ def test_a_flood_is_told_in_a_few_lines_and_nothing_grows(monkeypatch, attack, m
         if turn % 5 == 0:
             flight.run(0.07)
     assert len(told(flight)) <= most, told(flight)
-    assert max(flight.waiting().values()) <= 256
+    assert max(flight.queue_lengths().values()) <= 256
     assert len(flight.shared.tracker.other_gimbals) <= 8
 
 
@@ -311,7 +311,7 @@ def test_what_asks_for_an_answer_without_end_gets_few(flight: Flight, attack: At
     for turn in range(300):
         attack(flight, turn)
     assert len(flight.link.sent) - before <= 5
-    assert max(flight.waiting().values()) <= 100
+    assert max(flight.queue_lengths().values()) <= 100
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def flight_command(
     console.print("What this flight cannot tell:" if blind else "This flight tells all of it.")
     for line in blind:
         console.print(f"  {escape(line)}", soft_wrap=True, highlight=False)
-    doubt = loaded.tables.flown.mismatch(TileCache.open(loaded.config.map))
+    doubt = loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map))
     for note in (*found.notes, *filter(None, (doubt,))):
         console.print(escape(note), style="yellow", soft_wrap=True)
     console.print(

@@ -259,7 +259,7 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
     from localizer.map.fetch.fetch import fetch
 
     what = f"fetching {part.source.name}"
-    with _told_count(what) as progress:
+    with _counted_text(what) as progress:
         known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
     console.print(
         f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
@@ -269,7 +269,7 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
 
 
 @contextmanager
-def _told_count(what: str) -> Iterator[Callable[[int, int], None]]:
+def _counted_text(what: str) -> Iterator[Callable[[int, int], None]]:
     try:
         with show_count(Console(stderr=True), what) as progress:
             yield progress

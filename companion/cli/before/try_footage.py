@@ -62,15 +62,15 @@ def try_command(
     with show_count(console, "reading footage") as count:
         flight = read_footage(footage, options, count)
     if map_cache is None:
-        _tell_map(flight)
+        _print_map(flight)
         raise typer.Exit(1)
     _try(flight, map_cache, report, width, searches)
 
 
-def _tell_map(flight: RecordedFlight) -> None:
+def _print_map(flight: RecordedFlight) -> None:
     from companion.trial.wanted_map import flat_map_advice, wanted_map
 
-    _tell_notes(flight, flight.notes)
+    _print_notes(flight, flight.notes)
     wanted = wanted_map(flight)
     out = Console()
     out.print(
@@ -83,7 +83,7 @@ def _tell_map(flight: RecordedFlight) -> None:
             out.print(line, soft_wrap=True, highlight=False)
 
 
-def _tell_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
+def _print_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
     for note in (f"camera by {flight.camera.source}", *notes):
         Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
 
@@ -103,7 +103,7 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
 
     trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
     judgement = trial_verdict(trial)
-    _tell_notes(flight, trial.notes)
+    _print_notes(flight, trial.notes)
     with show_steps(console) as say:
         page = write_trial(report, trial, judgement, map_cache, say)
     deployment = write_trial_deployment(report / "deployment.yaml", trial, map_cache)

@@ -100,7 +100,7 @@ class BoxDetector:
                 continue
             begun = time.monotonic()
             try:
-                self._look(network, *pair)
+                self._process(network, *pair)
                 self._in_a_row = 0
             except Exception as error:
                 self.failed += 1
@@ -139,12 +139,12 @@ class BoxDetector:
                     return frame, estimate
         return None
 
-    def _look(self, network: DetectorNetwork, frame: Frame, estimate: PoseEstimate) -> None:
+    def _process(self, network: DetectorNetwork, frame: Frame, estimate: PoseEstimate) -> None:
         self._looked_ns = estimate.exposure_time_ns
         boxes = network.detect(frame.image)
         self.looked += 1
         placed = [
-            (box, place) for box in boxes if (place := self._place(box, estimate)) is not None
+            (box, place) for box in boxes if (place := self._locate(box, estimate)) is not None
         ]
         sights = [LocatedBox(network.name_of(box.label), place) for box, place in placed]
         names = self._names.name(sights, estimate.exposure_time_ns)
@@ -155,7 +155,7 @@ class BoxDetector:
                 told = Detection(f"{DETECTED}{name}", estimate.exposure_time_ns, u, v)
                 self._on_detection(told)
 
-    def _place(self, box: Box, estimate: PoseEstimate) -> np.ndarray | None:
+    def _locate(self, box: Box, estimate: PoseEstimate) -> np.ndarray | None:
         u, v = _middle(box)
         if not (0.0 <= u <= estimate.camera.width and 0.0 <= v <= estimate.camera.height):
             return None

@@ -312,7 +312,7 @@ def test_peer_that_does_not_read_costs_messages_not_memory_or_time(start):
             time.sleep(0.002)
         assert time.monotonic() - begun < 60.0  # a send that blocked once would never end
         assert sleep_until(lambda: link.counters.tx_dropped > 1000, 30.0)
-        assert link.waiting()["unsent"] < 128 * 1024
+        assert link.queue_lengths()["unsent"] < 128 * 1024
         deaf.close()
 
 
