@@ -152,7 +152,7 @@ def _kind(share: float, trial: Trial, known: Array) -> str:
 
 
 def spread_limit_m(trial: Trial) -> float:
-    """Limit of the median distance from GNSS, m: root sum square of GNSS's two sigmas and 3 m."""
+    """Limit of the median distance from GNSS, m: root sum square of 3 m and two sigmas of GNSS."""
     sigmas = [p.sigma_m for p in trial.priors if p.pose is not None]
     own = float(np.median(sigmas)) if sigmas else 0.0
     return float(np.hypot(2.0 * own, 3.0))
