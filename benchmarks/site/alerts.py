@@ -34,7 +34,8 @@ name no effect |
 | exclude and reset | as *hold*; the first fix afterwards also increments `reset_counter`, which \
 tells the EKF to jump |
 | inhibit | injection and the switch to the vision source set do not start. Injection that runs \
-continues. After a crash before injection and a restart within 10 min, the alert is still active |
+continues. If the program crashes before injection has started, and restarts within 10 min, the \
+alert stays active |
 | one-off | the alert reports one moment; nothing has to end |
 | good GNSS | GNSS has a 3D fix, and neither `gnss_refused` nor `gnss_vision_mismatch` is active |
 | take over | On the ground: wait, and do not take off on vision. In flight: if the EKF uses good \
