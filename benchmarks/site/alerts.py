@@ -59,8 +59,8 @@ does not start, with three exceptions: `bridge.injection.force`; the pilot (mode
 the check has not failed (`injection_unchecked`). The first two also override *inhibit*. The check
 compares the fixes of the last two minutes with the EKF's position on GNSS. An alert is sent as a
 text only in mode inject, if fixes are made but injection has not started for 10 s. It ends when 50
-or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid pass*: the check passed at most 10 min ago, and at most 30 s before the last
-compared fix.
+or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid pass*: the
+check passed at most 10 min ago, and at most 30 s before the last compared fix.
 
 **Fixes and EKF:** `fix_rate_low` to `ekf_rejects_fixes` need 3 s or more of sent fixes. Only the
 first of these six whose condition holds is active.
