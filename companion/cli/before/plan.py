@@ -30,7 +30,7 @@ def plan_command(
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("plan"),
     condition: Annotated[
         list[str] | None,
-        typer.Option(help="day, season, dusk, night, fog, rain or snow; may be repeated (day)"),
+        typer.Option(help="day, season, dusk, night, fog, rain or snow; default: day"),
     ] = None,
     sigma: Annotated[
         float, typer.Option(min=0.05, max=100, help="largest acceptable position sigma, m")
