@@ -87,21 +87,21 @@ def _parallel(line: Array, offset_m: float) -> Array:
 
 @dataclass(frozen=True)
 class Crowd:
-    """A kind of moving objects. prefix: of their names; speeds_mps: lowest and highest."""
+    """A kind of moving objects. prefix: start of their names; speeds_mps: lowest and highest."""
 
     prefix: str
     meshes: Sequence[TileMesh]
     speeds_mps: tuple[float, float]
 
 
-def spread(
+def place_movers(
     crowd: Crowd,
     paths: Sequence[Array],
     count: int,
     rng: np.random.Generator,
     epoch_ns: int = 0,
 ) -> tuple[Mover, ...]:
-    """`count` objects with random path, start position, mesh and speed."""
+    """Make `count` objects with random mesh and speed, at random places of the closed paths."""
     lengths = np.array(
         [np.linalg.norm(np.diff(np.vstack([p, p[:1]]), axis=0), axis=1).sum() for p in paths]
     )

@@ -20,7 +20,7 @@ _DATAGRAM = 1316  # bytes: seven TS packets, what fits an Ethernet frame
 
 
 class LossyLink:
-    """Output of FFmpeg: sends datagrams to ``udp://host:port`` and drops a random share."""
+    """Output file for FFmpeg: sends datagrams to ``udp://host:port`` and drops a random share."""
 
     def __init__(self, url: str, loss: float, seed: int = 0) -> None:
         parts = urlsplit(url)

@@ -28,7 +28,7 @@ class TimedSample(Protocol):
 
     @property
     def time_ns(self) -> int:
-        """When it was so."""
+        """CLOCK_MONOTONIC time of the sample."""
 
 
 _Sample = TypeVar("_Sample", bound=TimedSample)
@@ -86,7 +86,7 @@ class GimbalState:
 
 @dataclass(frozen=True)
 class EkfSample:
-    """LOCAL_POSITION_NED with the EKF origin and flags of its time; times as in `Truth`."""
+    """LOCAL_POSITION_NED with EKF origin (None: not set) and flags; times as in `Truth`."""
 
     time_ns: int
     boot_s: float
@@ -114,7 +114,7 @@ class LeastLatencyClock:
         self._offsets.clear()
 
     def observe(self, boot_ms: int, received_ns: int) -> None:
-        """A message of boot time boot_ms was received."""
+        """Learn from a message of boot time boot_ms that arrived at received_ns."""
         self._offsets.append(received_ns - boot_ms * self._scale)
 
     def monotonic_ns(self, boot_ms: int) -> int:
@@ -157,12 +157,12 @@ class SampleTrack(Generic[_Sample]):
 
     @property
     def newest(self) -> _Sample | None:
-        """The last sample."""
+        """The last sample; None without samples."""
         with self._lock:
             return self._samples[-1] if self._samples else None
 
 
-def share(before_ns: int, after_ns: int, time_ns: int) -> float:
+def fraction(before_ns: int, after_ns: int, time_ns: int) -> float:
     """Position of a time between two others as a fraction, 0 to 1."""
     return (time_ns - before_ns) / (after_ns - before_ns) if after_ns > before_ns else 0.0
 
@@ -177,9 +177,9 @@ def slerp(a: Array, b: Array, t: float) -> Array:
     return np.asarray(q / np.linalg.norm(q))
 
 
-def between(a: Truth, b: Truth, time_ns: int) -> Truth:
-    """The true state at a time from a's to b's, interpolated linearly."""
-    t = share(a.time_ns, b.time_ns, time_ns)
+def interpolate(a: Truth, b: Truth, time_ns: int) -> Truth:
+    """The true state at time_ns, interpolated linearly between a and b."""
+    t = fraction(a.time_ns, b.time_ns, time_ns)
     return Truth(
         time_ns,
         a.boot_s + t * (b.boot_s - a.boot_s),

@@ -17,8 +17,8 @@ from sitl.ground.tracks import (
     LeastLatencyClock,
     SampleTrack,
     Truth,
-    between,
-    share,
+    fraction,
+    interpolate,
     slerp,
 )
 
@@ -108,7 +108,7 @@ class VehicleRecord:
         pair = self._truth.around(time_ns)
         if pair is None:
             return None
-        return between(*pair, time_ns)
+        return interpolate(*pair, time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalState | None:
         """The gimbal at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
@@ -116,11 +116,11 @@ class VehicleRecord:
         if pair is None:
             return None
         a, b = pair
-        t = share(a.time_ns, b.time_ns, time_ns)
+        t = fraction(a.time_ns, b.time_ns, time_ns)
         return GimbalState(time_ns, slerp(a.quaternion, b.quaternion, t), b.flags)
 
     def newest_common_ns(self) -> int | None:
-        """The latest time at which both truth and gimbal are known."""
+        """The newest time at which both true state and gimbal are known; None without it."""
         truth, gimbal = self._truth.newest, self._gimbal.newest
         return min(truth.time_ns, gimbal.time_ns) if truth and gimbal else None
 
@@ -144,11 +144,11 @@ class VehicleRecord:
         """Reset the clock after a change of the speed of simulated time."""
         self._clock.restart(speedup)
 
-    def take(self, message: Any, received_ns: int) -> None:
+    def add(self, message: Any, received_ns: int) -> None:
         """Store a message received at a CLOCK_MONOTONIC time."""
         kind = message.get_type()
         if kind == "STATUSTEXT":
-            self._text_log.take(message, received_ns)
+            self._text_log.add(message, received_ns)
         if not from_autopilot(message):
             return
         self.latest[kind] = message

@@ -56,8 +56,8 @@ class Chase:
 def make_chase(
     world: WorldInfo, frame: LocalFrame, epoch_ns: int, lead_s: float, seed: int = 0
 ) -> Chase:
-    """Choose the road nearest to home that is long enough; the car reaches it `lead_s` after
-    epoch_ns. frame: the map's ENU. ValueError if there is none.
+    """Choose the road nearest to home that is long enough. frame: the map's ENU. The car reaches
+    its begin_m lead_s after epoch_ns. Raises `ValueError` if no road is long enough.
     """
     needed = _ROOFS_AFTER_S[-1] * SPEED_MPS + 0.5 * _roof_length() + _AHEAD_M
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
@@ -97,7 +97,7 @@ def pursuit(car: Mover, time_ns: int, height_m: float, behind_m: float) -> Array
 
 
 def _roof_length() -> float:
-    """So long that the whole car is below it for the wanted time."""
+    """Length (m) at which the whole car is below the roof for the wanted time."""
     return _HIDDEN_S * SPEED_MPS + CAR_LENGTH_M
 
 

@@ -14,9 +14,9 @@ from sitl.demo.assets import prepare
 from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
 from sitl.suite.loop.case import LoopCase
+from sitl.suite.loop.evaluation import evaluate, false_alarms, figures
 from sitl.suite.loop.flight import LoopAssets, fly
 from sitl.suite.loop.inner_map import inner_map
-from sitl.suite.loop.judge import false_alarms, figures, judge
 from sitl.suite.loop.report import LoopRow, as_data, markdown, read_rows
 from sitl.vehicles.process import VehicleKind
 
@@ -28,9 +28,10 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Vehicles, seeds (world, light, errors), and folders of records and worlds. say: receives
-    progress lines; building: receives the progress of world generation (step, share done).
-    resume: fly only what ``out`` does not hold yet, or holds as not flown or too slow.
+    """Vehicles, seeds (of world, light, errors), and folders of records and worlds. worlds: None:
+    the default folder. say: receives progress lines; building: receives the progress of world
+    generation (step, share done). resume: skip flights that ``out`` already holds with a valid
+    result.
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -112,7 +113,7 @@ def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: RunOptions) ->
         case.name,
         kind,
         seed,
-        judge(record, case.expect, denied=case.deny),
+        evaluate(record, case.expect, denied=case.deny),
         figures(record, case.expect.beyond_m),
         false_alarms(record, denied=case.deny) if case.is_normal else None,
         record.pace,
