@@ -37,7 +37,7 @@ from benchmarks.odometry.stretches import StretchPlan, TestStretch, make_stretch
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, with_threads
 
 with needs_torch():
-    from localizer.training.data.batches import tamed
+    from localizer.training.data.batches import limit_haze
     from localizer.training.data.pairs import soften
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
@@ -226,7 +226,7 @@ class LostTrial:
         """What the camera sees at pose k, exposed at (k + 1) frame times."""
         pose: Pose = self._way.poses[k]
         view = self._site.seen.render(pose, self._camera, wait=True)
-        look = tamed(self._look, view.depth)
+        look = limit_haze(self._look, view.depth)
         image = apply_appearance(soften(self._rng, view.rgb), view.depth, look, self._rng)
         return Frame(image, round((k + 1) * _FRAME_S * 1e9), self._camera, k)
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
-from localizer.synth.visits.texture import hard_surfaces, regrown
+from localizer.synth.visits.texture import hard_surfaces, with_new_texture
 from localizer.types import Float32, Image, RenderedView
 
 SEASON = "season"
@@ -58,7 +58,7 @@ def _other_texture(rgb: Image, cell_m: float, rng: np.random.Generator, dry: boo
     if dry:
         share = np.float32(rng.uniform(0.3, 1.0)) * (1 - lasting)[..., None]
         albedo = albedo * (1 - share) + albedo.mean(axis=2, keepdims=True) * _DRY * share
-    other = regrown(albedo, lasting, cell_m, rng)[:height, :width]
+    other = with_new_texture(albedo, lasting, cell_m, rng)[:height, :width]
     image: Image = np.clip(other * 255 + 0.5, 0, 255).astype(np.uint8)
     return image
 

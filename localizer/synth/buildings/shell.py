@@ -46,7 +46,9 @@ class Shell:
         levels: int = ALL_LEVELS,
         eaves: float | None = None,
     ) -> None:
-        """Add a polygon (K, 3) in the building's frame."""
+        """Add a polygon (K, 3) in the building's frame. levels: bits of the levels of detail that
+        show it; eaves: z of the eaves, None: the building's.
+        """
         b = self.building
         local = np.asarray(points, float)
         c, s = np.cos(b.angle), np.sin(b.angle)

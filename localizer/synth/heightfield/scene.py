@@ -108,7 +108,7 @@ def light_scene(
         cosine = cosine * cv2.GaussianBlur(sunny, (0, 0), 0.6)
     shade = light.ambient * openness(height) + light.direct * cosine
     texture = scene.albedo * shade[..., None].astype(np.float32)
-    return textured(scene, texture, light, sky, texel_cells)
+    return bake_texture(scene, texture, light, sky, texel_cells)
 
 
 def openness(height: Float32) -> Float32:
@@ -119,14 +119,16 @@ def openness(height: Float32) -> Float32:
     return seen
 
 
-def textured(
+def bake_texture(
     scene: Scene,
     texture: Float32,
     light: SkyLight,
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
 ) -> LitScene:
-    """The scene with a given texture (n, n, 3), prepared for ray marching."""
+    """The scene with a given texture (n, n, 3), prepared for ray marching. texel_cells: as of
+    `light_scene`.
+    """
     height, cell = scene.height, scene.cell_m
     block_max = cv2.dilate(height, np.ones((3, 3), np.uint8))
     n = height.shape[0]
@@ -143,7 +145,7 @@ def textured(
     return LitScene(height, block_max, flat, scene.prism, scene.facades, light, sky, cell)
 
 
-def without(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
+def omit_randomly(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
     """The objects; each one is left out with the probability `share`."""
     return [p for p in prisms if rng.random() >= share]
 

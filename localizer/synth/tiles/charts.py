@@ -62,7 +62,7 @@ class ChartedMesh:
         )  # fmt: skip
 
     def halved(self, times: int = 1) -> ChartedMesh:
-        """The same with charts of half the resolution, `times` over."""
+        """The same mesh with charts of half the resolution, `times` over."""
         factor = 2**times
         charts, scale = [], np.ones((len(self.charts), 2))
         for k, image in enumerate(self.charts):

@@ -44,7 +44,7 @@ def make_place(
     return PlaceVisits(survey, tuple((lit, visit, season) for visit, lit, season in days), source)
 
 
-def be_nice() -> None:
+def low_priority() -> None:
     """Initialise a worker process: low priority, one core."""
     os.nice(5)
     cv2.setNumThreads(1)

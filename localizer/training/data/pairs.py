@@ -25,9 +25,9 @@ from localizer.synth.heightfield.scene import (
     compose,
     height_at,
     light_scene,
-    without,
+    omit_randomly,
 )
-from localizer.synth.visits.texture import draw_texel, regrown, wetted
+from localizer.synth.visits.texture import draw_texel, with_new_texture, with_wet_patches
 from localizer.training.places.changes import coarse_mesh, plain_walls
 from localizer.training.places.land import generated_place, photo_place
 from localizer.training.places.objects import new_buildings, parked_cars
@@ -86,8 +86,8 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class FlightDay:
-    """Conditions of a flight: weather or light (of `CONDITIONS`), changed buildings, another season
-    (None: drawn).
+    """Conditions of a flight. weather: weather or light, of `CONDITIONS`; outdated: whether
+    buildings have changed; season: whether the season differs from the map's; None: drawn.
     """
 
     weather: str
@@ -159,7 +159,7 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
 
 
 def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneConfig) -> LitScene:
-    """The map: the place on the survey day, as a baked texture on a coarse mesh."""
+    """The place on the survey day, as the map shows it: a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
     if rng.random() < _PLAIN_WALLS:
         prisms = plain_walls(prisms)
@@ -185,10 +185,10 @@ def flight_day_scene(
         if rng.random() < 0.7 or (visit.season and not season):
             albedo, season = season_shift(albedo, rng), True
         land = Land(land.height, albedo, land.cell_m)
-    albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
-    land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
+    albedo = with_new_texture(land.albedo, place.lasting, land.cell_m, rng)
+    land = Land(land.height, with_wet_patches(albedo, place.lasting, rng), land.cell_m)
     if outdated:
-        prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
+        prisms = omit_randomly(prisms, rng, rng.uniform(0.03, 0.25))
         prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
     prisms += parked_cars(rng, place, _car_count(rng, place))
     direct = 0.0 if condition in ("fog", "rain", "snow", "night") else 1.0
@@ -274,7 +274,9 @@ def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Gen
 def moved(
     rng: np.random.Generator, pose: Pose, distance: float, exact: tuple[float, float] | None
 ) -> Pose:
-    """Draw the query pose: up to 15 m and 15 deg away, or a few video frames further."""
+    """Draw the query pose near `pose`: up to 15 m and 15 deg away. distance: m to the ground,
+    limits the shift; exact: (metres, degrees) instead of drawn ones.
+    """
     if rng.random() < 0.3:
         metres, degrees = rng.uniform(0, 3), rng.uniform(0, 3)
     else:
@@ -304,7 +306,7 @@ def _overlap(scene: LitScene, reference: Pose, query: Pose, camera: Camera) -> f
 
 
 def soften(rng: np.random.Generator, image: Image) -> Image:
-    """A map texture somewhat coarser than the view."""
+    """Blur a map texture slightly, half the time."""
     if rng.random() < 0.5:
         return image
     soft: Image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))
