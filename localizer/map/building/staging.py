@@ -146,7 +146,7 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
         yield Staging(folder)
 
 
-def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache:
+def write_index(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache:
     """Write index and manifest, and open the staging folder as a cache, before publishing."""
     digest = index.save(staged.folder / INDEX_NAME)
     final = manifest.model_copy(update={"index_sha256": digest})
@@ -155,7 +155,7 @@ def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache
 
 
 def publish(staged: Staging, out: Path, manifest: Manifest) -> Manifest:
-    """Publish a `complete` cache atomically by a rename to `out`. `MapCacheError` while a reader
+    """Publish a `write_index` cache atomically by a rename to `out`. `MapCacheError` while a reader
     uses the old cache.
     """
     folder = staged.folder

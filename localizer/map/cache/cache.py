@@ -164,7 +164,7 @@ class TileCache:
             index = TileIndex(**safetensors.numpy.load(data))
         except (safetensors.SafetensorError, TypeError, ValueError) as error:
             raise MapCacheError(f"{path / INDEX_NAME}: not a tile index: {error}") from error
-        _check_together(path / MANIFEST_NAME, manifest, index)
+        _require_matching_index(path / MANIFEST_NAME, manifest, index)
         return cls(path, manifest, index)
 
     @cached_property
@@ -192,7 +192,7 @@ class TileCache:
         return self._load(tile_id, textured=True)
 
     def load_geometry(self, tile_id: int) -> TileMesh:
-        """The same without its texture, in a fraction of the time: for casting rays."""
+        """As `load_tile`, without the texture and much faster: for casting rays."""
         return self._load(tile_id, textured=False)
 
     def _load(self, tile_id: int, *, textured: bool) -> TileMesh:
@@ -312,9 +312,9 @@ def read_manifest(path: Path) -> Manifest:
         raise MapCacheError(f"{where}: not a manifest: {error}") from error
 
 
-def _check_together(where: Path, manifest: Manifest, index: TileIndex) -> None:
-    """Whether the manifest is the index's own: nothing else guards it against an edit, and boxes
-    about another origin would let the view lose its tiles.
+def _require_matching_index(where: Path, manifest: Manifest, index: TileIndex) -> None:
+    """`MapCacheError` if the manifest does not fit the index: no hash protects it from an edit, and
+    boxes about another origin would make the view lose its tiles.
     """
     if manifest.tiles != len(index.size):
         raise MapCacheError(

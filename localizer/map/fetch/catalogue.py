@@ -88,7 +88,7 @@ class CatalogueSource(BaseModel):
 
     @property
     def area_deg2(self) -> float:
-        """Size of its area, by which national services precede worldwide ones."""
+        """Area of its bounds; `choose` prefers small ones (national services) by it."""
         west, south, east, north = self.bounds
         return (east - west) * (north - south)
 

@@ -100,8 +100,8 @@ def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeig
 def _keyed_heights(
     keys: Mapping[int, int], where: object
 ) -> tuple[float | None, VerticalDatum | None, str]:
-    """Unit, datum and name by a GeoTIFF's vertical keys: of GeoTIFF 1.0's own numbers PROJ knows
-    nothing, so that GDAL leaves them out.
+    """Unit, datum and name from a GeoTIFF's vertical keys. PROJ does not know GeoTIFF 1.0's own
+    numbers, so GDAL omits them.
     """
     kind = keys.get(_VERTICAL_TYPE_KEY, keys.get(_VERTICAL_DATUM_KEY, 0))
     unit_key = keys.get(_VERTICAL_UNIT_KEY)

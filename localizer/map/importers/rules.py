@@ -74,7 +74,7 @@ class ImportRules:
         return replace(cls(), **given, trusted=frozenset(trusted))
 
     def limits(self) -> dict[str, int]:
-        """Name to number."""
+        """Value of each limit by its name."""
         return {name: getattr(self, name) for name in limit_names()}
 
     def require(self, name: str, amount: float, where: object) -> None:

@@ -69,13 +69,13 @@ def measure_kind(
 
 @dataclass(frozen=True)
 class _Sampler:
-    """Squares about the middles of leaves, spread over the map."""
+    """Makes vertical views of squares about the centres of leaves, spread over the map."""
 
     cache: TileCache
     renderer: NumbaRenderer
 
     def views(self, count: int, side_px: int, gsd_m: float) -> Iterator[tuple[Array, TopView]]:
-        """Each square's middle (2,) east and north, and its view."""
+        """The centre (2,), east and north m, of each square, and its view."""
         index = self.cache.index
         leaves = np.flatnonzero((index.child_count == 0) & (index.tile_count > 0))
         spread = np.linspace(0, len(leaves) - 1, min(count, len(leaves)))
@@ -132,7 +132,7 @@ def _from_plane_m(points: Array) -> float:
 
 
 def _resolution(sampler: _Sampler, texel_m: float) -> float:
-    """Metres that the imagery resolves; its texels' size where nothing can be measured."""
+    """Resolution of the imagery (m); the texel size if it cannot be measured."""
     texel_m = texel_m or _PALETTE_M
     low, high = sampler.cache.index.box_min[0], sampler.cache.index.box_max[0]
     room = float((high - low)[:2].min()) / texel_m
@@ -147,7 +147,7 @@ def _resolution(sampler: _Sampler, texel_m: float) -> float:
 
 
 def _spectrum(grey: Float32) -> Array:
-    """Power (bands,) of an image (n, n) drawn at half a texel a pixel, by frequency."""
+    """Power (bands,) by frequency of an image (n, n) with half a texel per pixel."""
     n = len(grey)
     taper = np.hanning(n)[:, None] * np.hanning(n)
     power = np.abs(np.fft.fft2((grey - grey.mean()) * taper)) ** 2

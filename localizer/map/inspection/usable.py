@@ -45,8 +45,8 @@ def usable_part(
 ) -> UsableArea | None:
     """The largest rectangle of cells that are 90 % free of faults; None without any.
 
-    faulty: (h, w) of the mosaic, True where there is nothing to match. height_m: of the flight; it
-    sets the size of the cells. frame: of the mosaic's metres.
+    faulty: (h, w), True where the mosaic has nothing to match. height_m: of the flight; sets the
+    size of the cells. frame: of the mosaic's metres.
     """
     rows, columns = faulty.shape
     cell = max(round(height_m * _CELL_OF_HEIGHT / mosaic.gsd_m), 1)
