@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.relocalization.relocalizer import Relocalizer
 from localizer.relocalization.types import PlaceQuery, SearchRegion
 from localizer.types import Frame, PosePrior
@@ -38,7 +38,7 @@ class KnownOfPlace:
         rng = np.random.default_rng((self.seed, index))
         tilt = np.array([*rng.normal(0.0, np.radians(self.tilt_sigma_deg), 2), 0.0])
         limit = np.radians(_HEADING_OFF_DEG) if self.heading else np.pi
-        rotation = turned(so3_exp(tilt) @ truth.rotation, rng.uniform(-limit, limit))
+        rotation = with_heading(so3_exp(tilt) @ truth.rotation, rng.uniform(-limit, limit))
         return PlaceQuery(
             frame,
             rotation,

@@ -32,7 +32,7 @@ from localizer.odometry.track import (
     seconds,
     track_after,
 )
-from localizer.registration.anchors import swept
+from localizer.registration.anchors import apply_sweep
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Registration
@@ -159,7 +159,7 @@ class VisualOdometry:
         result = self._optimizer.register(
             frame.features,
             camera,
-            swept(keyframe.anchors, frame.sweep, prior.world_from_camera, camera),
+            apply_sweep(keyframe.anchors, frame.sweep, prior.world_from_camera, camera),
             prior,
             motion=prior,
             seed=self._seed + frame.time_ns % 1_000_003,

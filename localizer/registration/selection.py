@@ -71,7 +71,7 @@ def suppress_duplicates(
 
 
 def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float32, Array]:
-    """Of the anchors in view: query and anchor features (n, C), joint weights (n,)."""
+    """Query and anchor features (n, C) and joint weights (n,) of the anchors in view."""
     x, uv = project(problem, R, t)
     visible = in_view(problem, x, uv)
     u, v = uv[visible].T

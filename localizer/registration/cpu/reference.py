@@ -59,7 +59,7 @@ def in_view(problem: LevelProblem, x: Array, uv: Array) -> NDArray[np.bool_]:
 
 
 def count_in_view(problem: LevelProblem, rotation: Array, translation: Array) -> int:
-    """How many anchors are in view from the pose camera_from_local."""
+    """Number of anchors in view from the pose camera_from_local."""
     return int(in_view(problem, *project(problem, rotation, translation)).sum())
 
 
@@ -136,7 +136,7 @@ def robust_loss(norm: Array, settings: LMSettings) -> tuple[Array, Array]:
 
 
 def minimum_visible(problem: LevelProblem, settings: LMSettings) -> int:
-    """The number of anchors below which a pose has no score."""
+    """Smallest number of anchors in view with which a pose gets a score."""
     return max(6, int(np.ceil(settings.min_overlap * problem.points.shape[1])))
 
 

@@ -96,7 +96,7 @@ class FrameMemory:
         frame[start : start + value.nbytes] = value.reshape(-1).view(np.uint8)
 
     def winner(self, swarm: NDArray[np.void]) -> NDArray[np.void]:
-        """The swarm with its own score address: sharpening must not change the ranking."""
+        """The swarm with separate score addresses: sharpening must not change the ranking."""
         out: NDArray[np.void] = swarm.copy()
         out["scores"], out["visible"] = self.trial
         return out
