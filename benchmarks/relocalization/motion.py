@@ -41,7 +41,7 @@ with needs_torch():
     from localizer.training.data.pairs import soften
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
-from localizer.evaluation.places import KnownOfPlace
+from localizer.evaluation.places import SimulatedPlaceData
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
@@ -135,7 +135,7 @@ class LostTrial:
         self._rng = rng
         self._camera = Camera.from_fov(*SIZE, float(rng.uniform(50, 80)))
         self.condition = CONDITIONS[index % len(CONDITIONS)]
-        self._known = KnownOfPlace(prior=False, heading=heading_known, seed=index)
+        self._known = SimulatedPlaceData(prior=False, heading=heading_known, seed=index)
         self.height_m = float(np.exp(rng.uniform(np.log(55), np.log(150))))
         half = (site.half_m, site.half_m)
         speed = float(rng.uniform(5, 12))

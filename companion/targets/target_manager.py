@@ -491,7 +491,7 @@ class TargetManager:
         time_ns = estimate.exposure_time_ns
         before = [p for p in self._pictures if time_ns - p[0].exposure_time_ns > _PASSED_NS]
         ground = before[::_GROUND_EVERY]
-        return follower.find_before(
+        return follower.find_on_ground(
             gray, estimate, position, reach_m, ground, was_hidden=was_hidden
         )
 

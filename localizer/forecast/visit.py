@@ -47,7 +47,7 @@ def simulate_visit(view: RenderedView, condition: str, rng: np.random.Generator)
 
 
 def _other_texture(rgb: Image, cell_m: float, rng: np.random.Generator, dry: bool) -> Image:
-    """Soft ground with another fine texture, and out of season if `dry`."""
+    """The image with another fine texture on soft ground; dry: also out of season."""
     height, width = rgb.shape[:2]
     side = max(height, width)
     square = cv2.copyMakeBorder(
@@ -64,7 +64,7 @@ def _other_texture(rgb: Image, cell_m: float, rng: np.random.Generator, dry: boo
 
 
 def _changed(image: Image, cell_m: float, rng: np.random.Generator) -> Image:
-    """The picture with some places that show another part of it."""
+    """The image with some regions replaced by other parts of it."""
     height, width = image.shape[:2]
     side = int(np.clip(_CHANGE_M / cell_m, 4, min(height, width) // 4))
     count = round(rng.uniform(*_CHANGED) * height * width / side**2)

@@ -59,7 +59,7 @@ class Sweep:
 
     @staticmethod
     def _share(away: Array, world_from_camera: Pose, camera: Camera) -> Array:
-        """(N, 1): when each point's row is read out, -0.5 for the first to 0.5 for the last."""
+        """(N, 1) readout time of each point's row: -0.5 for the first to 0.5 for the last."""
         pixels, _ = camera.project(away @ world_from_camera.rotation)
         rows = np.nan_to_num(pixels[:, 1] / camera.height - 0.5)
         return np.clip(rows, -0.5, 0.5)[:, None]

@@ -123,7 +123,7 @@ def in_view(
 
 
 def _uncovered(pixels: Array, camera: Camera, count: int, rng: np.random.Generator) -> Array:
-    """About `count` random pixels over the whole image, those left out that lie in a cell with one
+    """About `count` random pixels over the whole image, without those in a cell that contains one
     of `pixels` (N, 2).
     """
     side = min(camera.width, camera.height) / _CELLS

@@ -119,7 +119,7 @@ class TileRenderer(ABC):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw just these meshes."""
+        """Draw exactly these meshes."""
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
         """See `MapRenderer.prefetch`."""

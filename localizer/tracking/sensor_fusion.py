@@ -126,7 +126,7 @@ class SensorFusion:
                 votes.displacements, result.world_from_camera, combine(*known) if known else None
             )
             if likelihood is not None:
-                self.height_error = self.height_error.after(likelihood)
+                self.height_error = self.height_error.updated(likelihood)
         seen = self._with_map_error(result)
         if seen.status is not RegistrationStatus.OK:
             self.attitude_bias.skip_ground(place.translation, time_ns)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.geometry.antimeridian import beside, wrapped
+from localizer.geometry.antimeridian import lon_near, wrapped
 from localizer.geometry.geo import LocalFrame
 from localizer.map.inspection.mosaic import Mosaic
 
@@ -62,7 +62,7 @@ def usable_part(
     places = [frame.position(np.array([*corner, 0.0])) for corner in corners]
     north_west, north_east, south_west, south_east = (p.latitude_deg for p in places)
     about = frame.origin.longitude_deg
-    beyond = [beside(p.longitude_deg, about) for p in places]  # in the same order
+    beyond = [lon_near(p.longitude_deg, about) for p in places]  # in the same order
     return UsableArea(
         max(south_west, south_east),
         wrapped(max(beyond[0], beyond[2])),

@@ -256,7 +256,7 @@ class _Slides:
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
         return FollowedPosition(at, pixel, 0.9) if near else None
 
-    def find_before(self, *_picture, **_how):
+    def find_on_ground(self, *_picture, **_how):
         return False, None  # it looks as the ground does
 
     def shows_ground(self, _gray, _estimate):
@@ -305,7 +305,7 @@ class _Glimpse(_Slides):
     speed = 0.0
     times_s: tuple[float, ...] = (0.2,)
 
-    def find_before(self, _gray, estimate, *_picture, **_how):
+    def find_on_ground(self, _gray, estimate, *_picture, **_how):
         since_s = round((estimate.exposure_time_ns - self._begun_ns) * 1e-9, 1)
         at = self._place + np.array([0.0, 3.0, 0.0])
         found = (

@@ -14,7 +14,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits
 from localizer.targets.limits import (
-    LastPlace,
+    LastPosition,
     RefusalReason,
     TargetRefusal,
     is_at_seen_depth,
@@ -165,16 +165,14 @@ def _fix(place, time_ns, sigma=1.0):
 
 
 def test_another_object_under_the_same_name_is_told_once_it_was_seen_for_as_long():
-    last = LastPlace()
+    last = LastPosition()
     for k in range(100):
-        assert last.objection(_fix([0, 0, 0], k * SECOND // 10), moves=False) is None
+        assert last.check(_fix([0, 0, 0], k * SECOND // 10), moves=False) is None
     refused = [
-        k
-        for k in range(100, 150)
-        if last.objection(_fix([300, 0, 0], k * SECOND // 10), moves=False)
+        k for k in range(100, 150) if last.check(_fix([300, 0, 0], k * SECOND // 10), moves=False)
     ]
     assert refused == list(range(100, 130))
-    assert last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False) == TargetRefusal(
+    assert last.check(_fix([0, 0, 0], 16 * SECOND), moves=False) == TargetRefusal(
         RefusalReason.MOVED, 300.0
     )
 
