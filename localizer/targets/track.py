@@ -94,10 +94,7 @@ class TargetTrack:
         drift: tuple[float, float] = (0.0, 0.0),
         pixel_sigma: float | None = None,
     ) -> TargetFix | None:
-        """Add an observation: the target's pixel in an accepted frame. Returns its position; None,
-        with `refusal` set, without one. drift: as of `ray_spread`; pixel_sigma: None: the
-        settings'.
-        """
+        """Add the target's pixel in an accepted frame; its position, or None with `refusal` set."""
         settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
         time_ns, self.refusal = estimate.exposure_time_ns, None
         eye, d = ray_in_world(estimate, pixel)
@@ -183,9 +180,7 @@ class TargetTrack:
         return fix if pixel is not None and is_on_map(fix, self._cast) else None
 
     def hold(self, estimate: PoseEstimate) -> TargetFix | None:
-        """A static target's position in a frame without an observation; None for a moving one or
-        before the first position.
-        """
+        """A static target's position in a frame without an observation, by the pose; else None."""
         if self._moves or self._last.fix is None:
             return None
         fix = self._standing(estimate, None)

@@ -187,7 +187,7 @@ class TileStreamer:
         )
 
     def _choose(self, world_from_camera: Pose, camera: Camera, limits: DetailLimits) -> Selection:
-        """Select nodes and give the loader its list. The caller holds the lock."""
+        """Select nodes and give the loader its list. Needs the lock."""
         if self._closed:
             raise RuntimeError("the tile streamer is closed")
         choice = self._selector.select(world_from_camera, camera, self._nodes.resident, limits)
@@ -238,15 +238,13 @@ class TileStreamer:
                 self._lock.notify_all()
 
     def _to_load(self) -> list[int]:
-        """Nodes to load, in order; empty while there is no room for loaded ones."""
+        """Nodes to load, in order; empty while there is no room for them."""
         if self._arrived_bytes >= self._bytes_per_select:
             return []
         return self._queue or self._ahead
 
     def _take_in(self, limit: int | None) -> None:
-        """Make loaded nodes resident: at least one, up to `limit` bytes. The caller has the
-        lock.
-        """
+        """Make loaded nodes resident, at most `limit` bytes but at least one. Needs the lock."""
         taken = 0
         while self._arrived and (limit is None or taken < limit):
             node, meshes = self._arrived.pop(0)

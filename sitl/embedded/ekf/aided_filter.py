@@ -43,8 +43,7 @@ class Aiding(IntEnum):
 
 
 class AidedFilter:
-    """Fuses measurements of the active source set (1 to 3) into the filter `gated`. Nothing is
-    fused before alignment.
+    """Fuses measurements of the active source set (1 to 3) into the filter `gated` once aligned.
 
     armed: whether the vehicle is armed. `notify(severity, text)` sends a STATUSTEXT.
     """
@@ -70,8 +69,8 @@ class AidedFilter:
         return True
 
     def force_position(self, north_m: float, east_m: float, sigma_m: float) -> bool:
-        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: reset the position. False within 1 s of a fused
-        position, or without an origin.
+        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: reset; False within 1 s of aiding, or without
+        origin.
         """
         if self.gated.now_ms - self.gated.clock.position_pass <= 1000 or self.origin is None:
             return False
@@ -103,7 +102,7 @@ class AidedFilter:
         return int(self._parameters[f"EK3_SRC{self.source_set}_{what}"])
 
     def check_sources(self) -> None:
-        """After a change of the source set, let the new source's next data reset the filter."""
+        """After a change of the source set, its next position and yaw reset the filter."""
         position, yaw = self.source("POSXY"), self.source("YAW")
         if position != self._last_position_source:
             self.gated.source_reset = self._last_position_source >= 0 and position != 0
@@ -113,7 +112,7 @@ class AidedFilter:
             self._last_yaw_source = yaw
 
     def check_gps(self, gps: GpsData) -> None:
-        """EKF3's receiver checks. The first fix that passes them sets a missing origin."""
+        """EKF3's receiver checks; the first fix that passes sets a missing origin."""
         now = self.gated.now_ms
         if not gps.good or now - self.gated.clock.gps_received > 1000:
             self.gated.clock.gps_bad = now
@@ -130,7 +129,7 @@ class AidedFilter:
         self._tell(INFO, f"is using {source}")
 
     def update_aiding(self) -> None:
-        """End aiding by sources that have timed out. Called after every fusion step."""
+        """End aiding by sources that have timed out. Called after every step."""
         if self.aiding is not Aiding.ABSOLUTE:
             return
         now, clock = self.gated.now_ms, self.gated.clock
