@@ -32,7 +32,9 @@ class DrawnSensors:
     seed: int = 0
 
     def rotation(self, truth: Pose, index: int) -> Array | None:
-        """Simulated attitude (3, 3) world_from_camera of a frame; the heading is the true one."""
+        """Simulated attitude (3, 3) world_from_camera of frame `index`, with the true heading;
+        None: not measured.
+        """
         if self.tilt_sigma_deg is None:
             return None
         tilt = self._rng(index).normal(0.0, np.radians(self.tilt_sigma_deg), 2)
@@ -40,7 +42,7 @@ class DrawnSensors:
         return rotation
 
     def height_m(self, truth: Pose, index: int) -> float | None:
-        """Simulated height (world z, m) of a frame."""
+        """Simulated height (world z, m) of frame `index`; None: not measured."""
         if self.height_sigma_m is None:
             return None
         error = self._rng(index).normal(0.0, 1.0, 3)[2]

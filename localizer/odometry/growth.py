@@ -50,7 +50,8 @@ def add_scale_error(known: Array, scale: float, displacement: Array) -> Array:
 
 
 def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
-    """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis.
+    """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis;
+    unchanged without one (None).
 
     The sensor's error is constant over frames and does not average out. So a variance P larger than
     the sensor's R becomes R, however often it is measured, by an update with the noise ``R P / (P -

@@ -111,7 +111,7 @@ def in_view(
 ) -> tuple[Array, Array]:
     """The points (N, 3) that the camera sees inside its border, with their pixels.
 
-    sweep: the camera's motion while its rows are read out.
+    sweep: the camera's motion while its rows are read out; None: a global shutter.
     """
     seen = points if sweep is None else sweep.seen(points, pose, camera)
     pixels, inside = camera.project(pose.inverse.apply(seen))

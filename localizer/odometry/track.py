@@ -37,7 +37,9 @@ class OdometryStart:
     constraint: PoseConstraint | None
 
     def corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
-        """The constraint without the sensors' constant error, which is measured at the start."""
+        """The constraint without the sensors' constant error, which is known at the start; None:
+        none.
+        """
         if constraint is None or self.constraint is None:
             return constraint
         return without_constant_error(constraint, self.constraint, self.pose)
@@ -66,7 +68,7 @@ class OdometryTrack:
     def predict(
         self, config: OdometryConfig, time_ns: int, constraint: PoseConstraint | None
     ) -> PosePrior:
-        """Predict the pose: constant velocity, with the rotation that the sensors measure."""
+        """Predict the pose: constant velocity, with the sensors' rotation (None: the last one)."""
         dt = seconds(self.time_ns, time_ns)
         rotation, aided = self.pose.rotation, aided_rotation(constraint)
         if aided is not None and self.aided_rotation is not None:

@@ -58,7 +58,8 @@ class Usability:
 
 
 def examine(image: Image, previous: Image | None = None) -> Usability:
-    """Check an image (H, W, 3) uint8 RGB; previous: the stream's image before it.
+    """Check an image (H, W, 3) uint8 RGB. previous: the stream's image before it; None: it is not
+    tested for a frozen video.
 
     Takes a fraction of a millisecond at the working size.
     """

@@ -75,7 +75,9 @@ class SearchSurvivors:
 def registration(
     found: SearchSurvivors, config: JNGOConfig, prior: PosePrior, origin: Array
 ) -> Registration:
-    """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE."""
+    """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE. origin: (3,) of the
+    local frame, world.
+    """
     tangent = None
     if found.sums is not None:
         tangent = sandwich_covariance(found.sums, config.noise, found.prior_weight)

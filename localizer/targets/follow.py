@@ -246,7 +246,7 @@ class ImageFollower:
         return True
 
     def watch(self, gray: Gray, estimate: PoseEstimate, position: Array) -> bool:
-        """Process the next frame of a static target at position (3,), and return `is_changed`."""
+        """Process a frame of a static target at position (3,); returns whether it `is_changed`."""
         chart = self._chart(gray, estimate, position, self._half, course=0.0)
         if chart is not None:
             self._stands.update(estimate.exposure_time_ns, chart)

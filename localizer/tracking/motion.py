@@ -168,8 +168,8 @@ def reset_motion(
 ) -> MotionState:
     """The state's pose at another time with the sigmas of a search and unknown motion.
 
-    It is used for a camera whose clock jumped: the frames are consecutive, their times are not.
-    turn: as in `predict`.
+    Used for a camera whose clock jumped: its frames are consecutive, their times are not. turn: as
+    in `predict`; None: the rotation is kept.
     """
     mean = np.concatenate([state.mean[:3], np.zeros(9)])
     rotation = state.rotation if turn is None else turn @ state.rotation

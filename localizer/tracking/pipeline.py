@@ -127,8 +127,8 @@ def _shrink(image: Image, camera: Camera) -> Image:
 
 
 def mask_unseen_features(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
-    """The features with zero confidence outside the lens's image circle, where anchors would
-    otherwise be compared with black.
+    """The features with zero confidence outside `seen` (H, W), the lens's image circle, where
+    anchors would otherwise be compared with black. seen None: unchanged.
     """
     if seen is None:
         return pyramid

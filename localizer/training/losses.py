@@ -50,9 +50,10 @@ def contrast_loss(
 ) -> Tensor:
     """Cross entropy of finding each anchor's true position (B, N, 2, level pixels) in the query.
 
-    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched
-    completely. On finer ones the negatives are the neighbourhood, which decides the basin of
-    convergence, for `count` of the anchors.
+    reference: (B, N, C) anchor features; query: (B, C, h, w); visible: (B, N) mask; scale: factor
+    of the similarities. Levels of at most `whole_map_cells` are searched completely. On finer ones
+    the negatives are the neighbourhood, which decides the basin of convergence, for `count` of the
+    anchors.
     """
     if query.shape[2] * query.shape[3] <= whole_map_cells:
         loss = _whole_map(reference, query, truth, scale)

@@ -151,7 +151,7 @@ class FrameLog:
         self, sequence: int, time_ns: int, world_from_camera: Pose, true_ns: int | None = None
     ) -> None:
         """Append one frame; it is on disk when this returns. time_ns: by the stream, used to match
-        estimates; true_ns: exposure time, if it differs.
+        estimates; true_ns: exposure time; None: time_ns.
         """
         t, q = world_from_camera.translation, quaternion_from_matrix(world_from_camera.rotation)
         row = (time_ns, sequence, *(f"{x:.5f}" for x in t), *(f"{x:.9f}" for x in q))

@@ -97,7 +97,7 @@ class EkfSample:
 
     @property
     def location(self) -> Location | None:
-        """The location that the EKF reports."""
+        """The location that the EKF reports; None without an origin."""
         return self.origin.offset(*self.position_ned) if self.origin else None
 
 
@@ -168,8 +168,8 @@ def fraction(before_ns: int, after_ns: int, time_ns: int) -> float:
 
 
 def slerp(a: Array, b: Array, t: float) -> Array:
-    """Interpolate two close unit quaternions (20 ms apart): normalised linear interpolation; its
-    error is far below sensor noise.
+    """Interpolate between close unit quaternions a (t = 0) and b (t = 1), 20 ms apart: normalised
+    linear interpolation, whose error is far below sensor noise.
     """
     if float(a @ b) < 0:
         b = -b

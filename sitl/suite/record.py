@@ -100,6 +100,6 @@ class CaseRecord:
         return np.array([n for t, n, _ in self.errors if from_s <= t <= to_s])
 
     def at(self, seconds: float) -> VehicleSample | None:
-        """The first sample at or after a time, otherwise the last one."""
+        """The first sample at or after a time, otherwise the last one; None without samples."""
         later = [s for s in self.samples if s.at_s >= seconds]
         return later[0] if later else (self.samples[-1] if self.samples else None)

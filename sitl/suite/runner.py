@@ -75,7 +75,7 @@ class ReportRow:
 
     @property
     def measured(self) -> Figures | None:
-        """Median, p95 and maximum of the horizontal EKF error over the reference's span."""
+        """Median, p95 and maximum of the EKF error over the reference's span; None: not flown."""
         if self.record is None:
             return None
         span = self.reference or AccuracyExpectation(check="reference", median=1.0)

@@ -166,7 +166,7 @@ def open_vehicle(
 ) -> VehicleProcess:
     """Create a vehicle that is not started yet; "auto" is ArduPilot if its binary is found.
 
-    home: altitude AMSL.
+    home: altitude AMSL. setup: None: the defaults.
     """
     s = setup or VehicleSetup()
     if s.px4 and kind == "ardupilot":

@@ -59,13 +59,15 @@ class TileRecord:
 
 
 class Staging:
-    """The folder `<out>.building`: tile files and one record per finished source tile."""
+    """The folder `<out>.building`: tile files and one record per finished source tile. key: number
+    of a source tile in the tree's order.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def record(self, key: int) -> TileRecord | None:
-        """The record of a finished source tile whose files exist."""
+        """The record of a finished source tile; None if it or a file of it is missing."""
         try:
             data = json.loads(self._record_path(key).read_bytes())
             tiles = tuple(_stored_from_json(t) for t in data["tiles"])

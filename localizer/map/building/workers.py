@@ -26,7 +26,9 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ImportJob:
-    """Data of a worker besides the tile. frame: the cache's world; lift_m: added to heights."""
+    """Data of a worker besides the tile. frame: the cache's world; lift_m: added to heights. key:
+    number of a source tile in the tree's order.
+    """
 
     staged: Staging
     frame: LocalFrame

@@ -71,7 +71,7 @@ class Manifest(BaseModel):
 
     @property
     def imagery_date(self) -> str | None:
-        """Date of the imagery; older builds kept it among other options."""
+        """Date of the imagery, None if unknown; older builds kept it among other options."""
         stated = self.build.get("imagery_date") if self.kind is None else self.kind.imagery_date
         return str(stated) if re.fullmatch(IMAGERY_DATE, str(stated)) else None
 
@@ -228,7 +228,9 @@ def encode_tile(
     repeat: bool = False,
     finest_jpeg: bytes | None = None,
 ) -> bytes:
-    """Encode a tile file. finest_jpeg: the source's JPEG of mips[0], stored unchanged."""
+    """Encode a tile file. positions, uvs, faces, mips, repeat: as in `TileMesh`. finest_jpeg: the
+    source's JPEG of mips[0], stored unchanged; None: mips[0] is encoded.
+    """
     arrays: dict[str, NDArray[Any]] = {
         "positions": np.ascontiguousarray(positions, np.float32),
         "uvs": np.ascontiguousarray(uvs, np.float32),

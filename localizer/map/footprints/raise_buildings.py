@@ -63,7 +63,9 @@ class RaiseResult:
 
 
 def read_footprints(path: Path, height_property: str | None = None) -> Footprints:
-    """Read footprints of a GeoJSON or CityGML file, by its suffix."""
+    """Read footprints of a GeoJSON or CityGML file, by its suffix. height_property: of GeoJSON, see
+    `read_geojson`.
+    """
     if path.suffix.lower() in _GML:
         return read_citygml(path)
     return read_geojson(path, height_property)

@@ -270,8 +270,9 @@ def height_band(
     nodata: float | None,
     rules: ImportRules,
 ) -> tuple[HeightBand, list[str]]:
-    """Conversion of the DSM's numbers to metres; an unknown unit is an error. `GeoreferenceError`
-    for the unit, `MapSourceError` if scale and offset give no heights.
+    """Conversion of the DSM's numbers to metres, and warnings. height_unit, nodata: given by the
+    user, or None. `GeoreferenceError` for an unknown unit, `MapSourceError` if scale and offset
+    give no heights.
     """
     unit, warnings = stated.unit_m, []
     if height_unit is not None:

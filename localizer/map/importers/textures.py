@@ -21,8 +21,8 @@ _BLOCK = 4  # texels per colour of a palette, so that bilinear look-up at its ce
 
 
 def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
-    """(width, height) and format of a picture, from its header. `MapSourceError` if it cannot be
-    read.
+    """(width, height) and format (None: unknown) of an image, from its header. `MapSourceError` if
+    it cannot be read.
     """
     try:
         with PillowImage.open(io.BytesIO(data)) as header:
@@ -43,8 +43,8 @@ def require_readable(path: Path, rules: ImportRules) -> None:
 
 
 def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
-    """RGB image (h, w, 3) of JPEG, PNG or WebP bytes, and the bytes again when they are JPEG.
-    `MapSourceError` if it cannot be decoded.
+    """RGB image (h, w, 3) of JPEG, PNG or WebP bytes, and the bytes again if they are JPEG, else
+    None. `MapSourceError` if it cannot be decoded.
     """
     (width, height), kind = picture_size(data)
     rules.require("texels", float(width) * height, f"a texture of {width}x{height}")

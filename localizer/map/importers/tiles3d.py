@@ -104,7 +104,7 @@ def read_tileset(
     path: Path, rules: ImportRules | None = None, up_axis: UpAxis | None = None
 ) -> SourceTree:
     """Read `tileset.json` (or the folder that holds it) and every tileset it refers to. up_axis: of
-    its glTF, whatever it says itself. `MapSourceError` if one cannot be read or is malformed.
+    its glTF; None: as the tileset says. `MapSourceError` if one cannot be read or is malformed.
     """
     try:
         return _read_tileset(path, rules or ImportRules(), up_axis)

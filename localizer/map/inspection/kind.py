@@ -53,8 +53,8 @@ def measure_kind(
     imagery_date: str | None = None,
     sensor: str | None = None,
 ) -> MapKind:
-    """Measure the kind from vertical views of samples. heights: given by the user instead of
-    measured.
+    """Measure the kind from vertical views of samples. heights: given by the user; None: measured.
+    imagery_date, sensor: stored as given.
     """
     with TileStreamer(cache) as streamer:
         renderer = NumbaRenderer(streamer, 1)

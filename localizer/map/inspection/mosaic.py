@@ -35,7 +35,7 @@ class Mosaic:
         return self.west + column * self.gsd_m, self.north - row * self.gsd_m
 
     def pixel(self, east: float, north: float) -> tuple[float, float]:
-        """(row, column) of a position."""
+        """(row, column) of a position (world metres)."""
         return (self.north - north) / self.gsd_m, (east - self.west) / self.gsd_m
 
 

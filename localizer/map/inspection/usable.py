@@ -74,7 +74,9 @@ def usable_part(
 
 
 def largest_rectangle(good: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    """First and last (exclusive) row, likewise column, of the largest all-true rectangle."""
+    """First and last (exclusive) row, then column, of the largest all-true rectangle; None: no cell
+    is true.
+    """
     best, found = 0, None
     above = np.zeros(good.shape[1], np.int64)
     for row, line in enumerate(good):

@@ -307,7 +307,7 @@ class NumbaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """See `Backend.refine`."""
         R = np.array(rotations, dtype=np.float64, order="C")
         t = np.array(translations, dtype=np.float64, order="C")
         M, N = len(R), problem.points.shape[1]

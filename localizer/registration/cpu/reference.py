@@ -96,7 +96,7 @@ def projection_jacobian(problem: LevelProblem, x: Array, translation: Array) -> 
 def linearize(
     problem: LevelProblem, rotation: Array, translation: Array, settings: LMSettings
 ) -> Linearization:
-    """Score, gradient and Gauss-Newton Hessian at one pose."""
+    """Score, gradient and Gauss-Newton Hessian at one pose camera_from_local."""
     x, uv = project(problem, rotation, translation)
     u, v = uv.T
     visible = in_view(problem, x, uv)
@@ -167,7 +167,7 @@ def prior_terms(
 
 
 def retract(rotation: Array, translation: Array, step: Array) -> tuple[Array, Array]:
-    """Equation 5: rotate about the local origin, then translate; both in camera axes."""
+    """Equation 5: rotate about the local origin, then translate by step (rho, phi), camera axes."""
     return so3_exp(step[3:]) @ rotation, translation + step[:3]
 
 
@@ -210,7 +210,7 @@ class ReferenceBackend:
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """See `Backend.refine`."""
         R, t = rotations.copy(), translations.copy()
         scores, overlaps = np.empty(len(R)), np.empty(len(R))
         evaluations = 0

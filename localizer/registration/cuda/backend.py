@@ -56,7 +56,7 @@ class CudaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """See `Backend.refine`."""
         M = len(rotations)
         with self.lock:
             self.device.activate()

@@ -30,7 +30,7 @@ def geometry(
 
 
 def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) -> Array:
-    """`CovarianceSums.motion` of a level's geometry at a pose."""
+    """`CovarianceSums.motion` of a level's geometry at a pose camera_from_local."""
     x, uv = project(problem, rotation, translation)
     visible = in_view(problem, x, uv)
     return mean_motion(projection_jacobian(problem, x[visible], translation))

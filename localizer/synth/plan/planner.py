@@ -43,9 +43,7 @@ class Occupancy:
         cv2.polylines(self.grid, [self._pixels(points)], False, 1, thickness)
 
     def occupy(self, polygon: ArrayLike, margin: ArrayLike | None = None) -> bool:
-        """Occupy a polygon if it (or `margin`, a larger one around it) is free; returns whether it
-        was.
-        """
+        """Occupy a polygon if it (or `margin`, a larger one around it) is free; True if it was."""
         test = self._pixels(polygon if margin is None else margin)
         low, high = test.min(0), test.max(0) + 1
         n = self.grid.shape[0]

@@ -92,7 +92,7 @@ class StreetNet:
     edge_street: dict[tuple[tuple[int, int], tuple[int, int]], Street]
 
     def side(self, a: tuple[int, int], b: tuple[int, int]) -> Street | None:
-        """The street between two neighbouring lattice nodes, if there is one."""
+        """The street between two neighbouring lattice nodes; None without one."""
         return self.edge_street.get((min(a, b), max(a, b)))
 
 

@@ -96,7 +96,7 @@ class FlightDay:
 
 
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
-    """Yield all training pairs of the place of `seed`."""
+    """Yield all training pairs of the place of `seed`. library: None: generated ground only."""
     rng = np.random.default_rng(seed)
     place, source = draw_place(rng, config, library)
     survey = survey_scene(rng, place, config)
@@ -174,8 +174,8 @@ def flight_day_scene(
     visit: FlightDay,
     light: SkyLight | None,
 ) -> tuple[LitScene, bool]:
-    """The place on the flight day, and whether its season differs from the map's; a given light
-    also keeps the season.
+    """The place on the flight day, and whether its season differs from the map's. light: keeps this
+    light and the map's season; None: both are drawn.
     """
     land, prisms, season = place.land, list(place.prisms), False
     condition, outdated = visit.weather, visit.outdated

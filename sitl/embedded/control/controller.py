@@ -209,7 +209,9 @@ class PositionController:
     def thrust(
         self, wanted_down: float, velocity_down: float, tilt_cosine: float, dt: float
     ) -> float:
-        """Total thrust (N) for a down-velocity target (m/s). tilt_cosine: cosine of the tilt."""
+        """Total thrust (N) from wanted and present down velocity (m/s). tilt_cosine: of the
+        tilt.
+        """
         error = wanted_down - velocity_down
         self._integral[2] = min(max(self._integral[2] + _CLIMB_I * error * dt, -3.0), 3.0)
         down = min(max(_CLIMB_P * error + self._integral[2], -5.0), 4.0)

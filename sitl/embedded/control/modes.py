@@ -106,7 +106,9 @@ class FlightModes:
         self._guidance.set_point = None
 
     def takeoff(self, height_m: float) -> bool:
-        """MAV_CMD_NAV_TAKEOFF: climb to a height above home; only on the ground in GUIDED."""
+        """MAV_CMD_NAV_TAKEOFF: climb to a height above home. False unless armed on the ground in
+        GUIDED.
+        """
         if not (self.armed and self.mode is Mode.GUIDED and not self._flying):
             return False
         self._begin_takeoff(height_m)
@@ -122,7 +124,7 @@ class FlightModes:
         return True
 
     def go_to_local(self, target: Vector, yaw_rad: float | None = None) -> bool:
-        """Fly to NED metres from the EKF origin; False if the vehicle does not fly in GUIDED."""
+        """Fly to NED metres from the EKF origin (yaw_rad None: keep it); False outside GUIDED."""
         if not self._guided:
             return False
         self._guidance.fly(target)

@@ -85,7 +85,7 @@ class Jammer:
 
 
 class Sensors:
-    """All sensors of one vehicle."""
+    """All sensors of one vehicle. x: its true state (17,)."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)

@@ -81,7 +81,9 @@ def fly(
     case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
     participant: FlightParticipant | None = None,
 ) -> LoopRecord:  # fmt: skip
-    """Fly a case; `out` receives the logs. `SimulationError` if it could not be flown."""
+    """Fly a case; `out` receives the logs. seed: of world, light and errors. participant: None:
+    nobody takes part. `SimulationError` if it could not be flown.
+    """
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         flight = _LoopFlight(case, assets, kind, seed, out, stack, participant)
