@@ -73,9 +73,10 @@ def alignment_loss(
 ) -> tuple[Tensor, Tensor]:
     """Eq. 3: Barron's loss of the reprojection error after each LM iteration on one level.
 
-    reference: anchor features (B, N, C) and confidences (B, N); query: maps (B, C, h, w) and
-    (B, h, w); start: (B, 4, 4) initial query_from_reference. Returns the loss and each pair's pixel
-    error (B,) (image pixels, mean over visible anchors) after the last iteration.
+    reference: anchor features (B, N, C) and confidences (B, N); query: maps (B, C, h, w) and (B, h,
+    w) of a level of this stride; start: (B, 4, 4) initial query_from_reference. Returns the loss
+    and each pair's pixel error (B,) (image pixels, mean over visible anchors) after the last
+    iteration.
     """
     pose = start
     total = reference[0].new_zeros(())

@@ -25,7 +25,11 @@ NO_PARAMS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass
 class Shell:
-    """Collects the surfaces of one building in its own frame: x along, y across, z up from base."""
+    """Collects the surfaces of one building in its own frame: x along, y across, z up from base.
+
+    Lengths in metres; x, y, z: lowest and highest coordinate; eaves, top: z; pitch: of roofs, rad;
+    levels: bits of the levels of detail that show a surface.
+    """
 
     building: Building
     surfaces: list[Surface] = field(default_factory=list)

@@ -202,7 +202,9 @@ def _draw_prism(
 def cast_shadows(
     height: Float32, cell: float, sx: float, sy: float, sz: float, relief: float
 ) -> Float32:
-    """(n, n) float32: 1 where the sun is seen, 0 in cast shadow."""
+    """(n, n) float32: 1 where the sun (unit vector sx, sy, sz) is visible, 0 in cast shadow. cell:
+    side of a cell, m; relief: largest height difference, m.
+    """
     n = height.shape[0]
     out = np.ones((n, n), np.float32)
     flat = max(np.sqrt(sx * sx + sy * sy), 1e-4)

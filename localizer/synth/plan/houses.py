@@ -1,4 +1,4 @@
-"""Cells of detached houses: plots, gardens, fences, allotments."""
+"""Cells of detached houses: plots, gardens, fences, allotments; functions as in `country`."""
 
 from __future__ import annotations
 

@@ -69,7 +69,9 @@ class Occupancy:
 
 @dataclass
 class Planner:
-    """The state of planning one world."""
+    """The state of planning one world. Lengths in metres, angles in radians from east, positions
+    ENU.
+    """
 
     config: WorldConfig
     terrain: Terrain

@@ -1,4 +1,7 @@
-"""Urban cells besides houses: centre, blocks, industry, sports, parks; and the streets' edges."""
+"""Urban cells besides houses: centre, blocks, industry, sports, parks; and the streets' edges.
+
+Functions as in `country`.
+"""
 
 from __future__ import annotations
 

@@ -54,7 +54,9 @@ class TilePart:
 
 @dataclass
 class Baker:
-    """Paints the tiles of one scene into a folder. Belongs to one process."""
+    """Paints the tiles of one scene into a folder. Belongs to one process. west, north: edges, ENU
+    m.
+    """
 
     scene: TileScene
     folder: Path
