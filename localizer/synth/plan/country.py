@@ -1,6 +1,6 @@
 """Cells outside the town: fields, woods, meadows, orchards, farms, the riverside.
 
-Each ``plan_`` function fills one cell (i, j) of the street lattice and adds the result to `planner`;
+Each ``plan_`` function fills one cell (i, j) of the street lattice and adds to `planner`.
 outline: (N, 2) of the cell, ENU metres, counter-clockwise.
 """
 
