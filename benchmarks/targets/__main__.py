@@ -89,7 +89,7 @@ def measure(
         if time_ns - began_ns > _LOOKED_S * 1e9:
             continue
         count += 1
-        fix = track.see(told, pixel)
+        fix = track.observe(told, pixel)
         if fix is None:
             refused += 1
             continue

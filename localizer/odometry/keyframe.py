@@ -113,7 +113,7 @@ def in_view(
 
     sweep: the camera's motion while its rows are read out; None: a global shutter.
     """
-    seen = points if sweep is None else sweep.seen(points, pose, camera)
+    seen = points if sweep is None else sweep.apparent_points(points, pose, camera)
     pixels, inside = camera.project(pose.inverse.apply(seen))
     pixels, points = pixels[inside], points[inside]
     border = max(2.0, _BORDER_SHARE * min(camera.width, camera.height))

@@ -131,6 +131,6 @@ def apply_sweep(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camer
     if sweep is None or len(anchors.points_world) == 0:
         return anchors
     depth_m = float(np.linalg.norm(anchors.points_world.mean(axis=0) - pose.translation))
-    if not sweep.matters(camera, depth_m):
+    if not sweep.displaces_pixels(camera, depth_m):
         return anchors
-    return replace(anchors, points_world=sweep.seen(anchors.points_world, pose, camera))
+    return replace(anchors, points_world=sweep.apparent_points(anchors.points_world, pose, camera))

@@ -131,7 +131,7 @@ def _pixel_shifts(
         tangential * f * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1),
     ]
     if sweep is not None and camera.readout_ms > 0:
-        swept, _ = camera.project(pose.inverse.apply(sweep.seen(points, pose, camera)))
+        swept, _ = camera.project(pose.inverse.apply(sweep.apparent_points(points, pose, camera)))
         columns.append((swept - pixels) * (sigmas.readout_ms / camera.readout_ms))
     shifts: Array = np.nan_to_num(np.stack(columns, axis=2))
     return shifts

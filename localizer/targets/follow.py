@@ -24,7 +24,7 @@ from localizer.targets.foreground import (
     is_ground,
 )
 from localizer.targets.standing import StaticAppearance
-from localizer.targets.track import projected
+from localizer.targets.track import pixel_of
 from localizer.types import PoseEstimate
 
 Gray = NDArray[np.uint8]
@@ -134,7 +134,7 @@ class ImageFollower:
             return None
         self._usual += _LATELY * (best[0] - self._usual)
         position = expected + self._on_ground(best[1] * self._cell)
-        pixel = projected(estimate, position)
+        pixel = pixel_of(estimate, position)
         if pixel is None:
             return None
         self._course += turn
@@ -180,7 +180,7 @@ class ImageFollower:
         if best is None:
             return can_tell, None
         position = expected + self._on_ground(best.offset * self._cell)
-        pixel = projected(estimate, position)
+        pixel = pixel_of(estimate, position)
         if pixel is None:
             return can_tell, None
         self._course += turn

@@ -142,7 +142,7 @@ class StaticTarget:
         return True
 
     @property
-    def strain(self) -> float:
+    def residual_ratio(self) -> float:
         """Squared ratio of the newest residuals to their expected errors, at least 1."""
         n = len(self._recent)
         return max(1.0, sum(self._recent) / (2 * n)) if n else 1.0

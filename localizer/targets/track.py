@@ -60,7 +60,7 @@ class TargetSettings:
 
 
 class TargetTrack:
-    """Track of one target; not thread-safe. refusal: why the last `see` gave no position."""
+    """Track of one target; not thread-safe. refusal: why the last `observe` gave no position."""
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id = target_id
@@ -86,7 +86,7 @@ class TargetTrack:
         """(3,) m/s, world axes, of a moving target; None otherwise."""
         return self._moving.velocity if self._moves else None
 
-    def see(
+    def observe(
         self,
         estimate: PoseEstimate,
         pixel: tuple[float, float],
@@ -171,7 +171,7 @@ class TargetTrack:
         if float(np.sqrt(np.trace(P))) > self._settings.max_sigma_m:
             return None
         bias = self._settings.bias.covariance(position - estimate.world_from_camera.translation)
-        pixel = projected(estimate, position)
+        pixel = pixel_of(estimate, position)
         fix = TargetFix(
             self._id, position, P + bias + self._aim, pixel,
             estimate.exposure_time_ns, 0.0, self._moving.velocity,
@@ -185,7 +185,7 @@ class TargetTrack:
             return None
         fix = self._standing(estimate, None)
         away = fix.position_world - estimate.world_from_camera.translation
-        pixel = projected(estimate, fix.position_world)
+        pixel = pixel_of(estimate, fix.position_world)
         if pixel is None:
             return replace(fix, visibility=Visibility.OUTSIDE)
         sigma = float(np.sqrt(away @ fix.covariance @ away)) / float(np.linalg.norm(away))
@@ -193,7 +193,7 @@ class TargetTrack:
         seen = Visibility.HIDDEN if is_hidden else Visibility.HELD
         return replace(fix, pixel=pixel, visibility=seen)
 
-    def is_hiding(self, estimate: PoseEstimate, position: Array) -> bool:
+    def is_being_hidden(self, estimate: PoseEstimate, position: Array) -> bool:
         """Whether the map hides a moving target at (3,) now or within half a second.
 
         Observations of a half hidden target are biased to its visible side.
@@ -222,7 +222,7 @@ class TargetTrack:
         covariance, elsewhere = bias.copy(), 0.0
         for place in places:
             offset = place.position - best.position
-            spread = self._static.strain * place.covariance
+            spread = self._static.residual_ratio * place.covariance
             covariance += place.weight * (spread + np.outer(offset, offset))
             if offset @ np.linalg.solve(best.covariance + bias, offset) > _ELSEWHERE:
                 elsewhere += place.weight
@@ -276,7 +276,7 @@ def _aim(
     return surface_covariance(offset, normal, spread, 0.0)
 
 
-def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
+def pixel_of(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
     """Pixel of a world point (3,) in a frame; None outside the image.
 
     A lens model may project a point far outside the view into the image. So the pixel counts only

@@ -21,7 +21,7 @@ _GAMMA, _QUALITY = 2.2, 70
 _MOST_GAIN = 16.0
 
 
-def darkened(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
+def darken(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
     """An image (H, W, 3) as the camera takes it with the share `light` of the light: amplified by
     at most most_gain, with noise, coded as JPEG. An image below the native width counts as binned.
     """
@@ -84,7 +84,7 @@ class VideoFaultInjector:
             return self._even(image, _BLINDED_LEVEL, _BLINDED_NOISE)
         if self._fault is not None and kind == "darkens":
             halvings = (time_ns - self._began_ns) * 1e-9 / self._fault.seconds
-            return darkened(image, 0.5**halvings, _MOST_GAIN, self._rng)
+            return darken(image, 0.5**halvings, _MOST_GAIN, self._rng)
         return image
 
     def stamp(self, exposure_ns: int) -> int:

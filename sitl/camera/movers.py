@@ -67,7 +67,7 @@ class Mover:
         return np.asarray(chord / max(float(np.linalg.norm(chord)), 1e-9))
 
 
-def there_and_back(lane: ArrayLike, out_m: float, back_m: float) -> Array:
+def round_trip(lane: ArrayLike, out_m: float, back_m: float) -> Array:
     """Closed path (2 N, 3) from an open lane (N, 3): forward with an offset of `out_m` to the right
     of the lane, then back with an offset of `back_m` to the right of that direction.
     """

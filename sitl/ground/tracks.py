@@ -142,7 +142,7 @@ class SampleTrack(Generic[_Sample]):
                 del self._times[: self._limit]
                 del self._samples[: self._limit]
 
-    def around(self, time_ns: int) -> tuple[_Sample, _Sample] | None:
+    def neighbours(self, time_ns: int) -> tuple[_Sample, _Sample] | None:
         """The samples before and after a time, for interpolation; None outside the track."""
         with self._lock:
             i = bisect.bisect_left(self._times, time_ns)
@@ -150,7 +150,7 @@ class SampleTrack(Generic[_Sample]):
                 return None
             return self._samples[max(i - 1, 0)], self._samples[i]
 
-    def all(self) -> list[_Sample]:
+    def samples(self) -> list[_Sample]:
         """A copy of the track."""
         with self._lock:
             return list(self._samples)

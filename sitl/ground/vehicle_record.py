@@ -105,14 +105,14 @@ class VehicleRecord:
 
     def truth_at(self, time_ns: int) -> Truth | None:
         """The true state at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
-        pair = self._truth.around(time_ns)
+        pair = self._truth.neighbours(time_ns)
         if pair is None:
             return None
         return interpolate(*pair, time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalState | None:
         """The gimbal at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
-        pair = self._gimbal.around(time_ns)
+        pair = self._gimbal.neighbours(time_ns)
         if pair is None:
             return None
         a, b = pair
@@ -127,9 +127,9 @@ class VehicleRecord:
     def ekf_pairs(self) -> Iterator[tuple[EkfSample, Location]]:
         """Yield every reported EKF position with the true location at the same time."""
         # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
-        truth = self._truth.all()
+        truth = self._truth.samples()
         times = np.array([t.boot_s for t in truth])
-        for sample in self._ekf.all():
+        for sample in self._ekf.samples():
             i = int(np.searchsorted(times, sample.boot_s))
             if sample.location is None or not 0 < i < len(times):
                 continue

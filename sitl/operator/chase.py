@@ -14,7 +14,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.synth.tiles.props import CAR_COLOURS, CAR_LENGTH_M, car_mesh
 from localizer.synth.world import WorldInfo
-from sitl.camera.movers import Mover, there_and_back
+from sitl.camera.movers import Mover, round_trip
 
 CAR = "followed car"
 SPEED_MPS = 6.0
@@ -63,7 +63,7 @@ def make_chase(
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
     best: tuple[float, Array, float] | None = None
     for lane in world.roads:
-        path = there_and_back(lane, 0.0, _OTHER_LANE_M)
+        path = round_trip(lane, 0.0, _OTHER_LANE_M)
         path[:, 2] = world.ground_height(path[:, 0], path[:, 1])
         path = frame_from_world.apply(path)
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)

@@ -103,7 +103,7 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
     warnings = [f"{path.name}: {text}" for text in doubts]
     text = georeference.far_outside(np.array([low, high]))
     if text is not None:
-        warnings.append(options.rules.doubt("area", f"{path}: {text}"))
+        warnings.append(options.rules.accept("area", f"{path}: {text}"))
     elif (unsure := georeference.datum_doubt(np.array([low, high]))) is not None:
         warnings.append(f"{path.name}: {unsure}")
     if georeference.unread:

@@ -96,7 +96,7 @@ class _Page:
     asked: dict[str, Any] | None
 
     @classmethod
-    def got(cls, url: str, asked: dict[str, Any] | None, client: HttpClient) -> _Page:
+    def request(cls, url: str, asked: dict[str, Any] | None, client: HttpClient) -> _Page:
         """Request a page."""
         answer = client.get(url) if asked is None else client.post(url, asked)
         return cls(url, json.loads(answer.data), asked)
@@ -111,7 +111,7 @@ class _Page:
                 if str(link.get("method", "GET")).upper() == "POST":
                     earlier = (self.asked or {}) if link.get("merge") else {}
                     asked = {**earlier, **(link.get("body") or {})}
-                return _Page.got(urljoin(self.url, link["href"]), asked, client)
+                return _Page.request(urljoin(self.url, link["href"]), asked, client)
         return None
 
 
@@ -125,12 +125,12 @@ def _first_page(source: CatalogueSource, area: Area, client: HttpClient) -> _Pag
         asked: dict[str, Any] = {"bbox": box, "limit": _PAGE}
         if source.layer:
             asked["collections"] = [source.layer]
-        return _Page.got(urljoin(f"{home}/", methods["POST"]), asked, client)
+        return _Page.request(urljoin(f"{home}/", methods["POST"]), asked, client)
     parameters = {"bbox": ",".join(f"{v:.7f}" for v in box), "limit": str(_PAGE)}
     if source.layer:
         parameters["collections"] = source.layer
     there = urljoin(f"{home}/", methods.get("GET", f"{home}/search"))
-    return _Page.got(f"{there}?{urlencode(parameters)}", None, client)
+    return _Page.request(f"{there}?{urlencode(parameters)}", None, client)
 
 
 def _walked(source: CatalogueSource, area: Area, client: HttpClient) -> Iterator[Any]:

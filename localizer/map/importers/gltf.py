@@ -230,7 +230,7 @@ class _Document:
         node = item(self._json.get("nodes", []), index, "node")
         T = parent @ _node_matrix(node)
         if "mesh" in node and np.linalg.det(T[:3, :3]) < 0:
-            self._rules.doubt("mirrored", f"node {index} mirrors its mesh: left becomes right")
+            self._rules.accept("mirrored", f"node {index} mirrors its mesh: left becomes right")
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             raise MapSourceError("uses EXT_mesh_gpu_instancing, not supported")
         if "mesh" in node:

@@ -48,7 +48,7 @@ def check_heights(
         values, counts = np.unique(odd, return_counts=True)
         value = float(values[counts.argmax()])
         warnings.append(
-            rules.doubt(
+            rules.accept(
                 "heights",
                 f"{path}: {100 * len(odd) / len(known):.2g} % of its heights occur nowhere on "
                 f"Earth, most often {value:g}: missing heights that are not marked so (--nodata="
@@ -85,7 +85,7 @@ def _fill(path: Path, known: Array, band: HeightBand, rules: ImportRules) -> lis
         gap = abs(band.gain) * float(np.abs(rest - extreme).min())
         if gap > _FILL_GAP_M:
             warnings.append(
-                rules.doubt(
+                rules.accept(
                     "nodata",
                     f"{path}: {100 * share:.2g} % of its heights are {extreme:g}, with nothing "
                     f"within {gap:.0f} m of it: missing heights that are not marked so? (--nodata="
@@ -107,7 +107,7 @@ def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportR
     if share < _STEEP_SHARE:
         return []
     return [
-        rules.doubt(
+        rules.accept(
             "slope",
             f"{path}: {100 * share:.0f} % of its cells rise by more than 80 degrees: noise, "
             "another unit (--height-unit), or not heights",
@@ -206,7 +206,7 @@ def check_overlap(
     if share == 0.0:
         raise MapSourceError(f"{text}: it lies beside it; check both places and CRS")
     if share < _LEAST_OVERLAP:
-        return [rules.doubt("overlap", f"{text}; check both places and CRS")]
+        return [rules.accept("overlap", f"{text}; check both places and CRS")]
     return [text]
 
 

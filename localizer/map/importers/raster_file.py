@@ -171,7 +171,7 @@ def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
         )
     text = far_outside(crs, lon, lat)
     if text is not None:
-        return [rules.doubt("area", f"{path}: {text}")]
+        return [rules.accept("area", f"{path}: {text}")]
     unsure = datum_doubt(crs, float(np.mean(lon)), float(np.mean(lat)))
     return [] if unsure is None else [f"{path.name}: {unsure}"]
 
@@ -279,7 +279,7 @@ def height_band(
         given = unit_of(height_unit)
         if unit is not None and abs(given / unit - 1) > 1e-4:
             warnings.append(
-                rules.doubt(
+                rules.accept(
                     "datum",
                     f"{path}: --height-unit {height_unit}, but the file says units of {unit:g} m",
                 )

@@ -278,7 +278,7 @@ class _Reader:
         text = transform_warning(T)
         if text is not None:
             name = "mirrored" if np.linalg.det(T[:3, :3]) < 0 else "scaled"
-            self.warnings.append(self.rules.doubt(name, f"{path}: a tile's transform {text}"))
+            self.warnings.append(self.rules.accept(name, f"{path}: a tile's transform {text}"))
         return T
 
 

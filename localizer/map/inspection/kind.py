@@ -90,7 +90,7 @@ def _heights(sampler: _Sampler) -> Heights:
     points, standing, known = [], 0, 0
     for centre, view in sampler.views(_SQUARES, _CELLS, _CELL_M):
         shown = np.isfinite(view.height)
-        standing += int(objects(view.height, _CELL_M).sum())
+        standing += int(object_mask(view.height, _CELL_M).sum())
         known += int(shown.sum())
         rows, columns = (cells[::37] for cells in np.nonzero(shown))
         east = centre[0] + (columns + 0.5 - _CELLS / 2) * _CELL_M
@@ -101,7 +101,7 @@ def _heights(sampler: _Sampler) -> Heights:
     return "flat" if not points or _from_plane_m(np.concatenate(points)) < _FLAT_M else "terrain"
 
 
-def objects(height: Float32, cell_m: float) -> NDArray[np.bool_]:
+def object_mask(height: Float32, cell_m: float) -> NDArray[np.bool_]:
     """Cells of a height grid (h, w), NaN where unknown, that belong to buildings or trees: narrower
     than 60 m, higher than 2 m, most of the border steep.
     """
@@ -143,7 +143,7 @@ def _resolution(sampler: _Sampler, texel_m: float) -> float:
             grey = view.rgb.mean(axis=2, dtype=np.float32)
             if grey.std() > 2.0:
                 spectra.append(_spectrum(grey))
-    return texel_m / (2 * resolved(np.median(spectra, axis=0))) if spectra else texel_m
+    return texel_m / (2 * resolution_limit(np.median(spectra, axis=0))) if spectra else texel_m
 
 
 def _spectrum(grey: Float32) -> Array:
@@ -163,7 +163,7 @@ def _frequencies() -> Array:
     return (np.arange(_BANDS) + 0.5) / (2 * _BANDS)
 
 
-def resolved(power: Array) -> float:
+def resolution_limit(power: Array) -> float:
     """Spatial frequency, cycles a texel up to 0.5, above which an image with this spectrum has no
     detail.
 

@@ -66,10 +66,9 @@ class Pair:
 @dataclass(frozen=True)
 class SceneConfig:
     """Size and variety of the scenes and views. light_variety False keeps the map's own light and
-    season in the query (the ablation of the paper's Table 4). cell_m: range of the size of a cell,
-    which sets the altitude. conditions: of each light in turn when given (`visit_of`), as many as
-    there are lights; else drawn. motion: metres and
-    degrees between the two views, exactly, instead of the training's mixture.
+    season in the query (the ablation of the paper's Table 4). cell_m: range of a cell's size, which
+    sets the altitude. conditions: one for each light in turn (`named_conditions`); empty: drawn.
+    motion: exact metres and degrees between the two views; None: the training's mixture.
     """
 
     cells: int = 1024
@@ -105,7 +104,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
     for k in range(config.references):
         if lived is None or k % config.queries_per_light == 0:
             if config.conditions:
-                visit = visit_of(rng, config.conditions[k // config.queries_per_light])
+                visit = named_conditions(rng, config.conditions[k // config.queries_per_light])
             else:
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
@@ -223,7 +222,7 @@ def draw_condition(rng: np.random.Generator) -> str:
     return str(rng.choice(CONDITIONS, p=(0.42, 0.15, 0.17, 0.1, 0.08, 0.08)))
 
 
-def visit_of(rng: np.random.Generator, condition: str) -> FlightDay:
+def named_conditions(rng: np.random.Generator, condition: str) -> FlightDay:
     """Conditions of a named test: a weather, `SEASON`, `OUTDATED`, or any weather with both
     (`COMBINED`).
     """
