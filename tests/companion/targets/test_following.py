@@ -361,7 +361,7 @@ def test_a_car_that_comes_out_where_it_must_is_found_at_once(monkeypatch):
 @pytest.mark.parametrize("refused_s", [6.0, 1.0])
 def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeypatch, refused_s):
     """It was neither told nor ended: the operator heard of it no more."""
-    see = TargetTrack.see
+    see = TargetTrack.observe
 
     def refuses(track, estimate, pixel, **known):
         if 2_300 <= estimate.exposure_time_ns // MS < 2_300 + 1_000 * refused_s:
@@ -369,7 +369,7 @@ def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeyp
             return None
         return see(track, estimate, pixel, **known)
 
-    monkeypatch.setattr(TargetTrack, "see", refuses)
+    monkeypatch.setattr(TargetTrack, "observe", refuses)
     flown = _flown(_Drives, monkeypatch, 75, (0.9, 0.95))
     is_lost = refused_s > 4.0
     lost = alert(AlertId.TARGET_NOT_LOCATED, number=1, why="no map at its place")
