@@ -36,10 +36,12 @@ tells the EKF to jump |
 | inhibit | injection and the switch to the vision source set do not start. Injection that runs \
 continues. After a crash before injection and a restart within 10 min, the alert is still active |
 | one-off | the alert reports one moment; nothing has to end |
-| good GNSS | a 3D fix, and neither `gnss_refused` nor `gnss_vision_mismatch` |
+| good GNSS | GNSS has a 3D fix, and neither `gnss_refused` nor `gnss_vision_mismatch` is active |
 | take over | On the ground: wait, and do not take off on vision. In flight: if the EKF uses good \
 GNSS, do nothing; if GNSS is good but not used, select the GNSS source set; without good GNSS \
 change to ALT_HOLD or STABILIZE (PX4: Altitude, Stabilized), which need no position |
+| compare with landmarks | compare the position on the ground station's map with what the pilot or \
+the video shows. If it is wrong, take over |
 | in flight | armed, and 3 m or more above or below the take-off height |
 | sigma | one standard deviation; + 4 sigma: of the compared values |
 | message | the value of `bridge.injection.message` |

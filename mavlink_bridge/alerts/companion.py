@@ -115,7 +115,8 @@ HEALTH: tuple[AlertSpec, ...] = (
           f"the supervisor starts it again at once; {_NO_FIX} for some seconds", _TAKE_OVER),
     event(A.COMPANION_WAITS, CRITICAL, "companion {how} ({what}), again in {seconds:.0f} s",
           {"how": ProcessFault, "what": "name", "seconds": "s"},
-          "the same for the fifth time in 5 min, and no standby process is ready",
+          "with `companion run --supervised`: the flight process crashed, was killed or hung for "
+          "the fifth time in 5 min, and no standby process is ready",
           f"the supervisor starts it again after N (2 to 30 s); {_NO_FIX} until then", _TAKE_OVER),
     event(A.DEPLOYMENT_LOST, WARNING, "deployment file lost, flown as before", {},
           "at a restart after a crash the deployment file is invalid or cannot be read",

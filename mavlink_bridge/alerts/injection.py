@@ -141,13 +141,13 @@ INJECTION: tuple[AlertSpec, ...] = (
           "after an increment of `reset_counter` the EKF is still elsewhere in three comparisons; "
           "at most five times", f"{_SENT}; the next one increments `reset_counter` again", _NONE),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "3 s after the first fix is sent; also 1.5 s after the end of one of the next six "
-          "alerts (up to 60 s if it recurs)",
+          "3 s after the first fix is sent; also 1.5 s after the end of an alert from "
+          "`fix_rate_low` to `ekf_rejects_fixes` (up to 60 s if it recurs)",
           "the EKF's position is that of the fixes", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
               "the rate of sent fixes over 3 s is below 4 Hz (message gps_input: 4.65 Hz)",
-              "the rate is above it", f"{_SENT}; the EKF may stop using them",
+              "the rate is above this minimum", f"{_SENT}; the EKF may stop using them",
               "check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
               "EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED (ArduPilot)",
@@ -191,8 +191,8 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.YAW_UNCHECKED, WARNING, "yaw not checked: no attitude or gimbal", {},
               "for 20 fixes in a row the attitude or the gimbal angles at their time are missing",
               "a fix has both",
-              f"{_SENT} without the yaw check, so a wrong yaw would not be detected; exceptions: "
-              "`no_attitude`, and `yaw_mismatch` stays active",
+              f"{_SENT}, but a wrong yaw would not be detected; with message odometry, missing "
+              "attitude stops them (`no_attitude`); an active `yaw_mismatch` stays active",
               "check the rates of ATTITUDE and of the gimbal's messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},

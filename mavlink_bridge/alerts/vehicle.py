@@ -122,10 +122,10 @@ VEHICLE: tuple[AlertSpec, ...] = (
     event(A.SOURCE_SET_SELECTED, WARNING, "EKF source set {source_set}: {cause}",
           {"source_set": "", "cause": (GnssProblem, ReturnCause), "metres": "m"},
           "`bridge.switch.enabled`: the companion sends the command to select this set. To the "
-          "vision set: GNSS was bad for 1.5 s, and fixes are sent. To the GNSS set, unless the "
-          "pilot selected the vision set: (1) `return_to_gnss` is set, and GNSS agrees with vision "
-          "and IMU for 5 s; or (2) no fix was sent for 3 s, and GNSS is good for 3 s and within 25 "
-          "m of the EKF's position",
+          "vision set: GNSS was lost, glitched or was far from vision for 1.5 s, and fixes are "
+          "sent. To the GNSS set, unless the pilot selected the vision set: (1) `return_to_gnss` "
+          "is set, and GNSS agrees with vision and IMU for 5 s; or (2) no fix was sent for 3 s, "
+          "and GNSS has worked for 3 s and is within 25 m of the EKF's position",
           "the EKF uses this set, unless `source_set_refused` follows; *vision lost*: no fix is "
           "sent",
           "compare the position with landmarks"),
@@ -135,9 +135,9 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "select the source set yourself"),
     condition(A.SOURCE_SET_HELD, WARNING, "no switch: {cause}, {why}",
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
-              "`bridge.switch.enabled`: GNSS is bad for 1.5 s, but the vision set must not be "
-              "selected; again every 10 s",
-              "GNSS is good, or the vision set is selected",
+              "`bridge.switch.enabled`: GNSS is lost, glitches or is far from vision for 1.5 s, "
+              "but the vision set must not be selected; again every 10 s",
+              "GNSS is right again, or the vision set is selected",
               "the EKF stays on its source set; *not ready*: no valid pass of the shadow check, or "
               "an alert inhibits; *EKF with GNSS*: the EKF's position is nearer to GNSS than to "
               "vision; *set N chosen*: the pilot selected it",
@@ -165,7 +165,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "if it is yours: add it to `bridge.ground_systems`, or sign its link"),
     event(A.SENDERS_REFUSED, WARNING, "system {system} and more refused: {why}",
           {"system": "id", "why": SenderRefusal},
-          "the same for a fourth system; further ones are not reported",
+          "a fourth system that is not allowed to do so sends a command; further ones are not "
+          "reported",
           "their commands are denied",
           "if they are yours: add them to `bridge.ground_systems`, or sign their link"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
