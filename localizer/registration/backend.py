@@ -165,7 +165,10 @@ def sample_bilinear(image: NDArray[np.float32], x: Array, y: Array) -> Array:
 
 
 def camera_from_local(rotations: Array, centres: Array, origin: Array) -> tuple[Array, Array]:
-    """Rotations (M, 3, 3) and translations (M, 3) of M poses world_from_camera, given likewise."""
+    """Rotations (M, 3, 3) and translations (M, 3) of camera_from_local, of M poses
+    world_from_camera with rotations (M, 3, 3) and centres (M, 3). origin: the local frame's, in
+    world coordinates.
+    """
     inverse = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
     return inverse, np.einsum("mij,mj->mi", inverse, origin - centres)
 

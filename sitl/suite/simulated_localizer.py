@@ -99,7 +99,7 @@ class FixSink(Protocol):
     """Receives fixes: the bridge, or the integrity monitor before the bridge."""
 
     def submit(self, fix: VisionFix) -> None:
-        """One fix; never blocks."""
+        """Take one fix for injection. Never blocks."""
         ...
 
 

@@ -147,7 +147,7 @@ class TileStreamer:
             self._lock.notify_all()
 
     def counters(self) -> StreamCounters:
-        """Counters so far."""
+        """Counters since the streamer was made."""
         with self._lock:
             now = {
                 "resident_bytes": self._nodes.bytes + self._arrived_bytes,

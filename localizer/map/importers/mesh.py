@@ -86,7 +86,9 @@ def _has_area(mesh: SourceMesh) -> bool:
 
 
 def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
-    """The materials of an OBJ's libraries by name, and its missing textures as sentences."""
+    """The materials of an OBJ's libraries by name, and its flaws as sentences: missing textures,
+    libraries or materials, faces without a picture.
+    """
     libraries = [p for p in files_beside(path) if p.suffix.lower() == ".mtl" and p.is_file()]
     found = [m for library in libraries for m in read_mtl(library, path.parent)]
     doubts = [f"its texture {name!r} is not there" for m in found for name in m.missing]

@@ -218,7 +218,9 @@ def has_separate_mask(data: DatasetReader) -> bool:
 
 
 def apply_affine(transform: Affine, x: Array, y: Array) -> tuple[Array, Array]:
-    """Apply an affine transform to points; independent of affine's version."""
+    """Apply a transform to points: a raster's takes its columns and rows to its CRS, the inverse
+    back. Independent of affine's version.
+    """
     t = transform
     return t.a * x + t.b * y + t.c, t.d * x + t.e * y + t.f
 

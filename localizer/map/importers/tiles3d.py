@@ -200,7 +200,10 @@ class _Reader:
         return _object(document, f"{path}: the document")
 
     def tileset(self, path: Path, parent: Array, depth: int, *, replaces: bool) -> SourceNode:
-        """The root node of a tileset file, placed under `parent` (4, 4)."""
+        """The root node of a tileset file. parent: (4, 4) transform that ECEF has from the tileset.
+        depth: number of nodes above. replaces: the node above is replaced by its children
+        (REPLACE), not added to (ADD).
+        """
         if path in self._open:
             raise MapSourceError(f"{path}: external tilesets refer to each other in a cycle")
         self._uses[path] = self._uses.get(path, 0) + 1

@@ -39,15 +39,15 @@ def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) ->
 def winner_curvature(
     backend: CudaBackend,
     memory: FrameMemory,
-    refine_launch: KernelLaunch,
+    scoring: KernelLaunch,
     channels: int,
     pose: tuple[Array, Array],
     motion: Array,
     hessian: Array,
     distance_px: float,
 ) -> float:
-    """Curvature ratio (equation 11a) at a pose camera_from_local (rotation, translation).
-    refine_launch: the launch that scores `memory.probes`. The caller holds the backend's lock.
+    """Curvature ratio (equation 11a) at a pose camera_from_local (rotation, translation). scoring:
+    the launch that scores `memory.probes`. The caller holds the backend's lock.
     """
     device, steps = backend.device, curvature_steps(motion, distance_px)
     rotations, translations = retractions(*pose, steps)
@@ -59,9 +59,9 @@ def winner_curvature(
         (memory.probe_state, state),
     ):
         device.upload(address, values)
-    arguments = refine_launch.arguments.copy()
+    arguments = scoring.arguments.copy()
     arguments["state"] = memory.probe_state
-    backend.kernels(channels).launch(refine_launch.kernel, PROBES, refine_launch.threads, arguments)
+    backend.kernels(channels).launch(scoring.kernel, PROBES, scoring.threads, arguments)
     scores = np.empty(PROBES)
     device.download(scores, int(memory.probes["scores"]))
     device.synchronize()

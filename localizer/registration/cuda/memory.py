@@ -87,7 +87,7 @@ class FrameMemory:
         )  # fmt: skip
 
     def level(self, k: int) -> int:
-        """Address of the k-th level's description."""
+        """Device address of the description of pyramid level k."""
         return self.levels + k * layout.LEVEL.itemsize
 
     def write(self, frame: NDArray[np.uint8], address: int, value: NDArray[Any]) -> None:

@@ -73,7 +73,10 @@ def fly_loop(
 def loop_assets(
     case: LoopCase, seed: int, worlds: Path | None, progress: Callable[[str, float], None]
 ) -> LoopAssets:
-    """The world of a scenario and the companion's map; generated if missing."""
+    """The world of a loop case and a seed, and the companion's map of the world; generated if
+    missing. worlds: folder of generated worlds; None: the default. progress: called with a stage
+    and its share that is done.
+    """
     world = prepare(seed, worlds, progress, case.size_m, ideal=not case.honest)
     if case.wrong.other_map:
         other = prepare(seed + _OTHER_SEED, worlds, progress, case.size_m, ideal=True)
