@@ -108,12 +108,12 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
 
 
 def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
-    """The pose after a constraint of another sensor was applied.
+    """A pose and its covariance (6, 6) after the update with a constraint of another sensor.
 
-    covariance: (6, 6). The sensor's error (mounting, gimbal, air pressure) is constant over frames
-    and does not average out. So along each principal direction a variance P larger than the
-    sensor's R becomes R, by an update with the noise ``R P / (P - R)``; a smaller one is unchanged.
-    `odometry.growth.fuse` follows the same rule.
+    The sensor's error (mounting, gimbal, air pressure) is constant over frames and does not average
+    out. So along each principal direction a variance P larger than the sensor's R becomes R, by an
+    update with the noise ``R P / (P - R)``; a smaller one is unchanged. `odometry.growth.fuse`
+    follows the same rule.
     """
     rows, values = constraint_rows(constraint, pose)
     known = rows @ covariance @ rows.T

@@ -93,8 +93,8 @@ def find_object(
     chart: Grey, ground: Grey, look: TargetAppearance, aside: float = 0.0
 ) -> AppearanceCoverage | None:
     """Position at which the target covers the ground; None without one, if it is half hidden, or if
-    a second position is as likely. chart, ground: squares of the same size. aside: by how much
-    evidence at the end of the search range counts less.
+    a second position is as likely. chart, ground: squares of the same size. aside: share by which
+    evidence in the corners of the search range counts less; 0: all counts alike.
 
     With Gaussian noise the log-likelihood ratio of target against ground is proportional to ``sum
     (I - G)² - (I - L)²``. An image ``G + a (L - G)`` gives ``(2 a - 1)`` times the ratio of the

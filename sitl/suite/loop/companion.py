@@ -80,8 +80,8 @@ class LoopCompanion:
             time.sleep(0.2)
 
     def kill(self) -> None:
-        """SIGKILL to the flight process. With a supervisor it returns at once, and the supervisor
-        starts a new one; without, it waits until the process has ended.
+        """SIGKILL to the flight process. With a supervisor, which starts a new one, the call does
+        not wait; without, it waits until the process has ended.
         """
         if self._supervised:
             os.kill(self.health().pid, signal.SIGKILL)
