@@ -121,7 +121,7 @@ class PosePrior:
         rotation_sigma_deg: float = 4.0,
         time_ns: int = 0,
     ) -> PosePrior:
-        """A pose with standard deviations per axis, metres and degrees."""
+        """A prior of a pose: position_sigma_m on each axis, and rotation_sigma_deg about each."""
         sigma = np.repeat([position_sigma_m, np.radians(rotation_sigma_deg)], 3)
         return cls(world_from_camera, np.diag(sigma**2), time_ns)
 

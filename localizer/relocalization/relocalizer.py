@@ -44,7 +44,7 @@ _MOST_UNDISTORTERS = 8
 
 
 class Relocalizer:
-    """Finds a camera on a map from one frame. One thread uses it at a time.
+    """Finds the position of one frame's camera on a map. One thread uses it at a time.
 
     extractor: the network without the detail level. The caller closes all arguments; no other
     thread may use the renderer. height_sigma_m: RMS of the object heights that the map lacks.

@@ -195,7 +195,9 @@ def search(
 
 
 def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
-    """Group height indices by ratio at most `ratio`; each group shares its features."""
+    """Indices of ascending heights in groups that share their features: in a group, the highest is
+    at most `ratio` times the lowest.
+    """
     groups: list[list[int]] = []
     for i, height in enumerate(heights):
         if groups and height <= heights[groups[-1][0]] * ratio:

@@ -93,7 +93,10 @@ def extent_warnings(
     source: str,
     rules: ImportRules,
 ) -> list[str]:
-    """Warnings about a map's extent (latitude, longitude) and ellipsoidal heights."""
+    """Warnings about a map's extent, (latitude, longitude) in degrees, and its lowest and highest
+    ellipsoidal height. separation_m: geoid above the ellipsoid at the map. source: begins the text.
+    Impossible heights raise `MapSourceError` unless `rules` accept them.
+    """
     warnings = []
     low, high = (height - separation_m for height in height_range_m)
     if low < LOWEST_M or high > HIGHEST_M:
