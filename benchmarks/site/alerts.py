@@ -34,7 +34,8 @@ name no effect |
 | exclude and reset | as *hold*; the first fix afterwards also increments `reset_counter`, which \
 tells the EKF to jump |
 | inhibit | injection and the switch to the vision source set do not start. Injection that runs \
-continues. After a crash before injection and a restart within 10 min, the alert is still active |
+continues. If the program crashes before injection has started, and restarts within 10 min, the \
+alert stays active |
 | one-off | the alert reports one moment; nothing has to end |
 | good GNSS | GNSS has a 3D fix, and neither `gnss_refused` nor `gnss_vision_mismatch` is active |
 | take over | On the ground: wait, and do not take off on vision. In flight: if the EKF uses good \
@@ -54,12 +55,12 @@ PX4 sends ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 could be sent.
 
 **Not ready:** such an alert says why the shadow check has not passed. Until it passes, injection
-does not start, unless `bridge.injection.force` or the pilot (mode rc) starts it; the same two
-override *inhibit*. The check compares the fixes of the last two minutes with the EKF's position on
-GNSS. An alert is sent as a text only in mode inject, if fixes are made but injection has not
-started for 10 s. It ends when 50 or more compared fixes meet the limit; without GNSS a failed check
-stays failed. *Valid pass*: the check passed at most 10 min ago, and at most 30 s before the last
-compared fix.
+does not start, with three exceptions: `bridge.injection.force`; the pilot (mode rc); no GNSS, if
+the check has not failed (`injection_unchecked`). The first two also override *inhibit*. The check
+compares the fixes of the last two minutes with the EKF's position on GNSS. An alert is sent as a
+text only in mode inject, if fixes are made but injection has not started for 10 s. It ends when 50
+or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid pass*: the
+check passed at most 10 min ago, and at most 30 s before the last compared fix.
 
 **Fixes and EKF:** `fix_rate_low` to `ekf_rejects_fixes` need 3 s or more of sent fixes. Only the
 first of these six whose condition holds is active.

@@ -29,6 +29,7 @@ commands by `python -m benchmarks.site`; do not edit. `companion COMMAND --help`
 Names in capitals are arguments, given in the order of the table; `...` means one or more. Options
 take an integer N, a number X, TEXT, a PATH or one of the listed words; an option without these is a
 switch, off by default (with a `--no-` form: on). An empty default: not set.
+The last words of a meaning, such as 1 to 170, are the allowed range.
 
 | exit code | meaning |
 |---|---|

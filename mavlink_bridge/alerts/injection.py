@@ -23,7 +23,7 @@ INJECTION: tuple[AlertSpec, ...] = (
           "mode inject: the first fix is sent; also 1.5 s after the end of a *not sent* alert (up "
           "to 60 s if it recurs)", "the autopilot receives fixes", _NONE),
     condition(A.NO_FIX_YET, WARNING, "no fix yet", {},
-              "no fix since the start; only in health.json, not sent as a text",
+              "no fix since the start; never sent as a text",
               "the first fix", "vision has not found a position", _TAKE_OVER,
               lead=_NOT_SENT),
     condition(A.NO_FRESH_FIX, WARNING, "no fresh fix", {},

@@ -125,7 +125,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "vision set: GNSS was lost, glitched or was far from vision for 1.5 s, and fixes are "
           "sent. To the GNSS set, unless the pilot selected the vision set: (1) `return_to_gnss` "
           "is set, and GNSS agrees with vision and IMU for 5 s; or (2) no fix was sent for 3 s, "
-          "and GNSS has worked for 3 s and is within 25 m of the EKF's position",
+          "and GNSS has worked for 3 s, is within 25 m of the EKF's position and not refused",
           "the EKF uses this set, unless `source_set_refused` follows; *vision lost*: no fix is "
           "sent",
           "compare the position with landmarks"),
