@@ -205,7 +205,7 @@ def test_the_shift_of_an_image_is_found_and_moves_the_camera():
         features = np.ascontiguousarray(ground[row : row + 40, column : column + 50])
         return (FeatureLevel(features, sure, 8), FeatureLevel(features, sure, 4))
 
-    shift = FrameShift(pyramid(10, 8)).over(pyramid(5, 5))
+    shift = FrameShift(pyramid(10, 8)).estimate(pyramid(5, 5))
     assert (shift.u, shift.v) == (12.0, 20.0)
     assert shift.score == pytest.approx(0.9, abs=0.1)
     pose = Pose(DOWN, np.array([7.0, 8.0, 100.0]))
