@@ -94,8 +94,8 @@ class ClosedLoopCheck:
         rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
         sigma = recent[-1][3]
         reason = self._reason(rate, state, difference, sigma)
-        after_jump = now_ns - self._announced_ns > _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
-        if after_jump and difference is not None and _is_there(difference, sigma):
+        there = difference is not None and _is_there(difference, sigma)
+        if there and not self.is_jumping(now_ns):
             self._repeats = 0  # another jump may be missed as often
         return LoopVerdict(reason is None, reason, difference)
 
@@ -106,6 +106,10 @@ class ClosedLoopCheck:
             "pending": len(self._pending),
             "differences": len(self._differences),
         }
+
+    def is_jumping(self, now_ns: int) -> bool:
+        """Whether some of the compared positions are from before the last announced jump."""
+        return now_ns - self._announced_ns <= _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
 
     def jump_missed(self) -> bool:
         """Whether an announced jump must be announced again, because the EKF is still elsewhere.
