@@ -62,7 +62,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "check the rate of ATTITUDE; " + _BY_HAND, lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
               "the horizontal sigma of a fix is above 10 m", "it is 10 m or less",
-              "the position is too uncertain; the EKF receives none", _WAIT, lead=_NOT_SENT),
+              "the position is too uncertain; the EKF receives none, and of odometry's only the "
+              "change", _WAIT, lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
               "three of five fixes fail the yaw guard: vision's yaw is 3.5 deg off the "
