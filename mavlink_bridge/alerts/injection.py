@@ -146,9 +146,9 @@ INJECTION: tuple[AlertSpec, ...] = (
           "after an announced jump the EKF's position stays elsewhere in three comparisons; at "
           "most five times", f"{_SENT}; the next one increments reset_counter again", _NONE),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "3 s after the first fix is sent; again 3.5 s after each announced jump, at the end of "
-          "`ekf_jump`, and 1.5 s after the end of one of the next six alerts, or up to 60 s after "
-          "it if it recurs",
+          "3 s after the first fix is sent; again 3.5 s after an announced jump, or later, when "
+          "the EKF is within 3 sigma + 1 m; at the end of `ekf_jump`; and 1.5 s after the end of "
+          "one of the next six alerts, or up to 60 s after it if it recurs",
           "the EKF's position is that of the fixes", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},

@@ -43,9 +43,13 @@ class LoopVerdict:
 
 
 class ClosedLoopCheck:
-    """Compares sent positions with the EKF's; one thread."""
+    """Compares sent positions with the EKF's; one thread.
+
+    jumping: the EKF was not yet seen at the positions after the last announced jump.
+    """
 
     def __init__(self, message: InjectionMessage) -> None:
+        self.jumping = False
         self._message = message
         self._sent: deque[tuple[int, float, float, float]] = deque(maxlen=256)
         self._pending: deque[tuple[int, float, float, float]] = deque(maxlen=256)
@@ -68,7 +72,7 @@ class ClosedLoopCheck:
         """A position was sent: valid at stamp_ns, NE metres from the EKF origin."""
         if self._reset_counter not in (None, reset_counter):
             self._jump_ns = now_ns + _TAKES_NS
-            self._announced_ns = now_ns
+            self._announced_ns, self.jumping = now_ns, True
         self._reset_counter = reset_counter
         if not self._sent or now_ns - self._sent[-1][0] > _SETTLE_NS:
             self._began_ns = now_ns
@@ -94,9 +98,9 @@ class ClosedLoopCheck:
         rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
         sigma = recent[-1][3]
         reason = self._reason(rate, state, difference, sigma)
-        there = difference is not None and _is_there(difference, sigma)
-        if there and not self.is_jumping(now_ns):
-            self._repeats = 0  # another jump may be missed as often
+        after_jump = now_ns - self._announced_ns > _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
+        if after_jump and difference is not None and _is_there(difference, sigma):
+            self.jumping, self._repeats = False, 0  # another jump may be missed as often
         return LoopVerdict(reason is None, reason, difference)
 
     def waiting(self) -> dict[str, int]:
@@ -106,10 +110,6 @@ class ClosedLoopCheck:
             "pending": len(self._pending),
             "differences": len(self._differences),
         }
-
-    def is_jumping(self, now_ns: int) -> bool:
-        """Whether some of the compared positions are from before the last announced jump."""
-        return now_ns - self._announced_ns <= _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
 
     def jump_missed(self) -> bool:
         """Whether an announced jump must be announced again, because the EKF is still elsewhere.

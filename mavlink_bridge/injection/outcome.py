@@ -91,7 +91,7 @@ class InjectionOutcome:
         True if a jump must be announced again.
         """
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
-        unsettled = bool(self.ekf_ok_inhibited_by) or self._loop.is_jumping(now_ns)
+        unsettled = bool(self.ekf_ok_inhibited_by) or self._loop.jumping
         if unsettled:
             self._notifier.notify("loop", None)  # what was reported is of before
         if self.verdict is not None and (self.verdict.reason or not unsettled):

@@ -384,6 +384,16 @@ def test_after_each_relocalization_it_is_said_once_that_the_ekf_follows(flight, 
             break
 
 
+def test_an_ekf_that_still_swings_about_the_new_place_does_not_follow(flight: Flight) -> None:
+    """After a full loss it swung by 4 m for 12 s: it was said in between, and twice."""
+    flight.north_m, flight.ekf_north_m, flight.reset_count = 10.0, 7.5, 1
+    flight.run(12.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    flight.ekf_north_m = 9.5
+    flight.run(6.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 2
+
+
 def test_that_the_ekf_follows_is_said_after_its_reset_is_confirmed(flight: Flight) -> None:
     flight.end.inhibit(AlertId.EKF_JUMP)
     flight.north_m = flight.ekf_north_m = 10.0
