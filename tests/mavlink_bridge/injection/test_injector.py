@@ -502,8 +502,11 @@ def deltas(
     for t in range(SECOND, 4 * SECOND, MS):
         if (t - late) % period == 0:
             north = speed * (t - late) / SECOND
-            how = {"position_withheld": sigma_m is None, "scale_sigma": scale_sigma}
-            how["position_covariance_ned"] = np.eye(3) * (sigma_m or 1.0) ** 2
+            how: dict[str, Any] = {
+                "position_withheld": sigma_m is None,
+                "scale_sigma": scale_sigma,
+                "position_covariance_ned": np.eye(3) * (sigma_m or 1.0) ** 2,
+            }
             it.submit(fix(t - late, north, yaw_rad=yaw, **how), t)
         assert it.step(t, vehicle) is None
         if (delta := it.motion.take()) is not None:
