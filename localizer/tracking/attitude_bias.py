@@ -212,9 +212,11 @@ class AttitudeBiasEstimator:
             self.bias = passed(self.bias, place, time_ns)
 
     def learn(self, sight: AttitudeObservation) -> None:
-        """Add an observation."""
+        """Add an observation; without a reported attitude it only counts as made."""
         reported = self._rotation_at(sight.time_ns)
-        if self.bias is not None and self._config is not None and reported is not None:
+        if reported is None:
+            self.pass_by(sight.pose.translation, sight.time_ns)
+        elif self.bias is not None and self._config is not None:
             self.bias = measured(self.bias, self._config, reported, sight)
 
 
