@@ -30,7 +30,7 @@ def plan_command(
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("plan"),
     condition: Annotated[
         list[str] | None,
-        typer.Option(help="day, season, dusk, night, fog, rain or snow; may be repeated (day)"),
+        typer.Option(help="day, season, dusk, night, fog, rain or snow; default: day"),
     ] = None,
     sigma: Annotated[
         float, typer.Option(min=0.05, max=100, help="largest acceptable position sigma, m")
@@ -45,7 +45,7 @@ def plan_command(
         float, typer.Option(min=-90, max=0, help="gimbal pitch if the mission has none")
     ] = -75.0,
     flown: Annotated[
-        Path | None, typer.Option(help="record of a flight of this mission: checks the forecast")
+        Path | None, typer.Option(help="compare the forecast with this record of the mission")
     ] = None,
     alternatives: Annotated[bool, typer.Option(help="search alternatives for failing legs")] = True,
 ) -> None:
@@ -92,8 +92,8 @@ def plan_command(
     document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}
     (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
-    _print("to be bridged", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
-    _print("what would do instead", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))
+    _print("without vision", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
+    _print("alternatives", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))
     if legs:
         _print("flown", check.FLOWN_HEADINGS, [leg.row for leg in legs])
         Console().print(check.flown_words(legs), highlight=False, soft_wrap=True)
