@@ -50,7 +50,7 @@ class OpenVinoSession:
         self._mine = threading.local()
 
     def get_providers(self) -> list[str]:
-        """Its own name alone."""
+        """The list of its own name."""
         return [PROVIDER]
 
     def get_outputs(self) -> list[_Output]:
@@ -58,7 +58,7 @@ class OpenVinoSession:
         return self._outputs
 
     def run(self, outputs: list[str], inputs: dict[str, NDArray[np.uint8]]) -> list[Any]:
-        """The named outputs, each an array of the caller's own."""
+        """The named outputs; the arrays belong to the caller."""
         (image,) = inputs.values()
         request, shapes = self._request(image.shape)
         found = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
@@ -68,7 +68,7 @@ class OpenVinoSession:
         return [found[name] for name in outputs]
 
     def _request(self, shape: tuple[int, ...]) -> tuple[Any, dict[str, tuple[int, ...]]]:
-        """This thread's own for images of a shape, and the shapes of its outputs."""
+        """This thread's inference request for images of a shape, and its outputs' shapes."""
         network = self._network(shape)
         if getattr(self._mine, "network", None) is not network:
             self._mine.network, self._mine.request = network, network.create_infer_request()

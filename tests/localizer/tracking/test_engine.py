@@ -92,7 +92,7 @@ class FakeOptimizer:
         pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
         return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1, self.agreement)
 
-    def focal_tested(self, query, camera, anchors, found):
+    def with_focal_gain(self, query, camera, anchors, found):
         return replace(found, focal_gain=self.focal_gain)
 
 
