@@ -21,7 +21,7 @@ from localizer.registration.jngo import JNGO
 from localizer.relocalization import verdict
 from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.overview import open_overview, overview_key
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.render.numba_raster import NumbaRenderer
@@ -51,7 +51,7 @@ def opened(cache):
 @pytest.fixture(scope="module")
 def truth(small_assets):
     ground = float(small_assets.world.ground_height(*PLACE))
-    rotation = turned(so3_exp((np.radians(20), 0, 0)) @ DOWN, np.radians(143))
+    rotation = with_heading(so3_exp((np.radians(20), 0, 0)) @ DOWN, np.radians(143))
     return Pose(rotation, np.array([*PLACE, ground + 110.0]))
 
 
@@ -69,7 +69,7 @@ def query(small_assets, truth):
     """The frame of another day; the heading that is given is 100 degrees off, the height 2 m."""
     return PlaceQuery(
         Frame(seen_from(truth, small_assets), 123, CAMERA, 7),
-        turned(so3_exp((0.005, -0.004, 0)) @ truth.rotation, np.radians(100)),
+        with_heading(so3_exp((0.005, -0.004, 0)) @ truth.rotation, np.radians(100)),
         tilt_sigma_rad=np.radians(0.7),
         heading_sigma_rad=None,
         height_m=float(truth.translation[2]) + 2.0,
@@ -113,16 +113,16 @@ def test_a_place_that_stands_out_need_not_be_decisive(opened, query, truth, monk
     away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
     candidates = [best.candidate, PlaceCandidate(away, best.candidate.score)]
 
-    def answer(share, looked_at=True):
+    def decide(share, looked_at=True):
         result = replace(best.result, world_from_camera=away, quality=share * best.result.quality)
         other = replace(best, rank=1, result=result, credible=False)
-        judged = [best, other] if looked_at else [best]
-        monkeypatch.setattr(relocalizer, "verify", lambda *_: judged)
+        registered = [best, other] if looked_at else [best]
+        monkeypatch.setattr(relocalizer, "verify", lambda *_: registered)
         return relocalizer.confirm(query, candidates)
 
-    assert answer(0.5) is not None
-    assert answer(0.9) is None
-    assert answer(0.5, looked_at=False) is None
+    assert decide(0.5) is not None
+    assert decide(0.9) is None
+    assert decide(0.5, looked_at=False) is None
 
 
 def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, monkeypatch):
@@ -177,11 +177,11 @@ def test_a_low_camera_among_high_houses_is_found_from_candidates_aside(opened, s
     a registration alone found two of eight back (the flight covered-10s was not found again).
     """
     place, up_m = np.array([36.5, 63.7]), 62.0
-    rotation = turned(so3_exp((np.radians(10), 0, 0)) @ DOWN, np.radians(-90))
+    rotation = with_heading(so3_exp((np.radians(10), 0, 0)) @ DOWN, np.radians(-90))
     truth = Pose(rotation, np.array([*place, up_m]))
     query = PlaceQuery(
         Frame(seen_from(truth, small_assets), 123, CAMERA, 7),
-        turned(truth.rotation, np.radians(4)),
+        with_heading(truth.rotation, np.radians(4)),
         tilt_sigma_rad=np.radians(1),
         heading_sigma_rad=np.radians(10),
         height_m=up_m + 1.0,
