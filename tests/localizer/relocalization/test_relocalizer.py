@@ -77,6 +77,12 @@ def query(small_assets, truth):
     )
 
 
+@pytest.fixture(scope="module")
+def candidates(opened, query):
+    """Where the frame may be, the likeliest first: a search over the whole map."""
+    return opened.relocalizer.search(query)
+
+
 def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
     found = opened.relocalizer.find(query)
     assert found is not None
@@ -89,10 +95,11 @@ def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
     assert off @ np.linalg.solve(found.covariance[:3, :3], off) < 30
 
 
-def test_a_twin_that_is_as_credible_forbids_an_answer(opened, query, truth, monkeypatch):
+def test_a_twin_that_is_as_credible_forbids_an_answer(
+    opened, query, truth, candidates, monkeypatch
+):
     """Equal roofs: both places agree, so neither is given; a rival that disagrees is none."""
     relocalizer = opened.relocalizer
-    candidates = relocalizer.search(query)
     best, *_ = relocalizer.verify(query, candidates)
     away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
     result = replace(best.result, world_from_camera=away, quality=best.result.quality - 0.01)
@@ -102,30 +109,34 @@ def test_a_twin_that_is_as_credible_forbids_an_answer(opened, query, truth, monk
         assert (relocalizer.confirm(query, candidates) is None) is credible
 
 
-def test_a_place_that_stands_out_need_not_be_decisive(opened, query, truth, monkeypatch):
+def test_a_place_that_stands_out_need_not_be_decisive(
+    opened, query, truth, candidates, monkeypatch
+):
     """Other ground looks alike from above. It is no rival where its own registration says so; where
     it fits nearly as badly as the answer, or was never looked at, there is none.
     """
     relocalizer = opened.relocalizer
-    best, *_ = relocalizer.verify(query, relocalizer.search(query)[:1])
+    best, *_ = relocalizer.verify(query, candidates[:1])
     best = replace(best, log_odds=3.0)
     assert not best.is_decisive
     away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
-    candidates = [best.candidate, PlaceCandidate(away, best.candidate.score)]
+    places = [best.candidate, PlaceCandidate(away, best.candidate.score)]
 
     def answer(share, looked_at=True):
         result = replace(best.result, world_from_camera=away, quality=share * best.result.quality)
         other = replace(best, rank=1, result=result, credible=False)
         judged = [best, other] if looked_at else [best]
         monkeypatch.setattr(relocalizer, "verify", lambda *_: judged)
-        return relocalizer.confirm(query, candidates)
+        return relocalizer.confirm(query, places)
 
     assert answer(0.5) is not None
     assert answer(0.9) is None
     assert answer(0.5, looked_at=False) is None
 
 
-def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, monkeypatch):
+def test_ground_that_looks_alike_costs_few_registrations(
+    cache, query, truth, candidates, monkeypatch
+):
     """Forty places whose ground looks like the frame from above: rendered, the others do not. Each
     was registered before, and the one that was not left no answer.
     """
@@ -133,25 +144,26 @@ def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, mo
     register = JNGO.register
     monkeypatch.setattr(JNGO, "register", lambda *a, **k: registered.append(1) or register(*a, **k))
     monkeypatch.setattr(verdict, "DECISIVE", np.inf)
+    best = candidates[0]
     with open_relocalizer(cache, CONFIG) as found:
-        best = found.search(query)[0]
         places = [np.array([x, y]) for x in range(-160, 161, 40) for y in (-150, -90, 30, 90, 150)]
         alike = [
             replace(best, world_from_camera=Pose(truth.rotation, np.array([*p, query.height_m])))
             for p in places
         ]
-        registered.clear()
         answer = found.confirm(query, [*alike[:20], best, *alike[20:]])
     assert answer is not None
     assert answer.world_from_camera.distance_to(truth)[0] < 1.0
     assert len(registered) <= 12
 
 
-def test_a_doubt_that_the_last_pass_leaves_is_settled(opened, query, truth, monkeypatch):
+def test_a_doubt_that_the_last_pass_leaves_is_settled(
+    opened, query, truth, candidates, monkeypatch
+):
     """Decisive at first, no other candidate was registered; no longer decisive at the end, they
     have to be known not to be the place.
     """
-    best = opened.relocalizer.search(query)[0]
+    best = candidates[0]
     alike = [
         replace(best, world_from_camera=Pose(truth.rotation, np.array([x, 120.0, query.height_m])))
         for x in (-120.0, -60.0, 0.0, 60.0, 120.0)
