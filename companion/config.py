@@ -35,12 +35,12 @@ _SQUAREST = 1.5  # between fx and fy: pixels of 4:3 and 16:11 are the oddest in 
 class CameraModel(StrictModel):
     """Intrinsics in pixels of the stream as it arrives (pixel centres at + 0.5)."""
 
-    width: int = Field(ge=8, le=_MOST_PX)
-    height: int = Field(ge=8, le=_MOST_PX)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
+    width: int = Field(ge=8, le=_MOST_PX, description="of the stream, pixels")
+    height: int = Field(ge=8, le=_MOST_PX, description="likewise")
+    fx: float = Field(gt=0, description="focal length, pixels")
+    fy: float = Field(gt=0, description="likewise")
+    cx: float = Field(description="principal point, pixels; centre of the first pixel: 0.5")
+    cy: float = Field(description="likewise")
     distortion: tuple[float, ...] = Field(
         (0.0, 0.0, 0.0, 0.0, 0.0),
         description="opencv: k1 k2 p1 p2 k3, or 8, 12, 14 of OpenCV's; fisheye: k1 k2 k3 k4",

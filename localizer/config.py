@@ -36,7 +36,7 @@ class LocalizerConfig(BaseModel):
         "auto", description="auto: a GPU if there is one, otherwise numba"
     )
     device: DeviceChoice = Field(
-        "cpu", description="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"
+        "cpu", description="runs the optimizer; auto, cuda: a working GPU, otherwise the CPU"
     )
     threads: int = Field(
         2,
@@ -54,7 +54,9 @@ class LocalizerConfig(BaseModel):
     focal_fit_s: float = Field(0.0, exclude=True)  # interval of focal length fits, s; 0: none
     seed: int = Field(0, exclude=True)  # seed of anchors and hypotheses
     registration: JNGOConfig = Field(JNGOConfig(), exclude=True)
-    calibration: CalibrationSigmas = CalibrationSigmas()
+    calibration: CalibrationSigmas = Field(
+        CalibrationSigmas(), description="remaining errors of camera.model, 1 sigma"
+    )
     # fuse roll and pitch of autopilot and gimbal with each fix; None: no
     attitude: AttitudePrior | None = Field(AttitudePrior(), exclude=True)
     # of the autopilot's height (barometer) against the map's; None: not used

@@ -55,13 +55,15 @@ class YawGuardConfig:
 class InjectionConfig(StrictModel):
     """What is sent to the flight controller, how often, and when it is withheld."""
 
-    message: InjectionMessage = "vision_position_estimate"
-    rate_hz: float = Field(default=20.0, ge=4.0, le=30.0)
+    message: InjectionMessage = Field(
+        default="vision_position_estimate", description="MAVLink message that holds a fix"
+    )
+    rate_hz: float = Field(default=20.0, ge=4.0, le=30.0, description="messages per second")
     delay_ms: float = Field(
         default=100.0,
         ge=0.0,
         le=250.0,
-        description="age at which a fix is sent: VISO_DELAY_MS or GPSn_DELAY_MS, n = gps_id + 1",
+        description="age at which a fix is sent: VISO_DELAY_MS, or GPSn_DELAY_MS, n = gps_id + 1",
     )
     sigma_floor_m: float = Field(0.1, exclude=True)
     max_sigma_m: float = Field(10.0, exclude=True)  # largest sigma that is sent
@@ -69,10 +71,13 @@ class InjectionConfig(StrictModel):
         default=10.0,
         gt=0.0,
         le=1000.0,
-        description="largest protection level of an injected fix",
+        description="largest protection level of an injected fix, m",
     )
     time_to_alert_s: float = Field(
-        default=3.0, ge=0.2, le=60.0, description="time within which output stops"
+        default=3.0,
+        ge=0.2,
+        le=60.0,
+        description="output stops after so long above alert_limit_m, after 1 s at most",
     )
     max_extrapolation_s: float = Field(0.5, exclude=True)  # longest propagation over a gap
     # missing fix intervals after which nothing is sent
@@ -86,11 +91,13 @@ class InjectionConfig(StrictModel):
         default="tell",
         description="map offset against GNSS; apply: fixes are corrected by it",
     )
-    send_attitude: bool = True
+    send_attitude: bool = Field(
+        default=True, description="false: NaN angles in VISION_POSITION_ESTIMATE"
+    )
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = Field("profile", exclude=True)
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
-    gps_velocity: bool = True
-    gps_yaw: bool = False
+    gps_velocity: bool = Field(default=True, description="GPS_INPUT holds a velocity")
+    gps_yaw: bool = Field(default=False, description="GPS_INPUT holds a yaw")
     yaw_guard: YawGuardConfig = Field(YawGuardConfig(), exclude=True)
 
     @model_validator(mode="after")
@@ -103,11 +110,15 @@ class InjectionConfig(StrictModel):
 class SourceSwitchConfig(StrictModel):
     """Automatic change of the EKF source set when GNSS is bad (42007)."""
 
-    enabled: bool = False
-    gnss_set: int = Field(default=1, ge=1, le=3)
-    vision_set: int = Field(default=2, ge=1, le=3)
+    enabled: bool = Field(
+        default=False, description="select the vision set when GNSS is bad (ArduPilot)"
+    )
+    gnss_set: int = Field(default=1, ge=1, le=3, description="source set that uses GNSS")
+    vision_set: int = Field(default=2, ge=1, le=3, description="source set that uses vision")
     bad_after_s: float = Field(1.5, exclude=True)
-    return_to_gnss: bool = False
+    return_to_gnss: bool = Field(
+        default=False, description="select the GNSS set when GNSS agrees with vision for 5 s"
+    )
     inconsistency_sigmas: float = Field(5.0, exclude=True)
 
     @model_validator(mode="after")
@@ -120,29 +131,36 @@ class SourceSwitchConfig(StrictModel):
 class InjectionEnableConfig(StrictModel):
     """In mode ``rc`` an RC channel's pulse width or a command selects shadow or inject."""
 
-    channel: int = Field(default=9, ge=1, le=18)
-    inject_above_us: int = Field(default=1700, ge=900, le=2100)
+    channel: int = Field(
+        default=9, ge=1, le=18, description="RC channel that enables injection in mode rc"
+    )
+    inject_above_us: int = Field(
+        default=1700, ge=900, le=2100, description="its pulse width above which injection is on"
+    )
     command: Literal["user_1", "user_2", "user_3", "user_4", "user_5"] | None = Field(
         default="user_1",
-        description="MAV_CMD_USER_n to the localizer's component: param1 1 injects, 0 does not",
+        description="MAV_CMD_USER_n to localizer_component: param1 1 enables injection, 0 disables",
     )
 
 
 class CameraConfig(StrictModel):
     """Description of the camera for the ground station, and its mounting."""
 
-    announce: bool = True
-    vendor: str = Field(default="PiLoT companion", max_length=31)
-    model: str = Field(default="map camera", max_length=31)
+    announce: bool = Field(default=True, description="announce a camera to ground stations")
+    vendor: str = Field(default="PiLoT companion", max_length=31, description="its vendor name")
+    model: str = Field(default="map camera", max_length=31, description="its model name")
     width_px: int = Field(1280, exclude=True)
     height_px: int = Field(720, exclude=True)
     horizontal_fov_deg: float = Field(60.0, exclude=True)
     stream_uri: str = Field(
         default="",
         max_length=159,
-        description="rtsp://..., tcp://..., or udp://...:PORT and PORT of MPEG-TS; empty: none",
+        description="video for ground stations: rtsp://..., tcp://..., or udp://...:PORT and "
+        "PORT of MPEG-TS; empty: none",
     )
-    mount: Literal["gimbal", "fixed"] = "gimbal"
+    mount: Literal["gimbal", "fixed"] = Field(
+        default="gimbal", description="fixed: mounted on the airframe"
+    )
     gimbal_component: int = Field(
         default=0, ge=0, le=255, description="component of the gimbal, if there are several; 0: any"
     )
@@ -151,9 +169,16 @@ class CameraConfig(StrictModel):
     )
     # rate at which CAMERA_SETTINGS is requested; 0: none
     zoom_rate_hz: float = Field(0.0, exclude=True)
-    mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
-    mount_pitch_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
-    mount_yaw_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+    mount_roll_deg: float = Field(
+        default=0.0,
+        ge=-180.0,
+        le=180.0,
+        description="mounting of the camera on the gimbal or airframe",
+    )
+    mount_pitch_deg: float = Field(
+        default=0.0, ge=-180.0, le=180.0, description="nose up; -90 looks down"
+    )
+    mount_yaw_deg: float = Field(default=0.0, ge=-180.0, le=180.0, description="to the right")
 
     @property
     def vertical_fov_deg(self) -> float:
@@ -197,8 +222,8 @@ class TargetsConfig(StrictModel):
 class SigningConfig(StrictModel):
     """MAVLink 2 signing: a 32-byte key as 64 hexadecimal digits in a file of mode 0600."""
 
-    key_file: Path
-    link_id: int = Field(default=1, ge=0, le=255)
+    key_file: Path = Field(description="file of `companion key`")
+    link_id: int = Field(default=1, ge=0, le=255, description="id of this link in signatures")
     # file for the newest stamps; null: FILE.LINK.seen beside the key
     state_file: Path | None = Field(None, exclude=True)
 
@@ -218,10 +243,20 @@ class BridgeConfig(StrictModel):
     ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``.
     """
 
-    connection: str = "udpin:127.0.0.1:14551"
-    ground_connection: str | None = None
-    mode: Mode = "shadow"
-    system_id: int | None = Field(default=None, ge=1, le=255, description="null: the vehicle's")
+    connection: str = Field(
+        default="udpin:127.0.0.1:14551",
+        description="link to the autopilot: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, "
+        "tcpin:HOST:PORT or serial:DEVICE:BAUD",
+    )
+    ground_connection: str | None = Field(
+        default=None, description="link to a ground station; null: through the autopilot"
+    )
+    mode: Mode = Field(
+        default="shadow", description="off: listen; shadow: compare; rc: pilot selects"
+    )
+    system_id: int | None = Field(
+        default=None, ge=1, le=255, description="MAVLink system id; null: the vehicle's"
+    )
     sender: str | None = Field(
         default=None,
         description="udpin: accepted sender, ADDRESS or ADDRESS:PORT; null: the first autopilot",
@@ -231,16 +266,22 @@ class BridgeConfig(StrictModel):
         max_length=32,
         description="system ids that may enable injection and start tracking",
     )
-    localizer_component: int = Field(default=197, ge=2, le=255)  # 1 is the autopilot
-    companion_component: int = Field(default=191, ge=2, le=255)
-    camera_component: int = Field(default=100, ge=2, le=255)
+    localizer_component: int = Field(
+        default=197, ge=2, le=255, description="component id that sends positions"
+    )
+    companion_component: int = Field(
+        default=191, ge=2, le=255, description="component id that sends commands and texts"
+    )
+    camera_component: int = Field(
+        default=100, ge=2, le=255, description="component id of the announced camera"
+    )
     look_at: bool = Field(
         default=False,
         description="a ground station may point the gimbal at a position or target",
     )
     named_values: bool = Field(
         default=False,
-        description="NAMED_VALUE_FLOAT VPS_* at 1 Hz",
+        description="send quality figures as NAMED_VALUE_FLOAT VPS_* at 1 Hz",
     )
     texts_as_autopilot: bool = Field(
         default=False,
@@ -248,14 +289,20 @@ class BridgeConfig(StrictModel):
     )
     attitude_rate_hz: float = Field(50.0, exclude=True)
     injection: InjectionConfig = InjectionConfig()
-    origin: OriginConfig | None = None
+    origin: OriginConfig | None = Field(
+        default=None, description="EKF origin that is set if the vehicle has none; null: never set"
+    )
     switch: SourceSwitchConfig = SourceSwitchConfig()
     rc: InjectionEnableConfig = InjectionEnableConfig()
     camera: CameraConfig = CameraConfig()
     targets: TargetsConfig = TargetsConfig()
-    signing: SigningConfig | None = None
-    ground_signing: SigningConfig | None = None
-    tlog: Path | None = None
+    signing: SigningConfig | None = Field(
+        default=None, description="MAVLink 2 signing of the autopilot's link; null: off"
+    )
+    ground_signing: SigningConfig | None = Field(
+        default=None, description="the same of ground_connection"
+    )
+    tlog: Path | None = Field(default=None, description="file for all MAVLink frames; null: none")
     # file that keeps enabled injection and a failed shadow check over a restart
     state_file: Path | None = Field(None, exclude=True)
     link_timeout_s: float = Field(5.0, exclude=True)

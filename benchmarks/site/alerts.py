@@ -17,33 +17,58 @@ hide: [toc]
 
 # Alerts
 
-Made from the catalogue by `python -m benchmarks.site`; do not edit.
+For the pilot and the operator: every text that the companion sends, its cause, its effect and what
+to do. Made from the catalogue by `python -m benchmarks.site`; do not edit.
 
-An alert is sent as STATUSTEXT `{PREFIX}TEXT` and written to `events.csv` and `health.json` with its
-identifier. *Fix*: a position from vision; it is sent in mode inject, and in mode rc while injection
-is enabled. *Sent* refers to these modes. *Output held*: no position is sent. *Exclude and
-reset*: as *output held*, and the next fix increments `reset_counter`. *Inhibit*: injection and the
-switch to vision do not start; injection that is running continues. If the program crashes before
-injection has started, and restarts within 10 min, an alert that inhibits stays active. The pilot
-(mode rc) and `bridge.injection.force` override *inhibit* and *not ready*. *Event*: it has no end.
+An alert is sent as STATUSTEXT `{PREFIX}TEXT`. `events.csv` and `health.json` contain its
+identifier. In a text, N is a number, and other capitals are a name, a number or a reason.
+
+| term | meaning |
+|---|---|
+| fix | a position from vision. It is sent to the autopilot while injection is on: in mode inject \
+after the shadow check, in mode rc after the pilot's order. In mode shadow none is sent |
+| fixes continue | this alert does not stop fixes; another alert can. The same holds for rows that \
+name no effect |
+| no fixes | vision makes no fix, so none is sent, until the alert ends |
+| output held; hold | fixes are made, but none is sent, until the alert ends |
+| exclude and reset | as *hold*; the first fix afterwards also increments `reset_counter`, which \
+tells the EKF to jump |
+| inhibit | injection and the switch to the vision source set do not start. Injection that runs \
+continues. If the program crashes before injection has started, and restarts within 10 min, the \
+alert stays active |
+| one-off | the alert reports one moment; nothing has to end |
+| good GNSS | GNSS has a 3D fix, and neither `gnss_refused` nor `gnss_vision_mismatch` is active |
+| take over | On the ground: wait, and do not take off on vision. In flight: if the EKF uses good \
+GNSS, do nothing; if GNSS is good but not used, select the GNSS source set; without good GNSS \
+change to ALT_HOLD or STABILIZE (PX4: Altitude, Stabilized), which need no position |
+| compare with landmarks | compare the position on the ground station's map with what the pilot or \
+the video shows. If it is wrong, take over |
+| in flight | armed, and 3 m or more above or below the take-off height |
+| sigma | one standard deviation; + 4 sigma: of the compared values |
+| message | the value of `bridge.injection.message` |
+
+Without GNSS and without fixes, ArduPilot's EKF has no input. ArduPilot then lands after 5 to 8 s
+([when vision ends](../how-to/when-vision-ends.md)). Limits without a named key are fixed.
 PX4 sends ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 
-A *not sent* alert is raised in the modes shadow, inject and rc. A *not ready* alert is a result of
-the shadow check, which compares fixes with the EKF's position on GNSS over two minutes. It becomes
-a STATUSTEXT in mode inject only, if fixes come but injection has not started for 10 s. It ends
-after 50 or more compared fixes; without GNSS a failed check stays failed. *Valid pass*: the check
-passed at most 10 min ago, and at most 30 s before the last comparison of a fix with GNSS.
+**Not sent:** the EKF receives no position; the alert says why. In mode shadow it says why none
+could be sent.
 
-Of the six alerts `fix_rate_low` to `ekf_rejects_fixes` only one is active: the first in the table
-whose condition holds.
+**Not ready:** such an alert says why the shadow check has not passed. Until it passes, injection
+does not start, with three exceptions: `bridge.injection.force`; the pilot (mode rc); no GNSS, if
+the check has not failed (`injection_unchecked`). The first two also override *inhibit*. The check
+compares the fixes of the last two minutes with the EKF's position on GNSS. An alert is sent as a
+text only in mode inject, if fixes are made but injection has not started for 10 s. It ends when 50
+or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid pass*: the
+check passed at most 10 min ago, and at most 30 s before the last compared fix.
 
-Alerts of localization are assessed once a second; the same one is sent at most every 10 s. An alert
-whose row does not mention fixes or positions has no effect on them.
+**Fixes and EKF:** `fix_rate_low` to `ekf_rejects_fixes` need 3 s or more of sent fixes. Only the
+first of these six whose condition holds is active.
 
-*Fixes are sent* means that this alert does not stop them; another alert can.
-
-The end of an alert of the integrity monitor is sent as `cleared: NAME`, that of some others as the
-text in brackets. The end of the rest shows by the next status, for example `localization tracking`.
+**Repeats and ends:** statuses of localization are assessed once a second; the same one is sent at
+most every 10 s. The end of a check of positions is sent as `cleared: NAME`, that of some others as
+the text in brackets. The next status, for example `localization tracking`, shows the end of the
+rest.
 """
 _TABLE = """
 ## {}
@@ -52,7 +77,7 @@ _TABLE = """
 |---|---|---|---|---|---|---|
 """
 _GROUPS = {
-    "Checks of the positions (integrity monitor)": (*INTEGRITY, *MONITOR, *SOURCES),
+    "Checks of positions (integrity monitor)": (*INTEGRITY, *MONITOR, *SOURCES),
     "Output of positions to the autopilot": INJECTION,
     "Flight controller and MAVLink": VEHICLE,
     "Localization, video and the program": HEALTH,
@@ -75,7 +100,7 @@ def alerts_page() -> str:
 
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
-    ended = spec.cleared or "event"
+    ended = spec.cleared or "one-off"
     if spec.reports_end and spec.cleared_text is not None:
         ended += f" (`{spec.cleared_text}`)"
     inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import textwrap
 from collections.abc import Iterator
 from enum import Enum
 from typing import Any
@@ -13,10 +14,11 @@ import localizer
 
 _HEAD = """# API of `localizer`
 
-Made from the docstrings by `python -m benchmarks.site`; do not edit.
-Everything here is imported as `from localizer import NAME` and is stable; other names may change.
-Frames, heights and time: [architecture.md](../explanation/architecture.md). Angles:
-[angles.md](angles.md). Examples: [examples/](../../examples). One photo
+This page is for whoever uses the localizer as a Python library. It is made from the docstrings by
+`python -m benchmarks.site`; do not edit. Everything here is imported as
+`from localizer import NAME` and is stable; other names may change. Terms, frames, heights and time:
+[architecture](../explanation/architecture.md). Angles: [angles](angles.md). More examples:
+[examples/](../../examples). One photo is localized like this
 ([localize_photo.py](../../examples/localize_photo.py); `read_rgb` is in `localizer.pictures`):
 
 ```python
@@ -64,20 +66,36 @@ def _section(name: str, value: Any) -> str:
         ]
     else:
         lines.insert(1, _code(f"{name}{_signature(value.__init__)}"))
-        lines += [line for member in _members(value) for line in member]
+        lines += [*_properties(value), *_methods(value)]
     return "\n".join(lines) + "\n"
 
 
-def _members(kind: type) -> Iterator[list[str]]:
-    """Public methods and properties that the class itself defines, in the order of its source."""
+def _properties(kind: type) -> list[str]:
+    """One line for each public property that the class itself defines."""
+    found = {
+        name: member
+        for name, member in vars(kind).items()
+        if not name.startswith("_") and (isinstance(member, property) or _is_cached(member))
+    }
+    rows = [
+        textwrap.fill(f"- `{name}`: {_flat(member)}", 100, subsequent_indent="  ")
+        for name, member in found.items()
+    ]
+    return ["Properties:\n", *rows, ""] if rows else []
+
+
+def _is_cached(member: Any) -> bool:
+    return hasattr(member, "attrname")
+
+
+def _methods(kind: type) -> Iterator[str]:
+    """Public methods that the class itself defines, in the order of its source."""
     for name, member in vars(kind).items():
-        if name.startswith("_"):
+        if name.startswith("_") or isinstance(member, property) or _is_cached(member):
             continue
-        if isinstance(member, property) or hasattr(member, "attrname"):  # a cached property
-            yield [f"### {kind.__name__}.{name}\n", *_text(member)]
-        elif callable(function := getattr(kind, name)) and inspect.isroutine(function):
+        if callable(function := getattr(kind, name)) and inspect.isroutine(function):
             code = _code(f"{kind.__name__}.{name}{_signature(function)}")
-            yield [f"### {kind.__name__}.{name}\n", code, *_text(function)]
+            yield from [f"### {kind.__name__}.{name}\n", code, *_text(function)]
 
 
 def _signature(function: Any) -> str:
@@ -113,7 +131,9 @@ def _code(text: str) -> str:
 
 
 def _text(value: Any) -> list[str]:
-    return [f"{inspect.getdoc(value) or ''}\n"]
+    """The docstring without what is meant for those who change the class."""
+    parts = (inspect.getdoc(value) or "").split("\n\n")
+    return ["\n\n".join(p for p in parts if not p.startswith("Above 200 lines")) + "\n"]
 
 
 def _flat(value: Any) -> str:

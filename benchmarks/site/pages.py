@@ -23,8 +23,13 @@ from companion.setup.reference import reference
 
 _CLI = """# Command line
 
-Made from the commands by `python -m benchmarks.site`; do not edit. `companion COMMAND --help`
-prints the same.
+Every command of `companion` with its arguments and options, for whoever runs it. Made from the
+commands by `python -m benchmarks.site`; do not edit. `companion COMMAND --help` prints the same.
+
+Names in capitals are arguments, given in the order of the table; `...` means one or more. Options
+take an integer N, a number X, TEXT, a PATH or one of the listed words; an option without these is a
+switch, off by default (with a `--no-` form: on). An empty default: not set.
+The last words of a meaning, such as 1 to 170, are the allowed range.
 
 | exit code | meaning |
 |---|---|
@@ -38,11 +43,15 @@ prints the same.
 
 _CONFIGURATION = """# Configuration
 
-Made from the schema by `python -m benchmarks.site`; do not edit. `companion init --reference`
-prints the same. Every value is the default; values of required settings are examples. Intervals are
-allowed ranges. A deployment needs only what differs, and `companion init FILE` writes one. Unknown
-keys and values out of range are refused by name. When to change what:
-[configs/deployment.yaml](../../configs/deployment.yaml).
+Every key of the deployment file, for whoever writes one. `companion init FILE` writes one; it needs
+only the keys that differ from this page. When to change what:
+[configs/deployment.yaml](../../configs/deployment.yaml). This page is made from the schema by
+`python -m benchmarks.site`; do not edit. `companion init --reference` prints the same.
+
+Every value is the default; the value of a required key is an example. The comment above a key
+describes it, with the allowed range ([1, 255] with both ends, (0, 1] without 0) or the allowed
+words. A part that is off is `null`; its keys are commented out. Unknown keys and values out of
+range are refused by name.
 """
 
 _TOP = re.compile(r"^(\w+):", re.M)
@@ -67,7 +76,7 @@ class _Parameter:
     def words(self) -> str:
         """What is written on the command line."""
         if self.is_argument:
-            return self.name.upper()
+            return self.name.upper() + ("..." if get_origin(self.kind) is list else "")
         # In an annotation the first name stands where the default of older typers stood.
         first = [self.info.default] if isinstance(self.info.default, str) else []
         named = ", ".join([*first, *(self.info.param_decls or ())])
@@ -86,7 +95,7 @@ def command_page() -> str:
     for name, function in _commands("companion", app):
         parameters = list(_parameters(function))
         help_text = _sentence((function.__doc__ or "").split("\n\n")[0])
-        lines += [f"## {name}\n", help_text, "", f"```\n{_usage(name, parameters)}\n```\n"]
+        lines += [f"## {name}\n", help_text, ""]
         if parameters:
             lines += ["| argument, option | default | meaning |", "|---|---|---|"]
             lines += [*map(_row, parameters), ""]
@@ -138,18 +147,6 @@ def _parameters(function: Callable[..., Any]) -> Iterator[_Parameter]:
         info = next(n for n in notes if isinstance(n, ArgumentInfo | OptionInfo))
         if not info.hidden:
             yield _Parameter(name, kind, info, parameter.default)
-
-
-def _usage(name: str, parameters: list[_Parameter]) -> str:
-    words = [name]
-    for parameter in parameters:
-        several = "..." if get_origin(parameter.kind) is list else ""
-        if parameter.is_argument:
-            word = parameter.words + several
-            words.append(word if parameter.is_required else f"[{word}]")
-        elif parameter.is_required:
-            words.append(f"{parameter.words} {_kind(parameter.kind)}")
-    return " ".join([*words, "[OPTIONS]"])
 
 
 def _row(parameter: _Parameter) -> str:

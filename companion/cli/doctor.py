@@ -31,18 +31,19 @@ if TYPE_CHECKING:
 
 def doctor_command(
     config: Annotated[Path, typer.Argument(help="deployment YAML")],
-    fix: Annotated[bool, typer.Option(help="write wrong parameters, after asking")] = False,
+    fix: Annotated[bool, typer.Option(help="ask, then correct wrong parameters")] = False,
     yes: Annotated[bool, typer.Option(help="do not ask")] = False,
     vehicle: Annotated[bool, typer.Option(help="check the flight controller too")] = True,
     beside_flight: Annotated[
         bool,
-        typer.Option("--beside-flight", help="skip vehicle and feed, which a flight uses"),
+        typer.Option("--beside-flight", help="skip vehicle and video, which a running flight uses"),
     ] = False,
     page: Annotated[
-        Path | None, typer.Option(help="one page to sign, .html with .txt beside it")
+        Path | None, typer.Option(help="write one page to sign: .html, with .txt beside it")
     ] = None,
     plan: Annotated[
-        Path | None, typer.Option(help="plan.json of `companion plan`, for the page's forecast")
+        Path | None,
+        typer.Option(help="plan.json of `companion plan`: puts its forecast on the page"),
     ] = None,
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""

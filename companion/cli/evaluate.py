@@ -65,15 +65,17 @@ def evaluate_command(
     ],
     map_cache: Annotated[Path, typer.Option("--map", help="tile cache")],
     report: Annotated[Path, typer.Option(help="folder of the report")] = Path("eval-report"),
-    name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
+    name: Annotated[str | None, typer.Option(help="sequence of the PiLoT data set")] = None,
     prior: Annotated[
         str,
         typer.Option(
-            help="first: one prior; each: one per frame; lost: one 100 to 500 m off; none: search"
+            help="approximate pose of: first, the first frame; each, every frame; lost, the first, "
+            "100 to 500 m off; none: search"
         ),
     ] = "first",
     known_heading: Annotated[
-        bool, typer.Option("--known-heading", help="for lost and none: heading known to 15 degrees")
+        bool,
+        typer.Option("--known-heading", help="lost and none: heading known to 15 degrees"),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
     noise_m: Annotated[
@@ -87,13 +89,13 @@ def evaluate_command(
         typer.Option(
             min=0.01,
             max=45,
-            help="also give roll and pitch, with random errors of this sigma, degrees",
+            help="also use roll and pitch, with random errors of this sigma, degrees",
         ),
     ] = None,
     height_sigma_m: Annotated[
         float | None,
         typer.Option(
-            min=0.01, max=1000, help="also give height, with random errors of this sigma, m"
+            min=0.01, max=1000, help="also use height, with random errors of this sigma, m"
         ),
     ] = None,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
@@ -102,7 +104,7 @@ def evaluate_command(
     ] = "auto",
     device: Annotated[
         DeviceChoice,
-        typer.Option(help="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
+        typer.Option(help="runs the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
     ] = "auto",
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,

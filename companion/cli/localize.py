@@ -61,19 +61,19 @@ def localize_command(
         float, typer.Option(min=0.01, max=1000, help="sigma of the priors' position, m")
     ] = 5.0,
     prior_sigma_deg: Annotated[
-        float, typer.Option(min=0.01, max=180, help="sigma of their attitude, degrees")
+        float, typer.Option(min=0.01, max=180, help="sigma of the priors' attitude, degrees")
     ] = 4.0,
     attitude_sigma_deg: Annotated[
         float | None,
         typer.Option(
             min=0.05,
             max=20,
-            help="sigma of the priors' roll and pitch where measured, deg",
+            help="sigma of the priors' roll and pitch, degrees, if measured",
         ),
     ] = None,
     height_sigma_m: Annotated[
         float | None,
-        typer.Option(min=0.05, max=100, help="sigma of the priors' height where it is measured, m"),
+        typer.Option(min=0.05, max=100, help="sigma of the priors' height, m, if it is measured"),
     ] = None,
     out: Annotated[Path, typer.Option(help="folder of the results")] = Path("localized"),
     rate_hz: Annotated[
@@ -85,7 +85,7 @@ def localize_command(
     ] = "auto",
     device: Annotated[
         DeviceChoice,
-        typer.Option(help="of the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
+        typer.Option(help="runs the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
     ] = "auto",
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
 ) -> None:

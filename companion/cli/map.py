@@ -62,12 +62,14 @@ def build(
     ] = None,
     up_axis: Annotated[
         Literal["y", "z"] | None,
-        typer.Option(help="of a mesh or tileset: y (glTF's default) or z (OBJ's)"),
+        typer.Option(help="upward axis of a mesh or tileset; default: y (glTF), z (OBJ)"),
     ] = None,
     height_unit: Annotated[
-        str | None, typer.Option(help="of a DSM without a unit: m, ft or us-ft")
+        str | None, typer.Option(help="height unit of a DSM that states none: m, ft or us-ft")
     ] = None,
-    nodata: Annotated[float | None, typer.Option(help="of a DSM without a nodata tag")] = None,
+    nodata: Annotated[
+        float | None, typer.Option(help="missing cells of a DSM that states none")
+    ] = None,
     flat_ground: Annotated[
         float | None,
         typer.Option(help="height of the ground, m, below an orthophoto without a DSM: a flat map"),
@@ -110,7 +112,7 @@ def build(
     ] = None,
     trust: Annotated[
         list[str] | None,
-        typer.Option(help="import in spite of the doubt that an error message names"),
+        typer.Option(help="accept the input that an error message doubts by this name"),
     ] = None,
 ) -> None:
     """Import a source into a tile cache; continues an interrupted build."""

@@ -26,7 +26,7 @@ def replay_command(
         Path | None, typer.Option("--map", help="instead of the record's map")
     ] = None,
     tolerance_m: Annotated[
-        float, typer.Option(min=0, help="largest difference of 95 % of the positions")
+        float, typer.Option(min=0, help="allowed difference, m; 95 % of the positions must meet it")
     ] = 1.0,
     page: Annotated[
         str | None,

@@ -21,7 +21,7 @@ def _group() -> None:
 @app.command("build")
 def build(
     out: Annotated[Path, typer.Option(help="folder of the tileset")],
-    seed: Annotated[int, typer.Option(min=0, help="which world")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the world")] = 0,
     variant: Annotated[
         str, typer.Option(help="survey: as a map shows it; live: another day and season")
     ] = "survey",

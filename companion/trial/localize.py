@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class FrameLocalizer:
         self._localizer, self._relocalizer, self._camera = localizer, relocalizer, camera
         self._told = {} if told is None else told
         self._loaded = 0
-        self._height_m: float | None = None
+        self._found_heights_m: list[float] = []  # of frames whose height was not known
 
     def load(self, recorded: RecordedFrame) -> Frame:
         """Load the image with its camera model, zoom included. Raises stream errors."""
@@ -78,7 +78,7 @@ class FrameLocalizer:
             return self._tracked(recorded.name, frame, prior.pose_prior(frame.exposure_time_ns))
         radius = max(_REGION_SIGMAS * prior.sigma_m, _LEAST_REGION_M)
         region = SearchRegion.circle(prior.pose.translation[:2], radius)
-        return self._found(recorded.name, frame, self._at_likely_height(prior), region)
+        return self._found(recorded.name, frame, prior, region)
 
     def anywhere(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
         """Search the whole map, without the frame's position."""
@@ -86,7 +86,7 @@ class FrameLocalizer:
             frame = self.load(recorded)
         except (StreamDecodeError, StreamSizeError, OSError) as error:
             return Localized(recorded.name, None, problem=str(error))
-        return self._found(recorded.name, frame, self._at_likely_height(prior), None)
+        return self._found(recorded.name, frame, prior, None)
 
     def _tracked(self, name: str, frame: Frame, prior: PosePrior) -> Localized:
         self._localizer.set_prior(prior)
@@ -101,14 +101,6 @@ class FrameLocalizer:
             estimate.accepted,
         )  # fmt: skip
 
-    def _at_likely_height(self, prior: FramePrior) -> FramePrior:
-        """Where the height is unknown, about that at which others of this flight were found."""
-        if prior.height_known or self._height_m is None:
-            return prior
-        ground = prior.height_m - prior.height_sigma_m
-        sigma = max(_FOUND_HEIGHT_SHARE * abs(self._height_m - ground), 5.0)
-        return replace(prior, height_m=self._height_m, height_sigma_m=sigma)
-
     def _found(
         self, name: str, frame: Frame, prior: FramePrior, region: SearchRegion | None
     ) -> Localized:
@@ -119,8 +111,8 @@ class FrameLocalizer:
             prior.height_sigma_m, region,
         )  # fmt: skip
         bands = [(prior.height_m, prior.height_sigma_m)]
-        if not prior.height_known and self._height_m is None:
-            bands = height_bands(prior)
+        if not prior.height_known:
+            bands = likely_height(prior, self._found_heights_m) or height_bands(prior)
         tried = (
             self._relocalizer().find(replace(query, height_m=height_m, height_sigma_m=sigma_m))
             for height_m, sigma_m in bands
@@ -129,8 +121,20 @@ class FrameLocalizer:
         if found is None:
             return Localized(name, None, searched=True, problem="no place was confirmed")
         if not prior.height_known:
-            self._height_m = float(found.world_from_camera.translation[2])
+            self._found_heights_m.append(float(found.world_from_camera.translation[2]))
         return Localized(name, found.world_from_camera, found.covariance, found.quality, True, True)
+
+
+def likely_height(prior: FramePrior, found_m: Sequence[float]) -> list[tuple[float, float]]:
+    """World z and its sigma (m) for a search, from the heights (m) of frames found so far: the
+    latest on which two agree, as one photo may be of the climb. Empty if no two agree.
+    """
+    ground = prior.height_m - prior.clearance_m
+    for one, other in combinations(reversed(found_m), 2):
+        sigma = max(_FOUND_HEIGHT_SHARE * abs(one - ground), 5.0)
+        if abs(one - other) < sigma:
+            return [(one, sigma)]
+    return []
 
 
 def height_bands(prior: FramePrior) -> list[tuple[float, float]]:

@@ -25,11 +25,11 @@ class CalibrationSigmas(BaseModel):
 
     focal_percent: float = Field(0.1, ge=0, le=20, description="of the focal length")
     principal_percent: float = Field(
-        0.11, ge=0, le=20, description="of the principal point, per axis, of the picture's width"
+        0.11, ge=0, le=20, description="of the principal point, per axis, % of the image width"
     )
     distortion: float = Field(0.003, ge=0, le=1, description="of k1; k2 as much, p1, p2 a tenth")
     readout_ms: float = Field(1.0, ge=0, le=100, description="of a rolling shutter's readout")
-    stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
+    stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' timestamps")
     map_m: float = Field(SENSORS.map_patch_m, exclude=True)  # of the map's surface, per axis
     map_length_m: float = Field(
         SENSORS.map_patch_length_m, exclude=True

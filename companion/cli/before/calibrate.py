@@ -30,7 +30,7 @@ def flight_command(
         Path | None, typer.Option(help="deployment file that the record was flown with")
     ] = None,
     write: Annotated[bool, typer.Option(help="change that file and keep the old one")] = False,
-    report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
+    report: Annotated[Path | None, typer.Option("--json", help="file for all figures")] = None,
 ) -> None:
     """Estimate camera, mounting angles, lever arm, time and map offset from a shadow flight."""
     from companion.calibrate.flight import calibrate

@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 FootageCamera = Annotated[
-    Path | None, typer.Option(help="camera.json; else the footage's own tags")
+    Path | None, typer.Option(help="camera.json; default: the footage's tags")
 ]
 FieldOfView = Annotated[
     float | None, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
 ]
 MountPitch = Annotated[
-    float, typer.Option(min=-180, max=180, help="of a camera on the airframe; -90 looks down")
+    float, typer.Option(min=-180, max=180, help="pitch of a fixed camera, degrees; -90 looks down")
 ]

@@ -32,7 +32,7 @@ def init_command(
         str | None, typer.Option(help="autopilot: serial:/dev/ttyTHS1:921600, udpin:HOST:PORT, ...")
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(help="camera.json of the calibration; else --fov")
+        Path | None, typer.Option(help="camera.json of the calibration; without it --fov")
     ] = None,
     fov: Annotated[
         float | None,
@@ -44,11 +44,12 @@ def init_command(
         Literal["gimbal", "fixed"] | None, typer.Option(help="fixed: screwed to the airframe")
     ] = None,
     mount_pitch: Annotated[
-        float, typer.Option(min=-180, max=180, help="of a fixed camera, nose up: -90 looks down")
+        float,
+        typer.Option(min=-180, max=180, help="pitch of a fixed camera, deg; -90 looks down"),
     ] = -90.0,
     record: Annotated[Path, typer.Option(help="folder of the flights' records")] = Path("flights"),
     listen: Annotated[
-        bool, typer.Option(help="read vehicle and stream; otherwise write only what is given")
+        bool, typer.Option(help="read vehicle and stream; without it write only what is given")
     ] = True,
     overwrite: Annotated[bool, typer.Option(help="replace an existing file")] = False,
     reference: Annotated[

@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 _FINEST_M = 0.2  # what a flight at 100 m and a working width of 320 can use, and some more
 _MB = 1e6
 
-Sources = Annotated[
-    list[Path] | None, typer.Option(help="YAML file of more sources; may be repeated")
-]
+Sources = Annotated[list[Path] | None, typer.Option(help="YAML file of more sources")]
 
 HeightProperty = Annotated[
     str | None, typer.Option(help="GeoJSON property; default: height and its usual spellings")

@@ -30,7 +30,7 @@ def plan_command(
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("plan"),
     condition: Annotated[
         list[str] | None,
-        typer.Option(help="day, season, dusk, night, fog, rain or snow; may be repeated (day)"),
+        typer.Option(help="day, season, dusk, night, fog, rain or snow; default: day"),
     ] = None,
     sigma: Annotated[
         float, typer.Option(min=0.05, max=100, help="largest acceptable position sigma, m")
@@ -45,7 +45,7 @@ def plan_command(
         float, typer.Option(min=-90, max=0, help="gimbal pitch if the mission has none")
     ] = -75.0,
     flown: Annotated[
-        Path | None, typer.Option(help="record of a flight of this mission: checks the forecast")
+        Path | None, typer.Option(help="compare the forecast with this record of the mission")
     ] = None,
     alternatives: Annotated[bool, typer.Option(help="search alternatives for failing legs")] = True,
 ) -> None:

@@ -35,13 +35,13 @@ def shadow_check_command(
         Path, typer.Option("--map", help="tile cache made by `companion map build`")
     ],
     config: Annotated[
-        Path | None, typer.Option(help="deployment file; else made from the footage")
+        Path | None, typer.Option(help="deployment file; default: made from the footage")
     ] = None,
     camera: FootageCamera = None,
     fov: FieldOfView = None,
     mount_pitch: MountPitch = -90.0,
-    rate_hz: Annotated[float, typer.Option(min=0.1, max=60, help="images a second, at most")] = 5.0,
-    report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
+    rate_hz: Annotated[float, typer.Option(min=0.1, max=60, help="most images per second")] = 5.0,
+    report: Annotated[Path | None, typer.Option("--json", help="file for all figures")] = None,
 ) -> None:
     """Play a recorded flight through bridge and integrity monitor, as in shadow mode.
 

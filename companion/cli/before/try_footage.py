@@ -42,7 +42,7 @@ def try_command(
     ] = 100,
     searches: Annotated[
         int,
-        typer.Option(min=0, max=2000, help="number of frames that are searched without position"),
+        typer.Option(min=0, max=2000, help="frames whose position is searched on the map"),
     ] = 20,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
 ) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import time
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,11 @@ from localizer.training.distributed import TrainingProcess
 from localizer.training.loop.log import append
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
+
+# torch's optimizers import Triton. Its LLVM and that of Mesa's software OpenGL, which the renderer
+# of pairs may load, end the process with a segmentation fault if Mesa's is loaded first.
+with suppress(ImportError):
+    importlib.import_module("triton")
 
 _log = logging.getLogger(__name__)
 

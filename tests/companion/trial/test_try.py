@@ -17,7 +17,7 @@ from companion.errors import FootageError, ReportError
 from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
-from companion.trial.localize import FrameLocalizer, Localized, height_bands
+from companion.trial.localize import FrameLocalizer, Localized, height_bands, likely_height
 from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
 from companion.trial.run import localize_each, placed, spread
@@ -214,6 +214,25 @@ def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_asse
     for true in (15.5, 30.0, 49.0, 100.0, 149.0):
         ((height, _),) = [(h, s) for h, s in bands if abs(h - true) <= s]
         assert 2 / 3 < height / true < 3 / 2
+
+
+@pytest.mark.parametrize(
+    ("found", "likely"),
+    [((), None), ((31,), None), ((31, 50), None), ((31, 50, 49), 49), ((50, 49, 31), 49)],
+)
+def test_one_photo_of_the_climb_does_not_set_the_height_of_a_flight(
+    small_assets, tmp_path, found, likely
+):
+    """With the height of the first photo found, 11 of 12 real ones 20 m above it were lost."""
+    cache = TileCache.open(small_assets.map_cache)
+    middle = cache.frame.position(np.zeros(3))
+    write_photo(tmp_path / "a.jpg", place=(middle.latitude_deg, middle.longitude_deg, 0.0))
+    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
+    (prior,) = priors_of(flight, cache).priors
+    ground = prior.height_m - prior.clearance_m
+    bands = likely_height(prior, [ground + height for height in found])
+    assert [round(z - ground) for z, _ in bands] == ([likely] if likely else [])
+    assert all(5.0 <= sigma < 10.0 for _, sigma in bands)
 
 
 @pytest.mark.parametrize(("factor", "told"), [(1.0, 0), (0.3048, 1), (0.6, 0)])

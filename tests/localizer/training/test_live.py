@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -98,3 +100,28 @@ def test_a_wrong_value_is_named(tmp_path: Path, line: str, wrong: str, why: str)
     path.write_text(text.replace(line, wrong, 1))
     with pytest.raises(ModelError, match=why):
         load_config(path)
+
+
+_OPENGL_FIRST = """
+import localizer.training.loop.train
+from localizer.errors import RenderError
+from localizer.render.base import StaticTiles
+from localizer.render.select import make_renderer
+try:
+    make_renderer("moderngl", StaticTiles([]))
+except RenderError as error:
+    raise SystemExit(str(error))
+import torch
+torch.optim.AdamW([torch.zeros(1, requires_grad=True)])
+print("made")
+"""
+
+
+def test_an_optimizer_can_be_made_after_a_software_opengl_was_opened() -> None:
+    """Mesa's LLVM, then Triton's, ended a training with a segmentation fault."""
+    result = subprocess.run(
+        [sys.executable, "-c", _OPENGL_FIRST], capture_output=True, text=True, check=False
+    )
+    if result.returncode == 1 and "Traceback" not in result.stderr:
+        pytest.skip(result.stderr.strip())
+    assert result.stdout == "made\n", (result.returncode, result.stderr)
