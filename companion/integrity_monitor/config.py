@@ -19,7 +19,7 @@ class VideoCheckConfig:
     still_s: float = 3.0  # time after which a frozen frame is reported
     repeat_memory_s: float = 60.0  # time over which repetition is searched
     repeat_s: float = 2.0  # length of a repetition that is reported
-    # `FrameVerdict.detail` that is too low; refusals begin below it (docs/results/accuracy.md)
+    # `FrameVerdict.detail` that is too low; refusals begin below it (docs/results/real.md)
     low_detail: float = 2.0
 
 

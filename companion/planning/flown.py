@@ -14,7 +14,7 @@ from localizer.forecast.risk import RISK_LIMIT
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 
-FLOWN_HEADINGS = ("leg", "forecast to hold", "held in flight", "forecast right", "places flown")
+FLOWN_HEADINGS = ("leg", "should work", "worked", "forecast right", "positions flown")
 
 
 @dataclass(frozen=True)

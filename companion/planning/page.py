@@ -24,10 +24,10 @@ tr.bad td{background:#fbe4e4}.verdict{font-size:1.15em;padding:.5em .8em;border-
 img{width:100%;max-width:1000px;border:1px solid #c9d0d8}small{color:#5b6470}
 """
 LEG_HEADINGS = (
-    "leg", "m", "holds", "sigma m", "lost or wrong", "map", "like it", "in", "why not"
+    "leg", "m", "works", "sigma m", "lost or wrong", "map", "similar", "condition", "reason"
 )  # fmt: skip
 STRETCH_HEADINGS = ("from m", "to m", "length m", "seconds", "drift m", "odometry")
-PROPOSAL_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
+PROPOSAL_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "works then")
 
 
 def verdict_words(plan: MissionForecast) -> str:
@@ -41,13 +41,13 @@ def verdict_words(plan: MissionForecast) -> str:
     if bad:
         lost = sum(s.length_m for s in plan.stretches)
         said = (
-            f"Vision will not do on {len(bad)} of {count}: {lost:.0f} of "
-            f"{plan.length_m:.0f} m have to be bridged or flown otherwise"
+            f"Vision fails on {len(bad)} of {count}: {lost:.0f} of {plan.length_m:.0f} m need "
+            f"odometry or another route"
         )
     else:
         which = f"the {count} that could be judged" if plan.not_judged else f"all {count}"
         said = (
-            f"Vision should hold on {which} ({plan.length_m / 1000:.1f} km), sigma below "
+            f"Vision should work on {which} ({plan.length_m / 1000:.1f} km), sigma below "
             f"{limit:g} m"
         )
     return said + (f". Not judged: {'; '.join(plan.not_judged)}." if plan.not_judged else ".")
@@ -78,7 +78,7 @@ def stretch_row(stretch: VisionGap) -> tuple[str, ...]:
         f"{stretch.length_m:.0f}",
         f"{stretch.seconds:.0f}",
         f"{stretch.drift_m:.1f}",
-        "carries it" if stretch.can_bridge else "ends before",
+        "continues" if stretch.can_bridge else "ends before",
     )
 
 
@@ -90,7 +90,7 @@ def proposal_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
             i.change.words,
             f"{100 * i.risk:.0f} %",
             f"{i.sigma_m:.2f}",
-            "yes" if i.holds else "better, but no",
+            "yes" if i.holds else "no, but better",
         )
         for i in plan.proposals
     ]
@@ -155,11 +155,11 @@ def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], pat
         f"<h1>Forecast of {escape(q.mission_file.name)}</h1>"
         f"<p class='verdict {'ok' if plan.holds else 'no'}'>{escape(verdict_words(plan))}</p>"
         f"<p>Under {escape(', '.join(q.conditions))}; sigma to {q.limits.sigma_m:g} m, at most "
-        f"{100 * q.limits.risk:.0f} % of the pictures lost or more than 1 m wrong.</p>"
+        f"{100 * q.limits.risk:.0f} % of the frames lost or more than 1 m wrong.</p>"
         + "<h2>Legs</h2>"
         + _table(LEG_HEADINGS, map(leg_row, plan.verdicts), bad)
-        + _part("To be bridged", STRETCH_HEADINGS, map(stretch_row, plan.stretches))
-        + _part("What would do instead", PROPOSAL_HEADINGS, proposal_rows(plan))
+        + _part("Without vision", STRETCH_HEADINGS, map(stretch_row, plan.stretches))
+        + _part("Alternatives", PROPOSAL_HEADINGS, proposal_rows(plan))
         + shown
         + "<ul>"
         + "".join(f"<li><small>{escape(note)}</small>" for note in plan.notes)

@@ -23,11 +23,11 @@ from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
 
 _OLD_SHADOW_DAYS = 7
 WHEN_VISION_ENDS = (
-    ("degraded, bridging N s", "odometry carries it on: turn back over ground that the map knows"),
+    ("degraded, bridging N s", "odometry continues: turn back over mapped ground"),
     ("lost; not sent: ...", "take over in ALT_HOLD or STABILIZE, or select GNSS if it is good"),
     ("5 to 8 s later", "ArduPilot lands (EKF Failsafe) unless somebody has taken over"),
-    ("output held: ...", "do not believe the position; look which of the two is wrong"),
-    ("place found, the EKF follows", "choose the mode again: ArduPilot stays in LAND"),
+    ("output held: ...", "no position is sent: take over, or select GNSS if it is good"),
+    ("cleared: EKF jump", "select the mode again: ArduPilot stays in LAND"),
 )
 
 
@@ -153,10 +153,10 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
     if data.get("map_sha256") != _hash(flown):
         return SheetRow("forecast", f"{mission}: made over another map than {flown}", False)
     if data["holds"] and not bad:
-        text = f"{mission}: vision should hold on all {len(legs)} legs ({conditions})"
+        text = f"{mission}: vision should work on all {len(legs)} legs ({conditions})"
         return SheetRow("forecast", text, True)
     text = (
-        f"{mission}: vision will not do on {len(bad)} of {len(legs)} legs ({conditions}): "
+        f"{mission}: vision fails on {len(bad)} of {len(legs)} legs ({conditions}): "
         f"{', '.join(bad)}"
     )
     return SheetRow("forecast", text, False)

@@ -117,8 +117,7 @@ def judge(trial: Trial) -> Judgement:
 
     WORKS: 80 % of the frames are localized, no search finds a wrong place, and the median
     difference from GNSS, if known, is at most `spread_limit_m`. PARTLY: 30 % are localized, but one
-    of these conditions fails. NOT: fewer than 30 %. UNKNOWN: fewer than 30 % of fewer than
-    `LEAST_FRAMES` frames, also of none.
+    of these conditions fails. NOT: fewer than 30 %. UNKNOWN: fewer than `LEAST_FRAMES` frames.
     """
     count = len(trial.best)
     localized = sum(one.accepted for one in trial.best)

@@ -92,8 +92,8 @@ def plan_command(
     document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}
     (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
-    _print("to be bridged", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
-    _print("what would do instead", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))
+    _print("without vision", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
+    _print("alternatives", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))
     if legs:
         _print("flown", check.FLOWN_HEADINGS, [leg.row for leg in legs])
         Console().print(check.flown_words(legs), highlight=False, soft_wrap=True)

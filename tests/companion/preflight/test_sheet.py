@@ -55,7 +55,7 @@ def test_each_line_is_of_its_source(deployment, tmp_path):
     now = datetime.now(timezone.utc)
     found = rows(make_sheet(path, config, Diagnosis((GOOD, WRONG)), plan, now))
     assert found["parameters and parts"] == ("1 of 2 checks good; wrong: VISO_TYPE", False)
-    assert found["forecast"][0] == "a.plan: vision will not do on 1 of 2 legs (dusk): 2-3"
+    assert found["forecast"][0] == "a.plan: vision fails on 1 of 2 legs (dusk): 2-3"
     assert found["shadow score"] == ("ready: 0.4 m for 120 s (day-2, today)", True)
     assert found["map"][1] is False
     assert "2026-11-02" in found["calibration"][0]
