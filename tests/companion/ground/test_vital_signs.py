@@ -14,7 +14,8 @@ SECOND = 10**9
 
 def estimate(time_ns, *, accepted=True, state=TrackingState.TRACKING, sigma=0.3):
     covariance = np.diag([sigma**2, sigma**2, 1.0, 0.0, 0.0, 0.0])
-    return estimated(time_ns=time_ns, covariance=covariance, state=state, accepted=accepted)
+    said = {"covariance": covariance, "quality": 0.8, "state": state, "accepted": accepted}
+    return estimated(time_ns=time_ns, **said)
 
 
 def test_what_a_good_flight_says():

@@ -95,7 +95,7 @@ def fields_of(packet):
 
 def estimate(time_ns, east=0.0, accepted=True, tilt=0.0):
     pose = Pose(so3_exp([tilt, 0.0, 0.0]) @ DOWN, np.array([east, 0.0, 100.0]))
-    return estimated(pose, time_ns, accepted=accepted, camera=CAMERA)
+    return estimated(pose, time_ns, quality=0.8, accepted=accepted, camera=CAMERA)
 
 
 def test_the_fields_of_a_picture_are_where_it_was_taken_and_what_it_shows():

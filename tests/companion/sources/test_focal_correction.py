@@ -76,7 +76,7 @@ def test_on_rendered_pictures_it_finds_the_lens(small_assets: FlightAssets) -> N
 
 
 def estimate(time_ns: int, factor: float, sigma: float = 0.003) -> PoseEstimate:
-    return estimated(time_ns=time_ns, camera=CAMERA, focal=FocalFit(factor, sigma))
+    return estimated(time_ns=time_ns, quality=0.8, camera=CAMERA, focal=FocalFit(factor, sigma))
 
 
 class Lens:
