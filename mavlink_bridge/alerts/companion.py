@@ -38,8 +38,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               {"seconds": "s", "metres": "m"},
               "no frame has matched the map for 2 s; odometry continues the position",
               "three frames in a row match the map, or odometry fails (`lost`)",
-              f"{_SENT}, with a covariance that grows, until `hpl_over_limit`; N m: 95 % bound of "
-              "the position error",
+              f"{_SENT}, with a covariance that grows, until `hpl_over_limit`; N s: time since the "
+              "last match; N m: 95 % bound of the position error",
               "fly back over mapped ground with buildings and roads"),
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
               "ten frames in a row are rejected, the predicted position is too old, or odometry "
@@ -112,7 +112,8 @@ HEALTH: tuple[AlertSpec, ...] = (
     event(A.COMPANION_RESTARTS, CRITICAL, "companion {how} ({what}), restarting",
           {"how": ProcessFault, "what": "name"}, "with `companion run --supervised`: the flight "
           "process crashed, was killed, or hangs (a thread for 4 s, the process for 3 s)",
-          f"the supervisor starts it again at once; {_NO_FIX} for some seconds", _TAKE_OVER),
+          f"the supervisor starts it again at once; {_NO_FIX} for some seconds; WHAT: thread or "
+          "signal", _TAKE_OVER),
     event(A.COMPANION_WAITS, CRITICAL, "companion {how} ({what}), again in {seconds:.0f} s",
           {"how": ProcessFault, "what": "name", "seconds": "s"},
           "with `companion run --supervised`: the flight process crashed, was killed or hung for "

@@ -17,9 +17,9 @@ _OR_GNSS = "select the GNSS source set if GNSS is good"
 INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VIDEO_FROZEN, ERROR, "video frozen", "video frozen {seconds:.0f} s",
               {"seconds": "s"},
-              "in flight: frames are identical for 1.5 s; or the image does not move while the "
-              "EKF's velocity moves the vehicle by 2 m; or the image does not move for 3 s (for 2 "
-              "s + 0.027 s per metre of ground across the image, if that is longer)",
+              "in flight: identical frames for 1.5 s; or no image motion while the EKF's velocity "
+              "moves the vehicle by 2 m; or no image motion for 3 s (2 s + 0.027 s per metre of "
+              "ground across the image, if that is longer)",
               "the image moves for 2 s",
               "camera or link repeat an old frame, so the position from vision stands still",
               _TAKE_OVER, action=OutputAction.EXCLUDE_AND_RESET, clear_s=2.0),

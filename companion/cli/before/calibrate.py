@@ -136,8 +136,8 @@ def board_command(
     if sheet is not None:
         made = write_sheet(sheet, paper)
         console.print(
-            f"{sheet}: print it at 100 % on {paper}, glue it on something flat; a square is "
-            f"{made.square_mm:g} mm then (its size does not matter, that it is flat does)",
+            f"{sheet}: print it at 100 % on {paper} and glue it on a flat plate; a square is then "
+            f"{made.square_mm:g} mm (another size does no harm)",
             soft_wrap=True, highlight=False,
         )  # fmt: skip
     if source is None:

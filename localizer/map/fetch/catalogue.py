@@ -29,37 +29,45 @@ class CatalogueSource(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{1,60}$", description="how it is asked for")
-    title: str = Field(description="what it is")
-    kind: Kind = Field(description="how it is spoken to")
+    name: str = Field(
+        pattern=r"^[a-z0-9][a-z0-9-]{1,60}$", description="name in --imagery, --heights"
+    )
+    title: str = Field(description="description for the list of sources")
+    kind: Kind = Field(description="protocol")
     role: Role = Field(description="imagery, surface (with roofs and trees) or terrain (without)")
     url: str = Field(
         description="address; xyz and tms with {z} {x} {y}; cog may have {lat} and {lon}, the "
         "south-west corner of a degree as N47 and E008; stac a catalogue's file or an API"
     )
-    licence: str = Field(min_length=3, description="its name, and where it can be read")
-    attribution: str = Field(min_length=2, description="who must be named; goes into the map")
-    country: str = Field(min_length=2, max_length=60, description="where it is")
-    bounds: tuple[float, float, float, float] = Field(description="west, south, east, north")
-    resolution_m: float = Field(gt=0.01, le=1000, description="metres a pixel, at its best")
-    layer: str = Field("", description="layer (wms, wmts), coverage (wcs), collection (stac)")
-    style: str = Field("", description="of wms and wmts; none: the service's own")
-    crs: str = Field("EPSG:3857", description="that wms or wcs is asked in")
-    format: str = Field("", description="MIME type asked for; none: JPEG, GeoTIFF for heights")
-    version: str = Field("", description="of the protocol; none: wms 1.3.0, wcs 2.0.1")
-    axes: tuple[str, str] | None = Field(
-        None, description="of wcs 2.0.1: names of easting and northing; none: as it says itself"
+    licence: str = Field(min_length=3, description="name of the licence, and its address")
+    attribution: str = Field(min_length=2, description="attribution; stored in the map")
+    country: str = Field(min_length=2, max_length=60, description="country or region")
+    bounds: tuple[float, float, float, float] = Field(
+        description="west, south, east, north, degrees"
     )
-    matrix_set: str = Field("", description="of wmts; none: the first in EPSG:3857")
-    asset: str = Field("", description="of stac: its key, * for any text; none: the first GeoTIFF")
-    most_zoom: int = Field(19, ge=0, le=24, description="of xyz and tms")
+    resolution_m: float = Field(gt=0.01, le=1000, description="metres a pixel of the finest data")
+    layer: str = Field("", description="layer (wms, wmts), coverage (wcs), collection (stac)")
+    style: str = Field("", description="of wms and wmts; empty: the default of the service")
+    crs: str = Field("EPSG:3857", description="coordinate system of wms and wcs requests")
+    format: str = Field("", description="requested MIME type; empty: JPEG, GeoTIFF for heights")
+    version: str = Field("", description="of the protocol; empty: wms 1.3.0, wcs 2.0.1")
+    axes: tuple[str, str] | None = Field(
+        None, description="of wcs 2.0.1: names of easting and northing; null: read from the service"
+    )
+    matrix_set: str = Field("", description="of wmts; empty: the first in EPSG:3857")
+    asset: str = Field(
+        "", description="of stac: key of the asset, * for any text; empty: the first GeoTIFF"
+    )
+    most_zoom: int = Field(19, ge=0, le=24, description="finest zoom level of xyz and tms")
     tile_px: int = Field(256, ge=64, le=4096, description="side of a tile, of xyz and tms")
-    piece_px: int = Field(1024, ge=64, le=8192, description="side of what is asked for at once")
+    piece_px: int = Field(1024, ge=64, le=8192, description="side of one request, pixels")
     vertical_datum: VerticalDatum | None = Field(None, description="of heights")
-    nodata: float | None = Field(None, description="what missing heights are, if it does not say")
-    date: str | None = Field(None, description="of the pictures: 2024, 2024-06 or 2024-06-30")
+    nodata: float | None = Field(
+        None, description="value of missing heights, if the file does not state it"
+    )
+    date: str | None = Field(None, description="date of the images: 2024, 2024-06 or 2024-06-30")
     rate_per_s: float = Field(4.0, gt=0, le=50, description="requests a second, at most")
-    parallel: int = Field(4, ge=1, le=8, description="requests under way at once, at most")
+    parallel: int = Field(4, ge=1, le=8, description="simultaneous requests, at most")
 
     @model_validator(mode="after")
     def _holds(self) -> CatalogueSource:
