@@ -21,7 +21,7 @@ from localizer.registration.jngo import JNGO
 from localizer.relocalization import verdict
 from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.overview import open_overview, overview_key
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.render.numba_raster import NumbaRenderer
@@ -51,7 +51,7 @@ def opened(cache):
 @pytest.fixture(scope="module")
 def truth(small_assets):
     ground = float(small_assets.world.ground_height(*PLACE))
-    rotation = turned(so3_exp((np.radians(20), 0, 0)) @ DOWN, np.radians(143))
+    rotation = with_heading(so3_exp((np.radians(20), 0, 0)) @ DOWN, np.radians(143))
     return Pose(rotation, np.array([*PLACE, ground + 110.0]))
 
 
@@ -69,18 +69,12 @@ def query(small_assets, truth):
     """The frame of another day; the heading that is given is 100 degrees off, the height 2 m."""
     return PlaceQuery(
         Frame(seen_from(truth, small_assets), 123, CAMERA, 7),
-        turned(so3_exp((0.005, -0.004, 0)) @ truth.rotation, np.radians(100)),
+        with_heading(so3_exp((0.005, -0.004, 0)) @ truth.rotation, np.radians(100)),
         tilt_sigma_rad=np.radians(0.7),
         heading_sigma_rad=None,
         height_m=float(truth.translation[2]) + 2.0,
         height_sigma_m=2.0,
     )
-
-
-@pytest.fixture(scope="module")
-def candidates(opened, query):
-    """Where the frame may be, the likeliest first: a search over the whole map."""
-    return opened.relocalizer.search(query)
 
 
 def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
@@ -95,11 +89,10 @@ def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
     assert off @ np.linalg.solve(found.covariance[:3, :3], off) < 30
 
 
-def test_a_twin_that_is_as_credible_forbids_an_answer(
-    opened, query, truth, candidates, monkeypatch
-):
+def test_a_twin_that_is_as_credible_forbids_an_answer(opened, query, truth, monkeypatch):
     """Equal roofs: both places agree, so neither is given; a rival that disagrees is none."""
     relocalizer = opened.relocalizer
+    candidates = relocalizer.search(query)
     best, *_ = relocalizer.verify(query, candidates)
     away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
     result = replace(best.result, world_from_camera=away, quality=best.result.quality - 0.01)
@@ -109,34 +102,30 @@ def test_a_twin_that_is_as_credible_forbids_an_answer(
         assert (relocalizer.confirm(query, candidates) is None) is credible
 
 
-def test_a_place_that_stands_out_need_not_be_decisive(
-    opened, query, truth, candidates, monkeypatch
-):
+def test_a_place_that_stands_out_need_not_be_decisive(opened, query, truth, monkeypatch):
     """Other ground looks alike from above. It is no rival where its own registration says so; where
     it fits nearly as badly as the answer, or was never looked at, there is none.
     """
     relocalizer = opened.relocalizer
-    best, *_ = relocalizer.verify(query, candidates[:1])
+    best, *_ = relocalizer.verify(query, relocalizer.search(query)[:1])
     best = replace(best, log_odds=3.0)
     assert not best.is_decisive
     away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
-    places = [best.candidate, PlaceCandidate(away, best.candidate.score)]
+    candidates = [best.candidate, PlaceCandidate(away, best.candidate.score)]
 
-    def answer(share, looked_at=True):
+    def decide(share, looked_at=True):
         result = replace(best.result, world_from_camera=away, quality=share * best.result.quality)
         other = replace(best, rank=1, result=result, credible=False)
-        judged = [best, other] if looked_at else [best]
-        monkeypatch.setattr(relocalizer, "verify", lambda *_: judged)
-        return relocalizer.confirm(query, places)
+        registered = [best, other] if looked_at else [best]
+        monkeypatch.setattr(relocalizer, "verify", lambda *_: registered)
+        return relocalizer.confirm(query, candidates)
 
-    assert answer(0.5) is not None
-    assert answer(0.9) is None
-    assert answer(0.5, looked_at=False) is None
+    assert decide(0.5) is not None
+    assert decide(0.9) is None
+    assert decide(0.5, looked_at=False) is None
 
 
-def test_ground_that_looks_alike_costs_few_registrations(
-    cache, query, truth, candidates, monkeypatch
-):
+def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, monkeypatch):
     """Forty places whose ground looks like the frame from above: rendered, the others do not. Each
     was registered before, and the one that was not left no answer.
     """
@@ -144,26 +133,25 @@ def test_ground_that_looks_alike_costs_few_registrations(
     register = JNGO.register
     monkeypatch.setattr(JNGO, "register", lambda *a, **k: registered.append(1) or register(*a, **k))
     monkeypatch.setattr(verdict, "DECISIVE", np.inf)
-    best = candidates[0]
     with open_relocalizer(cache, CONFIG) as found:
+        best = found.search(query)[0]
         places = [np.array([x, y]) for x in range(-160, 161, 40) for y in (-150, -90, 30, 90, 150)]
         alike = [
             replace(best, world_from_camera=Pose(truth.rotation, np.array([*p, query.height_m])))
             for p in places
         ]
+        registered.clear()
         answer = found.confirm(query, [*alike[:20], best, *alike[20:]])
     assert answer is not None
     assert answer.world_from_camera.distance_to(truth)[0] < 1.0
     assert len(registered) <= 12
 
 
-def test_a_doubt_that_the_last_pass_leaves_is_settled(
-    opened, query, truth, candidates, monkeypatch
-):
+def test_a_doubt_that_the_last_pass_leaves_is_settled(opened, query, truth, monkeypatch):
     """Decisive at first, no other candidate was registered; no longer decisive at the end, they
     have to be known not to be the place.
     """
-    best = candidates[0]
+    best = opened.relocalizer.search(query)[0]
     alike = [
         replace(best, world_from_camera=Pose(truth.rotation, np.array([x, 120.0, query.height_m])))
         for x in (-120.0, -60.0, 0.0, 60.0, 120.0)
@@ -189,11 +177,11 @@ def test_a_low_camera_among_high_houses_is_found_from_candidates_aside(opened, s
     a registration alone found two of eight back (the flight covered-10s was not found again).
     """
     place, up_m = np.array([36.5, 63.7]), 62.0
-    rotation = turned(so3_exp((np.radians(10), 0, 0)) @ DOWN, np.radians(-90))
+    rotation = with_heading(so3_exp((np.radians(10), 0, 0)) @ DOWN, np.radians(-90))
     truth = Pose(rotation, np.array([*place, up_m]))
     query = PlaceQuery(
         Frame(seen_from(truth, small_assets), 123, CAMERA, 7),
-        turned(truth.rotation, np.radians(4)),
+        with_heading(truth.rotation, np.radians(4)),
         tilt_sigma_rad=np.radians(1),
         heading_sigma_rad=np.radians(10),
         height_m=up_m + 1.0,
