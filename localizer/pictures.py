@@ -18,8 +18,8 @@ _COUNTS = 1 << 16
 
 
 def read_rgb(path: Path) -> Image:
-    """RGB image (H, W, 3) of a file, turned as its EXIF data say; `SequenceError` if it is none, or
-    of 16-bit grey: there is nobody to ask for the range.
+    """RGB image (H, W, 3) of a file, rotated by its EXIF data. `SequenceError` if it is no image,
+    or of 16-bit grey, whose range is unknown here.
     """
     try:
         rgb = decode_rgb(path.read_bytes())
@@ -36,7 +36,7 @@ def decode_rgb(
     data: bytes, *, turned: bool = True, grey_range: GreyRange | None = None
 ) -> Image | None:
     """RGB image (H, W, 3) of a file's content, grey ones with three equal channels; None if it is
-    no image. turned: as its EXIF data say. `GreyRangeError` for 16-bit grey without a range.
+    no image. turned: rotate it by its EXIF data. `GreyRangeError` for 16-bit grey without a range.
     """
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
     if not turned:

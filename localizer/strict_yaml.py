@@ -41,11 +41,11 @@ class _StrictLoader(yaml.SafeLoader):
         return node
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        """Of a number that says itself."""
+        """An integer, if its notation is decimal or explicit."""
         return int(_plain(node, super().construct_yaml_int(node)))
 
     def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
-        """Likewise."""
+        """A float, if its notation is decimal."""
         return float(_plain(node, super().construct_yaml_float(node)))
 
 
@@ -56,7 +56,7 @@ for _kind, _read in (
 
 
 def _plain(node: yaml.ScalarNode, number: float) -> float:
-    """The number of a scalar, unless YAML 1.1 reads it to base 60 or 8."""
+    """The number of a scalar; an error if YAML 1.1 reads it to base 60 or 8."""
     text = str(node.value)
     if ":" in text or _OCTAL.fullmatch(text):
         base = "60" if ":" in text else "8"

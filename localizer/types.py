@@ -92,7 +92,7 @@ class Anchors:
 
 @dataclass(frozen=True)
 class ReferenceBundle:
-    """The rendered reference view and its geo-anchors (paper, Eq. 2)."""
+    """The rendered reference view and its geo-anchors (paper, Eq. 2). time_ns: of its pose."""
 
     view: RenderedView
     anchors: Anchors
@@ -121,7 +121,7 @@ class PosePrior:
         rotation_sigma_deg: float = 4.0,
         time_ns: int = 0,
     ) -> PosePrior:
-        """A pose with standard deviations per axis, metres and degrees."""
+        """A prior of a pose: position_sigma_m on each axis, and rotation_sigma_deg about each."""
         sigma = np.repeat([position_sigma_m, np.radians(rotation_sigma_deg)], 3)
         return cls(world_from_camera, np.diag(sigma**2), time_ns)
 
@@ -157,7 +157,7 @@ class FocalFit:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """The localizer's answer for one frame.
+    """The localizer's result for one frame.
 
     covariance: (6, 6) as in `PosePrior`: east, north, up (m) and rotation about them (rad).
     quality: 0 to 1. status: whether the registration gave a pose. accepted: whether the integrity
@@ -206,7 +206,7 @@ class TargetSurface:
 
 @dataclass(frozen=True)
 class TargetSighting:
-    """An observed pixel with the surfaces (at least one) that it may show; time_ns: exposure."""
+    """A target's pixel and the surfaces (at least one) that it may show; time_ns: exposure."""
 
     target_id: str
     surfaces: tuple[TargetSurface, ...]

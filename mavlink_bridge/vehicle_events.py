@@ -14,6 +14,7 @@ _LOST_NS = 1_000_000_000  # beyond the freshness of a report, 1.5 s
 _PAID_BACK = 0.25  # of that time by each moment in which it is well: half of it is no GNSS
 _BACK_NS = 5_000_000_000
 _HELD_NS = 10_000_000_000
+_FIRST_NS = 3_000_000_000  # for the first GNSS report, which a vehicle met in flight sends later
 
 
 class VehicleEvents:
@@ -25,6 +26,7 @@ class VehicleEvents:
         self._back_ns: int | None = None  # since when it is well again
         self._bad_ns = self._looked_ns = 0  # for how long it was not, on balance
         self._armed = False
+        self._unheard_ns: int | None = None  # since when it is armed, before any GNSS report
         self._held_ns: int | None = None
 
     def look(
@@ -35,6 +37,10 @@ class VehicleEvents:
         """
         healthy = gnss_healthy(state, now_ns)
         self._follow_gnss(healthy and not (refused and not self._gnss), now_ns, injecting=injecting)
+        if state.armed and not state.gps_time_ns:
+            self._unheard_ns = self._unheard_ns or now_ns
+            if now_ns - self._unheard_ns < _FIRST_NS:
+                return
         if state.armed and not self._armed and not healthy:
             self._notifier.report(alert(AlertId.ARMED_WITHOUT_GNSS, output=_output(injecting)))
         self._armed = state.armed

@@ -130,11 +130,11 @@ def demo(
     _clear(out)
     port = free_console_port()
     with shown_progress(console) as progress:
-        onlookers = FlightObservers(
+        observers = FlightObservers(
             progress, partial(_tell_endpoint, console), port, partial(_tell_page, console)
         )
         program = shlex.split(companion) if companion else THIS_PROGRAM
-        record = fly(assets, script, kinds[fc], seed, out, onlookers, program)
+        record = fly(assets, script, kinds[fc], seed, out, observers, program)
     _report(console, record, script, seed)
 
 
@@ -240,7 +240,7 @@ def loop_table(
 def _runner(
     fc: str, out: Path, seeds: str = "1", worlds: Path | None = None
 ) -> tuple[Console, RunOptions]:
-    """Where a run of several flights prints, and its options, checked."""
+    """Console and checked options for a command that flies several flights."""
     if fc not in _SUITE_KINDS:
         raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
     if out.exists() and not out.is_dir():

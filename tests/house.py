@@ -25,7 +25,7 @@ _MANY_PARAMETERS = {
     "localizer/registration/cuda/curvature.py:winner_curvature",
     "localizer/odometry/keyframe.py:keyframe_anchors",
     # The launch of a kernel: the fields of its argument block.
-    "localizer/registration/cuda/steps.py:refining",
+    "localizer/registration/cuda/steps.py:refine_launch",
     # What they are made of is opened elsewhere (`open_localizer`, the training's run).
     "localizer/tracking/pipeline.py:__init__",
     "localizer/training/data/live.py:__init__",

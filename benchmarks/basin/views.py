@@ -31,7 +31,7 @@ from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sampl
 from localizer.synth.config import SURVEY, WorldConfig
 from localizer.synth.visits.visit import Visit, draw_look
 from localizer.synth.world import build_visits
-from localizer.training.data.batches import tamed
+from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import look_at, soften
 from localizer.types import Image, RenderedView
 
@@ -216,7 +216,7 @@ def _random_pose(
 
 
 def _weathered(seen: RenderedView, condition: str, rng: np.random.Generator) -> Image:
-    look = tamed(sample_appearance(rng, condition), seen.depth)
+    look = limit_haze(sample_appearance(rng, condition), seen.depth)
     return apply_appearance(soften(rng, seen.rgb), seen.depth, look, rng)
 
 

@@ -29,8 +29,8 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.rules import ImportRules
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
-from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, regrown
-from localizer.training.data.batches import tamed
+from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
+from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import SEASON, look_at, moved
 from localizer.training.places.photos import read_photo
 from localizer.training.places.seasons import season_shift
@@ -95,7 +95,7 @@ def _photo_pairs(
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
             query = apply_appearance(
-                query, depth, tamed(sample_appearance(rng, condition), depth), rng
+                query, depth, limit_haze(sample_appearance(rng, condition), depth), rng
             )
         view = renderer.render(moved(rng, truth, np.inf, (METRES, DEGREES)), camera, wait=True)
         if condition in (COARSE_MAP, OLDER_MAP):
@@ -132,7 +132,7 @@ def _rendered_pairs(
         if condition == SEASON:
             query = _image(season_shift(_squared(query), rng), query.shape)
         look = sample_appearance(rng, "day" if condition == SEASON else condition)
-        query = apply_appearance(query, seen.depth, tamed(look, seen.depth), rng)
+        query = apply_appearance(query, seen.depth, limit_haze(look, seen.depth), rng)
         pairs.append(TestPair(view, query, truth, condition, place=len(pairs)))
     return pairs
 
@@ -142,7 +142,7 @@ def _regrown_image(view: RenderedView, rng: np.random.Generator) -> Image:
     pixel_m = float(np.median(view.depth[view.depth > 0])) / view.camera.fx
     albedo = _squared(view.rgb)
     hard = hard_surfaces((albedo * 255).astype(np.uint8))
-    return _image(regrown(albedo, hard, pixel_m, rng), view.rgb.shape)
+    return _image(with_new_texture(albedo, hard, pixel_m, rng), view.rgb.shape)
 
 
 def _squared(rgb: Image) -> Float32:
@@ -174,7 +174,7 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
         surveyed, flown = dates[:: -1 if dry_map else 1]
         view, query, truth = _plot_pair(surveyed, flown, rng, size)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
-        query = apply_appearance(query, seen, tamed(sample_appearance(rng, "day"), seen), rng)
+        query = apply_appearance(query, seen, limit_haze(sample_appearance(rng, "day"), seen), rng)
         condition = "dry map, green flight" if dry_map else "green map, dry flight"
         pairs.append(TestPair(view, query, truth, condition, place=k // 2 % len(plots)))
     return pairs

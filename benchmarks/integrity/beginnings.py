@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.basin.views import BasinView
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.types import PosePrior
 
 NEAR = ((3.0, 3.0), (3.0, 3.0), (8.0, 8.0))  # metres and degrees of heading
@@ -89,7 +89,7 @@ def _off(truth: Pose, metres: float, degrees: float, rng: np.random.Generator) -
     shift = np.array([metres * np.cos(angle), metres * np.sin(angle), rng.normal(0, height_m)])
     tilt = np.array([*rng.normal(0, np.radians(tilt_deg), 2), 0.0])
     turn = np.radians(degrees) * rng.choice((-1.0, 1.0))
-    rotation = turned(so3_exp(tilt) @ truth.rotation, float(turn))
+    rotation = with_heading(so3_exp(tilt) @ truth.rotation, float(turn))
     level, tilted = metres / np.sqrt(2), np.radians(tilt_deg)
     sigma: Array = np.array([level, level, height_m, tilted, tilted, np.radians(degrees)])
     return PosePrior(Pose(rotation, truth.translation + shift), np.diag(sigma**2), 0)

@@ -127,7 +127,7 @@ class MapRegistrar:
         if anchors is None:
             return None
         found = self._optimizer.register(query, begun.camera, anchors, begun.prior, seed=index)
-        return self._optimizer.focal_tested(query, begun.camera, anchors, found)
+        return self._optimizer.with_focal_gain(query, begun.camera, anchors, found)
 
     def _anchors(self, begun: RegistrationStart, camera: Camera, seed: int) -> Anchors | None:
         pose = begun.prior.world_from_camera

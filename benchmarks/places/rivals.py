@@ -137,7 +137,7 @@ class Rendered:
             self._silent += 1
             lost = self._silent > _LOST_AFTER
             time_ns = frame.exposure_time_ns
-            self._state = motion.kept(ahead, time_ns, self._config, None) if lost else ahead
+            self._state = motion.reset_motion(ahead, time_ns, self._config, None) if lost else ahead
             return None
         self._silent = 0
         if passes > 1:  # what the first passes found replaces the prior, as in ours

@@ -19,8 +19,8 @@ from localizer.features.detail import DetailExtractor
 from localizer.forecast.forecast import (
     LEAST_MAP,
     Forecaster,
+    draw_prior,
     position_sigma_m,
-    prior_of,
 )
 from localizer.forecast.risk import WORST_M, Figures
 from localizer.geometry.pose import Pose
@@ -117,7 +117,7 @@ class LegFlyer:
         look: Any,
         rng: np.random.Generator,
     ) -> RegisteredFrame:
-        prior = prior_of(pose, rng)
+        prior = draw_prior(pose, rng)
         reference = self._map.render(prior.world_from_camera, live.camera, wait=True)
         if (reference.depth > 0).mean() < LEAST_MAP:
             return RegisteredFrame(accepted=False, error_m=WORST_M, sigma_m=WORST_M)

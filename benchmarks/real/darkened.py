@@ -27,7 +27,7 @@ with needs_torch():
 from companion.integrity_monitor.config import VideoCheckConfig
 from companion.integrity_monitor.video import detail, thumbnail
 from localizer.types import Image
-from sitl.camera.faults import darkened
+from sitl.camera.faults import darken
 
 _LIGHTS = tuple((1.0 / n, gain) for gain in (1.0, 16.0)
                 for n in (64, 256, 512, 1024, 2048, 4096, 8192, 16384))  # fmt: skip
@@ -49,7 +49,7 @@ class DarkenedView(RealView):
         if self.light == 1.0:
             return rgb
         rng = np.random.default_rng((self.seed, int(1.0 / self.light), int(self.most_gain)))
-        return darkened(rgb, self.light, self.most_gain, rng)
+        return darken(rgb, self.light, self.most_gain, rng)
 
 
 def rows(name: str, views: list[RealView]) -> Iterator[tuple[float, bool]]:

@@ -23,7 +23,7 @@ from localizer.evaluation.sequences import Sequence as Recorded
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.opening import open_localizer
 from localizer.tracking.pipeline import Localizer, working_camera
@@ -99,7 +99,7 @@ def judged_images(
             renderer = NumbaRenderer(streamer, 1)
             for k, view in mine:
                 frame = Frame(view.image(), times[k], view.camera, k)
-                prior = prior_of(view.truth, sensors, k, times[k])
+                prior = draw_prior(view.truth, sensors, k, times[k])
                 if displaced is not None and view.map_cache == own[k]:
                     prior = _displaced(prior, (displaced, k))
                 estimate = _localized(localizer, frame, prior)
@@ -111,7 +111,7 @@ def judged_images(
                     yield image
 
 
-def prior_of(truth: Pose, sensors: DrawnSensors, index: int, time_ns: int) -> PosePrior:
+def draw_prior(truth: Pose, sensors: DrawnSensors, index: int, time_ns: int) -> PosePrior:
     """Up to `OFF_M` beside the truth, with what the sensors report."""
     rng = np.random.default_rng((11, index))
     tilt = np.radians(_UNKNOWN_TILT_DEG)
@@ -120,7 +120,7 @@ def prior_of(truth: Pose, sensors: DrawnSensors, index: int, time_ns: int) -> Po
     off = np.array([*rng.uniform(-OFF_M, OFF_M, 2), rng.normal(0.0, HEIGHT_SIGMA_M)])
     level = OFF_M / np.sqrt(3.0)
     sigma = np.array([level, level, HEIGHT_SIGMA_M, tilt, tilt, np.radians(OFF_HEADING_DEG)])
-    pose = Pose(turned(rotation, heading), truth.translation + off)
+    pose = Pose(with_heading(rotation, heading), truth.translation + off)
     return sensors.in_prior(PosePrior(pose, np.diag(sigma**2), time_ns), truth, index)
 
 

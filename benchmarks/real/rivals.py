@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.features.methods import Method, load_xfeat, matched_pose, sift_pnp
-from benchmarks.real.judged import HEIGHT_SIGMA_M, distance_to_ground, ground_centre, prior_of
+from benchmarks.real.judged import HEIGHT_SIGMA_M, distance_to_ground, draw_prior, ground_centre
 from benchmarks.real.sets import RealView, SetDescription
 from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.geometry.pose import Pose
@@ -79,7 +79,7 @@ def rival_images(
     sensors = DrawnSensors(attitude_deg, height, by_frame=True, seed=5)
     for k, view in enumerate(views):
         small = view.at_width(width)
-        prior = prior_of(view.truth, sensors, k, 0)
+        prior = draw_prior(view.truth, sensors, k, 0)
         with TileStreamer(TileCache.open(view.map_cache)) as streamer:
             renderer = NumbaRenderer(streamer, 1)
             reference = renderer.render(prior.world_from_camera, small.camera, wait=True)

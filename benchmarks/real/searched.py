@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.real.judged import HEIGHT_SIGMA_M
 from benchmarks.real.sets import RealView
 from localizer.config import LocalizerConfig
-from localizer.evaluation.places import KnownOfPlace
+from localizer.evaluation.places import SimulatedPlaceData
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
@@ -43,7 +43,7 @@ def searched_images(
     progress: Callable[[], None] = lambda: None,
 ) -> Iterator[SearchedImage]:  # fmt: skip
     """Of every image of a set that has one map. elsewhere: a map without its places, or None."""
-    known = KnownOfPlace(False, False, TILT_SIGMA_DEG, HEIGHT_SIGMA_M, seed=7)
+    known = SimulatedPlaceData(False, False, TILT_SIGMA_DEG, HEIGHT_SIGMA_M, seed=7)
     config = LocalizerConfig(width=width, renderer="numba")
     for cache in [views[0].map_cache, *([elsewhere] if elsewhere is not None else [])]:
         away = cache != views[0].map_cache

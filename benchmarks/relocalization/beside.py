@@ -31,7 +31,7 @@ from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, ViewSearch, with_threads
 from localizer.config import LocalizerConfig
-from localizer.evaluation.places import KnownOfPlace
+from localizer.evaluation.places import SimulatedPlaceData
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
 from localizer.relocalization.types import PlaceQuery, Relocalization
@@ -98,7 +98,7 @@ def measured(
     asked: ViewSearch, index: int, view: BasinView, relocalizer: Relocalizer
 ) -> Beside | None:
     """Both alone and together; None where the engine does not track the view."""
-    query = KnownOfPlace(prior=False, heading=asked.heading_known, seed=asked.seed).query(
+    query = SimulatedPlaceData(prior=False, heading=asked.heading_known, seed=asked.seed).query(
         Frame(view.query, 1, view.camera, index), view.truth, index
     )
     relocalizer.find(query)  # the map's transforms are kept from here on

@@ -37,11 +37,11 @@ from benchmarks.odometry.stretches import StretchPlan, TestStretch, make_stretch
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, with_threads
 
 with needs_torch():
-    from localizer.training.data.batches import tamed
+    from localizer.training.data.batches import limit_haze
     from localizer.training.data.pairs import soften
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
-from localizer.evaluation.places import KnownOfPlace
+from localizer.evaluation.places import SimulatedPlaceData
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
@@ -135,7 +135,7 @@ class LostTrial:
         self._rng = rng
         self._camera = Camera.from_fov(*SIZE, float(rng.uniform(50, 80)))
         self.condition = CONDITIONS[index % len(CONDITIONS)]
-        self._known = KnownOfPlace(prior=False, heading=heading_known, seed=index)
+        self._known = SimulatedPlaceData(prior=False, heading=heading_known, seed=index)
         self.height_m = float(np.exp(rng.uniform(np.log(55), np.log(150))))
         half = (site.half_m, site.half_m)
         speed = float(rng.uniform(5, 12))
@@ -226,7 +226,7 @@ class LostTrial:
         """What the camera sees at pose k, exposed at (k + 1) frame times."""
         pose: Pose = self._way.poses[k]
         view = self._site.seen.render(pose, self._camera, wait=True)
-        look = tamed(self._look, view.depth)
+        look = limit_haze(self._look, view.depth)
         image = apply_appearance(soften(self._rng, view.rgb), view.depth, look, self._rng)
         return Frame(image, round((k + 1) * _FRAME_S * 1e9), self._camera, k)
 

@@ -13,7 +13,7 @@ from benchmarks.basin.views import BasinView
 from benchmarks.common.figures import markdown
 from benchmarks.common.shares import exact_interval
 from localizer.config import LocalizerConfig
-from localizer.evaluation.places import KnownOfPlace
+from localizer.evaluation.places import SimulatedPlaceData
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
@@ -58,7 +58,7 @@ class ViewSearch:
 
 def run(asked: ViewSearch, views: Sequence[BasinView], first: int) -> Iterator[ViewOutcome]:
     """Every view from number `first` on, on the whole map of its own place or of another."""
-    known = KnownOfPlace(prior=False, heading=asked.heading_known, seed=asked.seed)
+    known = SimulatedPlaceData(prior=False, heading=asked.heading_known, seed=asked.seed)
     maps: dict[Path, OpenRelocalizer] = {}
     try:
         for k, view in enumerate(views[first:], first):
@@ -75,7 +75,7 @@ def run(asked: ViewSearch, views: Sequence[BasinView], first: int) -> Iterator[V
 
 
 def _one(
-    asked: ViewSearch, view: BasinView, opened: OpenRelocalizer, known: KnownOfPlace, k: int
+    asked: ViewSearch, view: BasinView, opened: OpenRelocalizer, known: SimulatedPlaceData, k: int
 ) -> ViewOutcome:
     relocalizer = opened.relocalizer
     truth = view.truth

@@ -21,14 +21,15 @@ For the pilot and the operator: every text that the companion sends, its cause, 
 to do. Made from the catalogue by `python -m benchmarks.site`; do not edit.
 
 An alert is sent as STATUSTEXT `{PREFIX}TEXT`. `events.csv` and `health.json` contain its
-identifier. In a text, N is a number, and other capitals are a name, a number or a reason.
+identifier. In a text, N is a number, and other capitals are a name, a number or a reason. Names
+such as `bridge.origin` are keys of the deployment file; limits without a key are fixed.
 
 | term | meaning |
 |---|---|
-| fix | a position from vision. It is sent to the autopilot while injection is on: in mode inject \
-after the shadow check, in mode rc after the pilot's order. In mode shadow none is sent |
-| fixes continue | this alert does not stop fixes; another alert can. The same holds for rows that \
-name no effect |
+| fix | a position from vision. Injection sends it to the autopilot: in mode inject after the \
+shadow check (see *Not ready*), in mode rc after the pilot's order. In mode shadow none is sent |
+| fixes continue | this alert does not stop fixes; another alert can. A row that names no effect \
+has none on fixes |
 | no fixes | vision makes no fix, so none is sent, until the alert ends |
 | output held; hold | fixes are made, but none is sent, until the alert ends |
 | exclude and reset | as *hold*; the first fix afterwards also increments `reset_counter`, which \
@@ -44,12 +45,14 @@ change to ALT_HOLD or STABILIZE (PX4: Altitude, Stabilized), which need no posit
 | compare with landmarks | compare the position on the ground station's map with what the pilot or \
 the video shows. If it is wrong, take over |
 | in flight | armed, and 3 m or more above or below the take-off height |
-| sigma | one standard deviation; + 4 sigma: of the compared values |
+| sigma | one standard deviation of the value or difference that is judged |
+| protection level | radius that the position error exceeds in at most 0.1 % of fixes \
+(`integrity_monitor.protection.risk`) |
 | message | the value of `bridge.injection.message` |
 
 Without GNSS and without fixes, ArduPilot's EKF has no input. ArduPilot then lands after 5 to 8 s
-([when vision ends](../how-to/when-vision-ends.md)). Limits without a named key are fixed.
-PX4 sends ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
+([when vision ends](../how-to/when-vision-ends.md)). PX4 sends
+ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 
 **Not sent:** the EKF receives no position; the alert says why. In mode shadow it says why none
 could be sent.

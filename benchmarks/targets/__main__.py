@@ -54,7 +54,7 @@ class _Before:
     def __init__(self, name: str, cast: RayCaster) -> None:
         self._name, self._cast, self._filter = name, cast, TargetFilter()
 
-    def see(self, estimate: PoseEstimate, pixel: tuple[float, float]) -> TargetFix | None:
+    def observe(self, estimate: PoseEstimate, pixel: tuple[float, float]) -> TargetFix | None:
         sigmas = _SETTINGS.pixel_sigma, _SETTINGS.map_sigma_m
         surfaces = locate(estimate, pixel, self._cast, *sigmas)
         if not surfaces:
@@ -89,7 +89,7 @@ def measure(
         if time_ns - began_ns > _LOOKED_S * 1e9:
             continue
         count += 1
-        fix = track.see(told, pixel)
+        fix = track.observe(told, pixel)
         if fix is None:
             refused += 1
             continue

@@ -10,7 +10,7 @@ import numpy as np
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.targets.track import projected
+from localizer.targets.track import pixel_of
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from sitl.demo.scenario import Scenario
 
@@ -114,7 +114,7 @@ def sightings(
 ) -> Iterator[tuple[int, tuple[float, float]]]:
     """(step, pixel with noise) wherever a viewer would say that it is in sight."""
     for k, step in enumerate(flown):
-        pixel = projected(step.true, thing.positions[k])
+        pixel = pixel_of(step.true, thing.positions[k])
         if pixel is None:
             continue
         size = (step.true.camera.width, step.true.camera.height)

@@ -16,7 +16,7 @@ from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
-from localizer.registration.anchors import swept
+from localizer.registration.anchors import apply_sweep
 from localizer.registration.backend import sample_bilinear
 from localizer.registration.cpu.reference import feature_gradients
 from localizer.render.base import MapRenderer
@@ -64,7 +64,7 @@ class PictureReader:
         anchors = reference_anchors(view, self._extractor, _ANCHORS, 0)
         if len(anchors.points_world) < 10 * _LEAST_ANCHORS:
             return None
-        anchors = swept(anchors, sweep, pose, self._camera)
+        anchors = apply_sweep(anchors, sweep, pose, self._camera)
         query = self._extractor.extract(self._undistorter(frame))
         return self._measured(anchors, query, pose)
 

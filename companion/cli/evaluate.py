@@ -29,7 +29,7 @@ from companion.writing import made_folder, writing
 from localizer.config import LocalizerConfig
 from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.metrics import LocalizationMetrics
-from localizer.evaluation.places import KnownOfPlace, PlaceFinder
+from localizer.evaluation.places import PlaceFinder, SimulatedPlaceData
 from localizer.evaluation.sequences import (
     CSV_COLUMNS,
     EvaluatedFrame,
@@ -139,7 +139,7 @@ def evaluate_command(
             localizer = build_localizer(stack, data.camera, config, sensors.auxiliary(data))
             known = None
             if searched:
-                known = KnownOfPlace(
+                known = SimulatedPlaceData(
                     prior == "lost", known_heading, attitude_sigma_deg or 0.7,
                     height_sigma_m or 2.0, seed,
                 )  # fmt: skip
@@ -178,7 +178,7 @@ def evaluate_command(
 
 @contextmanager
 def place_finder(
-    stack: MapStack, config: LocalizerConfig, known: KnownOfPlace | None
+    stack: MapStack, config: LocalizerConfig, known: SimulatedPlaceData | None
 ) -> Iterator[PlaceFinder | None]:
     """The search for a position without a prior, if the option selects it."""
     opened = None if known is None else open_relocalizer(stack.cache, config)

@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 
-from localizer.geometry.antimeridian import beside
+from localizer.geometry.antimeridian import lon_near
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
@@ -75,10 +75,10 @@ class TopTiles:
         corners = [frame.position([e, n, 0.0]) for e, n in ((low[0], low[1]), (high[0], high[1]))]
         return {
             "bounds": [
-                [beside(corner.longitude_deg, here), corner.latitude_deg] for corner in corners
+                [lon_near(corner.longitude_deg, here), corner.latitude_deg] for corner in corners
             ],
             "origin": [frame.origin.latitude_deg, frame.origin.longitude_deg, ground],
-            "outline": [[beside(lon, here), lat] for lat, lon in manifest.extent],
+            "outline": [[lon_near(lon, here), lat] for lat, lon in manifest.extent],
             "gsd_m": manifest.gsd_m,
             "attribution": manifest.attribution,
             "geoid_separation_m": manifest.geoid_separation_m,

@@ -34,7 +34,7 @@ class Sigmas:
 
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
         """The localizer's settings with the sigmas of these sensors."""
-        known = None if self.attitude_deg is None else AttitudePrior.known_to(self.attitude_deg)
+        known = None if self.attitude_deg is None else AttitudePrior.with_sigma(self.attitude_deg)
         return config.model_copy(update={"attitude": known, "height_sigma_m": self.height_m})
 
 

@@ -19,7 +19,7 @@ from localizer.targets.bias import SharedBias
 from localizer.targets.follow import FollowedPosition, Gray, ImageFollower
 from localizer.targets.limits import RefusalReason
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.targets.track import TargetSettings, TargetTrack, projected
+from localizer.targets.track import TargetSettings, TargetTrack, pixel_of
 from localizer.types import PoseEstimate, TargetFix, Visibility
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
@@ -184,7 +184,7 @@ class TargetManager:
         """Start a clicked target and report its position, or why there is none."""
         name, time_ns = click.name, click.estimate.exposure_time_ns
         track = TargetTrack(name, replace(self._settings, confirm_s=0.0), self._cast)
-        fix = track.see(click.estimate, click.pixel, drift=self._drift(click))
+        fix = track.observe(click.estimate, click.pixel, drift=self._drift(click))
         if fix is None:
             self.missed += 1
             self._report_alert(
@@ -218,7 +218,7 @@ class TargetManager:
         if life is None:
             track = TargetTrack(name, self._settings, self._cast)
             life = _TargetState(track, 0, False, time_ns)
-        fix = life.track.see(estimate, pixel)
+        fix = life.track.observe(estimate, pixel)
         if _reason(life.track) is not RefusalReason.NO_MAP:
             self._lives[name] = life
         life.seen_ns = time_ns
@@ -298,7 +298,7 @@ class TargetManager:
             found = self._found_leaving(name, life, (estimate, gray), expected[0])
         fix = None
         if found is not None:
-            fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
+            fix = track.observe(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
             life.found_ns = life.seen_ns = time_ns
             life.refused_ns = 0 if fix is not None else life.refused_ns or time_ns
         elif track.moves and since_s > _LOST_S and not self._may_be_back(life, time_ns):
@@ -429,7 +429,7 @@ class TargetManager:
         """A moving target about where its motion leads; None where something hides it."""
         time_ns = estimate.exposure_time_ns
         expected = life.track.expected(time_ns)
-        if expected is None or life.track.is_hiding(estimate, expected[0]):
+        if expected is None or life.track.is_being_hidden(estimate, expected[0]):
             return None  # what is seen there is what hides it
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(expected[1])[-1], 0.0)))
         reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
@@ -491,7 +491,7 @@ class TargetManager:
         time_ns = estimate.exposure_time_ns
         before = [p for p in self._pictures if time_ns - p[0].exposure_time_ns > _PASSED_NS]
         ground = before[::_GROUND_EVERY]
-        return follower.find_before(
+        return follower.find_on_ground(
             gray, estimate, position, reach_m, ground, was_hidden=was_hidden
         )
 
@@ -561,7 +561,7 @@ class TargetManager:
         distance = float(self._cast(eye, d[None]).distances[0])
         if not np.isfinite(distance):
             return (0.0, 0.0)
-        moved = [projected(at, eye + distance * d) for at in click.around]
+        moved = [pixel_of(at, eye + distance * d) for at in click.around]
         most = _PIXELS * click.estimate.camera.width
         offsets = [np.array(p) - click.pixel if p is not None else np.full(2, most) for p in moved]
         if not offsets:

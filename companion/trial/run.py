@@ -156,7 +156,7 @@ def _known_to(config: LocalizerConfig, priors: tuple[FramePrior, ...]) -> Locali
     """
     tilt_deg = float(np.median([p.tilt_sigma_deg for p in priors]))
     height_m = float(np.median([p.height_sigma_m for p in priors]))
-    attitude = AttitudePrior.known_to(tilt_deg)
+    attitude = AttitudePrior.with_sigma(tilt_deg)
     return config.model_copy(update={"attitude": attitude, "height_sigma_m": height_m})
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Sequence
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PosePrior
@@ -32,7 +32,9 @@ class DrawnSensors:
     seed: int = 0
 
     def rotation(self, truth: Pose, index: int) -> Array | None:
-        """Simulated attitude (3, 3) world_from_camera of a frame; the heading is the true one."""
+        """Simulated attitude (3, 3) world_from_camera of frame `index`, with the true heading;
+        None: not measured.
+        """
         if self.tilt_sigma_deg is None:
             return None
         tilt = self._rng(index).normal(0.0, np.radians(self.tilt_sigma_deg), 2)
@@ -40,7 +42,7 @@ class DrawnSensors:
         return rotation
 
     def height_m(self, truth: Pose, index: int) -> float | None:
-        """Simulated height (world z, m) of a frame."""
+        """Simulated height (world z, m) of frame `index`; None: not measured."""
         if self.height_sigma_m is None:
             return None
         error = self._rng(index).normal(0.0, 1.0, 3)[2]
@@ -49,7 +51,7 @@ class DrawnSensors:
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
         """The localizer's settings with these sigmas."""
         tilt = self.tilt_sigma_deg
-        attitude = None if tilt is None else AttitudePrior.known_to(tilt)
+        attitude = None if tilt is None else AttitudePrior.with_sigma(tilt)
         return config.model_copy(
             update={"attitude": attitude, "height_sigma_m": self.height_sigma_m}
         )
@@ -75,7 +77,7 @@ class DrawnSensors:
         if rotation is not None and self.tilt_sigma_deg is not None:
             ahead, true_ahead = pose.rotation[:2, 1], truth.rotation[:2, 1]
             turn = np.arctan2(ahead[1], ahead[0]) - np.arctan2(true_ahead[1], true_ahead[0])
-            pose = Pose(turned(rotation, float(turn)), pose.translation)
+            pose = Pose(with_heading(rotation, float(turn)), pose.translation)
             covariance[3:5, :] = covariance[:, 3:5] = 0.0
             covariance[3, 3] = covariance[4, 4] = np.radians(self.tilt_sigma_deg) ** 2
         if height_m is not None and self.height_sigma_m is not None:

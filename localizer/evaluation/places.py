@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.relocalization.relocalizer import Relocalizer
 from localizer.relocalization.types import PlaceQuery, SearchRegion
 from localizer.types import Frame, PosePrior
@@ -19,7 +19,7 @@ _LEAST_SIGMA = np.array([1.0, 1.0, 1.0, *np.radians([1.0, 1.0, 1.0])])
 
 
 @dataclass(frozen=True)
-class KnownOfPlace:
+class SimulatedPlaceData:
     """Simulated data of other sensors for a lost camera: true values with seeded errors.
 
     prior: whether a position with an error of 100 to 500 m is known. heading: whether the heading
@@ -38,7 +38,7 @@ class KnownOfPlace:
         rng = np.random.default_rng((self.seed, index))
         tilt = np.array([*rng.normal(0.0, np.radians(self.tilt_sigma_deg), 2), 0.0])
         limit = np.radians(_HEADING_OFF_DEG) if self.heading else np.pi
-        rotation = turned(so3_exp(tilt) @ truth.rotation, rng.uniform(-limit, limit))
+        rotation = with_heading(so3_exp(tilt) @ truth.rotation, rng.uniform(-limit, limit))
         return PlaceQuery(
             frame,
             rotation,
@@ -59,13 +59,15 @@ class KnownOfPlace:
 
 @dataclass(frozen=True)
 class PlaceFinder:
-    """Searches the prior of a frame by a relocalizer."""
+    """Finds a frame's prior by a relocalizer. known: simulated data of other sensors."""
 
     relocalizer: Relocalizer
-    known: KnownOfPlace
+    known: SimulatedPlaceData
 
     def __call__(self, frame: Frame, truth: Pose, index: int) -> PosePrior | None:
-        """The prior to track from, or None; the truth only serves to draw what sensors say."""
+        """The prior to track from; None if nothing was found. truth: true pose, from which sensor
+        data are drawn.
+        """
         found = self.relocalizer.find(self.known.query(frame, truth, index))
         if found is None:
             return None

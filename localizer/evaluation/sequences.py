@@ -196,7 +196,7 @@ def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> Evaluate
 
 
 def _summary(frames: list[EvaluatedFrame], seconds: float) -> LocalizationMetrics:
-    """seconds: spent on the frames whose image could be used; the rate is theirs."""
+    """Metrics of the frames. seconds: time spent on usable images, for the frame rate."""
     translation, rotation = error_arrays(frames)
     usable = sum(not f.unusable for f in frames)
     metrics = localization_metrics(translation, rotation, seconds)

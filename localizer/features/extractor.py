@@ -37,7 +37,7 @@ class FeatureExtractor(Protocol):
 
     @property
     def name(self) -> str:
-        """What computes the features, for reports, e.g. ``tiny (onnxruntime, CPU)``."""
+        """Network and what runs it, for reports, e.g. ``tiny (onnxruntime, CPU)``."""
 
     def extract(self, rgb: Image) -> FeaturePyramid:
         """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by 8."""
@@ -113,10 +113,9 @@ def read_model_info(model: Path) -> ModelInfo:
 class OnnxExtractor:
     """A network in onnxruntime, on the best execution provider that works.
 
-    size: width and height of the images to come, for which it is warmed up. half: TensorRT may
-    compute in float16. only: TensorRT, CUDA or CPU, instead of the best.
-    bound_to: onnxruntime's name of the device where `extract_on_device` leaves its outputs; None:
-    the provider's.
+    size: width and height of the images to come, for the warm-up. half: TensorRT may compute in
+    float16. only: TensorRT, CUDA or CPU, instead of the best. bound_to: onnxruntime's name of the
+    device where `extract_on_device` leaves its outputs; None: the provider's.
     """
 
     def __init__(
@@ -198,7 +197,7 @@ class OnnxExtractor:
         return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
     def _check(self, session: Session, model: Path, width: int, height: int) -> None:
-        """Run once: it warms up, and a wrong graph fails here, not in flight."""
+        """Run the network once, to warm it up and to detect a wrong graph now, not in flight."""
         try:
             levels = self._run(session, np.zeros((height, width, 3), np.uint8))
         except Exception as error:

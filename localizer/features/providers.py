@@ -150,7 +150,7 @@ def provider_of(session: Session) -> str:
 
 
 def _prefix(expected: Expected) -> str:
-    """Of kept engines: those of other weights, sizes or precision must not be taken for this's."""
+    """File name prefix of cached engines; it differs for other weights, sizes and precisions."""
     kind = "float16" if expected.half else "float32"
     height, width = _sides(expected)
     return f"{expected.sha256[:16]}-{width}x{height}-{kind}"
@@ -162,7 +162,7 @@ def _sides(expected: Expected) -> tuple[int, int]:
 
 
 def _kept(expected: Expected) -> list[Path]:
-    """What TensorRT kept of such a model, and its timings."""
+    """TensorRT's cached engines and timings of this model."""
     folder = cache_folder("tensorrt")
     try:
         return sorted([*folder.glob(f"{_prefix(expected)}*"), *folder.glob("*.timing")])
@@ -171,7 +171,7 @@ def _kept(expected: Expected) -> list[Path]:
 
 
 def _removed(files: list[Path]) -> bool:
-    """Whether one of them could be removed."""
+    """Remove cached files; returns whether one could be removed."""
     removed = False
     for file in files:
         with contextlib.suppress(OSError):
@@ -181,8 +181,8 @@ def _removed(files: list[Path]) -> bool:
 
 
 def _kept_in(expected: Expected) -> dict[str, str]:
-    """Options that keep the engine; none, with a warning, where the folder takes no files: then it
-    is built, a minute or more, at every start.
+    """Options that make TensorRT cache the engine. Empty, with a warning, if the folder is not
+    writable: the engine is then built at every start, for a minute or more.
     """
     folder = cache_folder("tensorrt")
     try:

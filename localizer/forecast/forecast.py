@@ -50,7 +50,7 @@ class ViewForecast:
 class Forecaster:
     """Forecasts for one camera over one map; use it on one thread.
 
-    camera: of the stream, distorted or not; draws: pictures of each condition.
+    camera: of the stream, distorted or not; draws: number of simulated frames of each condition.
     """
 
     def __init__(
@@ -68,9 +68,11 @@ class Forecaster:
         self._config, self._draws = config, draws
 
     def at(self, pose: Pose, conditions: tuple[str, ...], seed: int) -> tuple[ViewForecast, ...]:
-        """One forecast per condition (`FORECAST_CONDITIONS`); deterministic for a seed."""
+        """One forecast for each of the conditions (`FORECAST_CONDITIONS`), at a true camera pose
+        world_from_camera; deterministic for a seed.
+        """
         rng = np.random.default_rng((71, seed))
-        prior = prior_of(pose, rng)
+        prior = draw_prior(pose, rng)
         view = self._renderer.render(pose, self._camera, wait=True)
         share = float((view.depth > 0).mean())
         reference = self._renderer.render(prior.world_from_camera, self._camera, wait=True)
@@ -138,7 +140,7 @@ class Forecaster:
         return is_acceptable(self._config.integrity, found, gate)
 
 
-def prior_of(truth: Pose, rng: np.random.Generator) -> PosePrior:
+def draw_prior(truth: Pose, rng: np.random.Generator) -> PosePrior:
     """A random prior about the true pose with `PRIOR_SIGMAS`."""
     drawn = rng.normal(0.0, PRIOR_SIGMAS)
     begun = Pose(so3_exp(drawn[3:]) @ truth.rotation, truth.translation + drawn[:3])
@@ -170,6 +172,6 @@ def _width_m(view: RenderedView) -> float:
 
 
 def _nothing(condition: str, share: float) -> ViewForecast:
-    """Where the view does not meet the map."""
+    """Forecast for a view that does not meet the map."""
     figures = Figures(WORST_M, 0.0, 0.0, share, 1.0, WORST_M)
     return ViewForecast(condition, figures, WORST_M, 1.0, 0.0, 0.0, AmbiguousPosition(0.0, 0.0))

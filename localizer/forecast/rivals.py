@@ -8,7 +8,7 @@ import numpy as np
 
 from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import LevelProblem, camera_from_local, world_from_camera
-from localizer.registration.covariance import apart_px, mean_motion, pose_differences
+from localizer.registration.covariance import image_gap_px, mean_motion, pose_differences
 from localizer.registration.cpu.reference import in_view, project, projection_jacobian
 from localizer.registration.jngo import JNGO
 from localizer.registration.selection import quality, subsample_anchors
@@ -54,7 +54,7 @@ def most_similar_rival(
     here, there = rotation[0], translation[0]
     fine = levels[-1]
     differences = pose_differences(*world_from_camera(R, t, origin), truth)
-    apart = apart_px(
+    apart = image_gap_px(
         differences, here, there, _motion(subsample_anchors(fine, _ANCHORS), here, there)
     )
     scores = np.where(apart > optimizer.config.mode_px, found.scores, np.inf)

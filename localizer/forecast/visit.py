@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
-from localizer.synth.visits.texture import hard_surfaces, regrown
+from localizer.synth.visits.texture import hard_surfaces, with_new_texture
 from localizer.types import Float32, Image, RenderedView
 
 SEASON = "season"
@@ -47,7 +47,7 @@ def simulate_visit(view: RenderedView, condition: str, rng: np.random.Generator)
 
 
 def _other_texture(rgb: Image, cell_m: float, rng: np.random.Generator, dry: bool) -> Image:
-    """Soft ground with another fine texture, and out of season if `dry`."""
+    """The image with another fine texture on soft ground; dry: also out of season."""
     height, width = rgb.shape[:2]
     side = max(height, width)
     square = cv2.copyMakeBorder(
@@ -58,13 +58,13 @@ def _other_texture(rgb: Image, cell_m: float, rng: np.random.Generator, dry: boo
     if dry:
         share = np.float32(rng.uniform(0.3, 1.0)) * (1 - lasting)[..., None]
         albedo = albedo * (1 - share) + albedo.mean(axis=2, keepdims=True) * _DRY * share
-    other = regrown(albedo, lasting, cell_m, rng)[:height, :width]
+    other = with_new_texture(albedo, lasting, cell_m, rng)[:height, :width]
     image: Image = np.clip(other * 255 + 0.5, 0, 255).astype(np.uint8)
     return image
 
 
 def _changed(image: Image, cell_m: float, rng: np.random.Generator) -> Image:
-    """The picture with some places that show another part of it."""
+    """The image with some regions replaced by other parts of it."""
     height, width = image.shape[:2]
     side = int(np.clip(_CHANGE_M / cell_m, 4, min(height, width) // 4))
     count = round(rng.uniform(*_CHANGED) * height * width / side**2)

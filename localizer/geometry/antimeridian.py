@@ -13,7 +13,7 @@ Corner = tuple[float, float]
 
 @dataclass(frozen=True)
 class GeoBox:
-    """Degrees. Across the 180th meridian east is less than west (as RFC 7946, 5.2, has it)."""
+    """A box in degrees. Across the 180th meridian east is less than west (RFC 7946, 5.2)."""
 
     south: float
     west: float
@@ -30,10 +30,10 @@ class GeoBox:
 
 def wrapped(longitude_deg: float) -> float:
     """The longitude in [-180, 180); 180 itself stays."""
-    return longitude_deg if abs(longitude_deg) <= 180.0 else beside(longitude_deg, 0.0)
+    return longitude_deg if abs(longitude_deg) <= 180.0 else lon_near(longitude_deg, 0.0)
 
 
-def beside(longitude_deg: float, reference_deg: float) -> float:
+def lon_near(longitude_deg: float, reference_deg: float) -> float:
     """The longitude plus a multiple of 360 that is nearest to a reference; it may be beyond 180."""
     return longitude_deg + 360.0 * round((reference_deg - longitude_deg) / 360.0)
 
@@ -41,15 +41,15 @@ def beside(longitude_deg: float, reference_deg: float) -> float:
 def geo_box(places: Iterable[tuple[float, float]]) -> GeoBox:
     """The box of positions (latitude, longitude) less than half the Earth apart."""
     latitudes, longitudes = zip(*places, strict=True)
-    near = [beside(longitude, longitudes[0]) for longitude in longitudes]
+    near = [lon_near(longitude, longitudes[0]) for longitude in longitudes]
     return GeoBox(min(latitudes), wrapped(min(near)), max(latitudes), wrapped(max(near)))
 
 
-def cut(ring: Sequence[Corner]) -> list[list[Corner]]:
+def split_outline(ring: Sequence[Corner]) -> list[list[Corner]]:
     """Cut a convex outline (longitude, latitude; not closed) at the 180th meridian: one or two
     outlines (RFC 7946, 3.1.9).
     """
-    near = [(beside(lon, ring[0][0]), lat) for lon, lat in ring]
+    near = [(lon_near(lon, ring[0][0]), lat) for lon, lat in ring]
     parts = []
     for turn in (-360.0, 0.0, 360.0):
         part = [(lon + turn, lat) for lon, lat in near]
@@ -60,7 +60,7 @@ def cut(ring: Sequence[Corner]) -> list[list[Corner]]:
 
 
 def _clipped(ring: Sequence[Corner], limit: float, sign: float) -> list[Corner]:
-    """What lies beyond a meridian in the direction of `sign` (Sutherland and Hodgman)."""
+    """An outline's part beyond a meridian in the direction of `sign` (Sutherland, Hodgman)."""
     kept: list[Corner] = []
     for (x, y), (a, b) in zip(ring, [*ring[1:], *ring[:1]], strict=True):
         here, there = sign * (x - limit) >= 0.0, sign * (a - limit) >= 0.0

@@ -181,10 +181,11 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def undistortion_maps(self, target: Camera) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-        """Fixed-point maps for ``cv2.remap`` from this camera's image to the pinhole `target`.
+        """Fixed-point maps for ``cv2.remap`` from this camera's image to `target`'s, an undistorted
+        camera: int16 (H, W, 2) and uint16 (H, W).
 
         They undo the distortion and resize in one pass. Pixels outside the lens's field of view
-        point outside the image, so that they become black.
+        point outside the image; with a constant border they become black.
         """
         if self.distortion_model == "opencv":
             maps = cv2.initUndistortRectifyMap(
@@ -215,8 +216,8 @@ class Camera:
 
     @cached_property
     def _reach(self) -> float:
-        """Tangent of the farthest ray from the axis in the picture: a polynomial brings rays beyond
-        it back into the picture, a lens does not.
+        """Largest tangent of the angle from the axis to a pixel. Beyond it a lens polynomial folds
+        rays back into the image, a lens does not.
         """
         u, v = np.linspace(0.0, self.width, _EDGE), np.linspace(0.0, self.height, _EDGE)
         edges = [np.stack(np.broadcast_arrays(u, side), -1) for side in (0.0, self.height)]
@@ -240,7 +241,7 @@ def with_field_of_view(pinhole: Camera, camera: Camera) -> Camera:
 
 
 def _centres(camera: Camera) -> Array:
-    """(H, W, 2): of every pixel."""
+    """(H, W, 2) pixel coordinates of all pixel centres."""
     v, u = np.mgrid[: camera.height, : camera.width]
     return np.stack([u, v], axis=-1) + 0.5
 

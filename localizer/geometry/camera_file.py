@@ -120,7 +120,7 @@ def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_matrix(k: Sequence[float], name: str) -> dict[str, float]:
-    """Of a matrix (3, 3), or fx fy cx cy: OpenCV's, which has the first pixel's centre at 0, 0."""
+    """fx, fy, cx, cy of a matrix (3, 3) or list by OpenCV (first pixel's centre at 0, 0)."""
     if len(k) not in (4, 9) or (len(k) == 9 and k[1] != 0.0):
         raise ValueError(f"{name}: expected a matrix of 3x3 without skew, or fx fy cx cy")
     fx, fy, cx, cy = k if len(k) == 4 else (k[0], k[4], k[2], k[5])
@@ -139,7 +139,7 @@ def _of_colmap(line: re.Match[str], count: int) -> dict[str, Any]:
 
 
 def _forms(flat: Mapping[str, Any]) -> dict[str, _Form]:
-    """The lens models that are named, by their names."""
+    """The lens models that the file names."""
     named = {k: v for k, v in flat.items() if _MODEL_KEY.fullmatch(k) and v is not None}
     if isinstance(named.get("lens"), int | float):  # CUAV's: the lens's focal length, mm
         del named["lens"]
@@ -153,7 +153,7 @@ def _forms(flat: Mapping[str, Any]) -> dict[str, _Form]:
 def _lens(
     flat: Mapping[str, Any], forms: Mapping[str, _Form]
 ) -> tuple[LensModel, tuple[float, ...]]:
-    """Model and coefficients, as `Camera` has them."""
+    """Lens model and coefficients for `Camera`."""
     model = next(iter(forms.values()))[0]
     k = _coefficients(flat, model)
     used = max((i + 1 for i, value in enumerate(k) if value != 0.0), default=0)
@@ -175,7 +175,7 @@ def _model(name: str) -> _Form | None:
 
 
 def _coefficients(flat: Mapping[str, Any], model: LensModel) -> tuple[float, ...]:
-    """In the model's order, from a list or from single keys."""
+    """Coefficients in the model's order, from a list or from single keys."""
     order = COEFFICIENTS[model]
     singles = {k: float(v) for k, v in flat.items() if _SINGLE_KEY.fullmatch(k)}
     foreign = [k for k, v in singles.items() if v != 0.0 and k not in order]
@@ -194,7 +194,7 @@ def _coefficients(flat: Mapping[str, Any], model: LensModel) -> tuple[float, ...
 
 
 def _numbers(given: Any, name: str) -> tuple[float, ...]:
-    """Of a list, a matrix or what ROS and OpenCV write for one."""
+    """The numbers of a list, a matrix, or ROS's or OpenCV's form of one."""
     if isinstance(given, Mapping) and "data" in given:
         given = given["data"]
     if isinstance(given, str) or not isinstance(given, Sequence):

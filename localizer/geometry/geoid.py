@@ -38,7 +38,7 @@ def _cubic(t: float) -> Array:
 
 @cache
 def _egm96() -> Array:
-    """Metres, (721, 1440)."""
+    """The grid in metres, (721, 1440)."""
     with np.load(_GRID) as stored:
         centimetres = stored["second_differences_cm"].astype(np.int32)
     return np.asarray(centimetres.cumsum(axis=0).cumsum(axis=1) / 100.0)

@@ -95,7 +95,7 @@ def _fisheye_radius(k: tuple[float, ...], angle: Array) -> Array:
 
 
 def _fisheye_angle(k: tuple[float, ...], radius: Array) -> Array:
-    """By Newton's steps; NaN where they find no angle."""
+    """Angle (rad) of a distorted radius, by Newton's method; NaN if it does not converge."""
     angle = np.minimum(radius, _WIDEST)
     for _ in range(_STEPS):
         a2 = angle * angle
@@ -147,7 +147,7 @@ def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Proje
 
 
 def _upright(tangents: Array) -> NDArray[np.bool_]:
-    """Whether the rays of a grid of pixels (_GRID squared, 2) lie in the pixels' order, each."""
+    """Mask of the pixels of a grid (_GRID squared, 2) whose rays have the pixels' order."""
     grid = tangents.reshape(_GRID, _GRID, 2)
     by_u, by_v = (np.asarray(np.gradient(grid, axis=axis)) for axis in (1, 0))
     area: Array = by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0]

@@ -34,12 +34,12 @@ class Sweep:
         readout_s = 1e-3 * readout_ms
         return cls(np.asarray(rate) * readout_s, np.asarray(velocity) * readout_s)
 
-    def matters(self, camera: Camera, depth_m: float) -> bool:
+    def displaces_pixels(self, camera: Camera, depth_m: float) -> bool:
         """Whether the motion displaces points at depth_m in the image."""
         angle = float(np.linalg.norm(self.turn) + np.linalg.norm(self.way) / max(depth_m, 1.0))
         return 0.5 * angle * max(camera.fx, camera.fy) > _LEAST_PX
 
-    def seen(self, points: Array, world_from_camera: Pose, camera: Camera) -> Array:
+    def apparent_points(self, points: Array, world_from_camera: Pose, camera: Camera) -> Array:
         """World points (N, 3), moved so that a camera at rest sees each in the same pixel as the
         moving camera. The camera at rest is at `world_from_camera`, the pose in the middle of the
         readout.
@@ -59,7 +59,7 @@ class Sweep:
 
     @staticmethod
     def _share(away: Array, world_from_camera: Pose, camera: Camera) -> Array:
-        """(N, 1): when each point's row is read out, -0.5 for the first to 0.5 for the last."""
+        """(N, 1) readout time of each point's row: -0.5 for the first to 0.5 for the last."""
         pixels, _ = camera.project(away @ world_from_camera.rotation)
         rows = np.nan_to_num(pixels[:, 1] / camera.height - 0.5)
         return np.clip(rows, -0.5, 0.5)[:, None]

@@ -65,7 +65,9 @@ def consistency_test(
     evidence: IndependentEvidence,
     config: IntegrityConfig,
 ) -> Consistency:
-    """Test a tentative track by another accepted pose, covariance (6, 6), and evidence."""
+    """Test a tentative track by another accepted pose (covariance (6, 6), exposure time_ns) and by
+    other sensors' evidence.
+    """
     if evidence.rotation is not None and not _attitude_agrees(pose, evidence.rotation, config):
         return Consistency.CONTRADICTED
     moved = pose.translation - tentative_track.world_from_camera.translation
@@ -89,15 +91,15 @@ def consistency_test(
 
 
 def _noise_m(moved: Array, covariance: Array) -> float:
-    """What noise may make of a way (3,), m: estimates slide along what looks alike, and the same
-    view is seen again. covariance: (6, 6), of the way.
+    """Limit (m) of the apparent displacement (3,) that noise causes: estimates slide along similar
+    structures, and the same view is seen again. covariance: (6, 6), of the displacement.
     """
     along = moved / max(float(np.linalg.norm(moved)), 1e-9)
     return _SIGMAS * float(np.sqrt(along @ covariance[:3, :3] @ along))
 
 
 def _attitude_agrees(pose: Pose, rotation: Array, config: IntegrityConfig) -> bool:
-    """Tilt and heading of the pose against another sensor's rotation (3, 3)."""
+    """Whether the pose's tilt and heading agree with another sensor's rotation (3, 3)."""
     turn = so3_log(pose.rotation @ rotation.T)
     tilt, heading = np.hypot(turn[0], turn[1]), abs(turn[2])
     return bool(

@@ -95,7 +95,7 @@ class MapHeightError:
 
     @classmethod
     def prior(cls, expected_m: float | None) -> MapHeightError:
-        """Before the first image. expected_m: by the map's kind; None if unknown."""
+        """The posterior before the first image. expected_m: by the map's kind; None if unknown."""
         if expected_m is None:
             return cls()
         if expected_m <= _SURE_M:
@@ -105,7 +105,7 @@ class MapHeightError:
 
     @classmethod
     def of_kind(cls, kind: MapKind | None) -> MapHeightError:
-        """Before the first image over a map of a kind, None if unknown."""
+        """The posterior before the first image over a map of this kind; None: unknown."""
         if kind is None:
             return cls()
         if kind.has_buildings:
@@ -119,6 +119,8 @@ class MapHeightError:
         weight = np.exp(total - total.max())
         return float(np.sqrt((weight * CANDIDATES_M**2).sum() / weight.sum()))
 
-    def after(self, likelihood: Array) -> MapHeightError:
-        """With another image over new ground; likelihood: (K,) of `height_likelihood`."""
+    def updated(self, likelihood: Array) -> MapHeightError:
+        """The posterior after another image of new ground; likelihood: (K,) of
+        `height_likelihood`.
+        """
         return replace(self, evidence=_KEPT * self.evidence + _TEMPERED * likelihood)

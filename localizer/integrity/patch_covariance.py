@@ -50,8 +50,8 @@ def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Arra
 
 
 def height_correlation(ground: Array) -> Array:
-    """(P, P) covariance of unknown heights at positions (P, 2), m, with unit variance: one part per
-    block and one common part.
+    """(P, P) covariance, of unit variance, of unknown heights at positions (P, 2), m: one part is
+    common to a block, one to all.
     """
     apart = ground[:, None] - ground[None]
     squared = np.einsum("ijk,ijk->ij", apart, apart)

@@ -28,7 +28,9 @@ _LEAST_QUALITY, _LEAST_LEAD = 0.02, 0.003  # below, a logarithm says no more
 
 @dataclass(frozen=True)
 class PlaceModel:
-    """Logistic regression: log odds = bias + sum of weights times (feature - mean) / spread."""
+    """Logistic regression of whether a registration is at the right position. Log odds = bias + sum
+    of weights times (feature - mean) / spread; arrays are (4,), in the order of `FEATURES`.
+    """
 
     mean: Array
     spread: Array

@@ -117,7 +117,8 @@ class MapKind:
         height_m: above the ground; half_view_deg: half of the field of view; attitude_sigma_deg: of
         roll and pitch. Without the parallax of buildings an image does not separate a tilt from a
         shift, so the attitude's error shifts the position. A roof of unknown height h at an angle a
-        from nadir shifts it by h tan a.
+        from nadir shifts it by h tan a. With buildings in the map, only `unknown_height_sigma_m`
+        counts.
         """
         lean = math.tan(math.radians(half_view_deg)) / math.sqrt(3)  # its rms over the image
         if self.has_buildings:

@@ -49,9 +49,9 @@ class TileSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SourceNode:
-    """One node of the tile tree. geometric_error in metres; replaces: REPLACE, else ADD; corners:
-    (8, 3) ECEF metres of a box that holds its tiles, as far as the source tells; stands_in: its
-    surface has what is missing of its children.
+    """One node of the tile tree. geometric_error: m. replaces: its children replace it (REPLACE),
+    else they are added (ADD). corners: (8, 3) ECEF metres of a box that holds its tiles; None: not
+    stated. stands_in: its surface can be shown where children are missing.
     """
 
     geometric_error: float
@@ -74,12 +74,11 @@ class SourceNode:
 class SourceTree:
     """A map source.
 
-    centre: (3,) ECEF metres; geoid_separation_m, attribution, vertical_datum: as far as the source
-    states them; files: all files of the source, so that a change of it can be detected; options:
-    further inputs of the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
-    if it only follows from the format; warnings: doubts that did not stop the import; imagery_date,
-    sensor: of its images, as far as the source states them; up_axis: by which its meshes were read,
-    None without one.
+    centre: (3,) ECEF metres. geoid_separation_m, attribution, vertical_datum, imagery_date, sensor:
+    as far as the source states them. files: all files of the source, so that a change is detected;
+    options: further inputs of the tree. vertical_crs: the source's own statement of
+    `vertical_datum`, empty if that follows from the format. warnings: doubts that did not stop the
+    import. up_axis: axis by which its meshes were read; None: it has none.
     """
 
     root: SourceNode

@@ -24,7 +24,7 @@ from localizer.geometry.pose import Array
 from localizer.map.importers.height_crs import stated_heights
 from localizer.map.importers.raster_file import (
     HeightBand,
-    applied,
+    apply_affine,
     height_band,
     offline,
     open_raster,
@@ -42,8 +42,8 @@ _OUTLINE = 9  # places per side of the raster, to find its box
 
 @dataclass(frozen=True)
 class TerrainGrid:
-    """Heights (rows, columns) of the ground in the map's frame, north first. west, north: of the
-    first one, m. Beyond its edge the ground goes on level.
+    """Heights (rows, columns) of the ground in the map's frame, north first. west, north: position
+    of the first height, m. Beyond the grid's edge the ground has the edge's height.
     """
 
     heights: Float32
@@ -98,7 +98,7 @@ def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
     flat = np.stack([east, north, -fallen], axis=-1)
     latitude, longitude, _ = np.moveaxis(frame.geodetic_from_enu(flat), -1, 0)
     x, y = there.transform(longitude, latitude)
-    u, v = applied(~raster.transform, np.asarray(x), np.asarray(y))
+    u, v = apply_affine(~raster.transform, np.asarray(x), np.asarray(y))
     heights = _heights(raster, path, band, u, v)
     known = np.isfinite(heights)
     if not known.any():
@@ -110,7 +110,7 @@ def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
 
 
 def _band(raster: DatasetReader, path: Path) -> HeightBand:
-    """How the raster's numbers become metres; colours and phases are no heights."""
+    """Conversion of the raster's numbers to metres; an error for colours and complex numbers."""
     colours = (ColorInterp.red, ColorInterp.palette)
     if raster.count >= 3 or raster.colorinterp[0] in colours:
         raise MapSourceError(f"{path}: a picture, not heights: {raster.count} bands of colours")
@@ -122,7 +122,7 @@ def _band(raster: DatasetReader, path: Path) -> HeightBand:
 
 
 def _heights(raster: DatasetReader, path: Path, band: HeightBand, u: Array, v: Array) -> Float32:
-    """Metres at places of the raster (rows, columns), pixels; only what lies about them is read."""
+    """Heights (m) at pixel positions u, v of the raster; only the pixels around them are read."""
     left, top = (int(np.clip(np.floor(a.min()) - 1, 0, n - 1)) for a, n in _sides(raster, u, v))
     right, bottom = (int(np.clip(np.ceil(a.max()) + 1, 1, n)) for a, n in _sides(raster, u, v))
     width, height = max(right - left, 1), max(bottom - top, 1)
@@ -168,10 +168,10 @@ def _require_ground(path: Path, heights: Float32, cell_m: float) -> None:
 
 
 def _box(raster: DatasetReader, there: Transformer, frame: LocalFrame) -> tuple[Array, Array]:
-    """West and south, east and north (2,) of the raster in the map's frame, as far as it counts."""
+    """(west, south), (east, north) of the raster near the origin, in the map's frame, m."""
     side = np.linspace(0.0, 1.0, _OUTLINE)
     u, v = (g.ravel() for g in np.meshgrid(side * raster.width, side * raster.height))
-    x, y = applied(raster.transform, u, v)
+    x, y = apply_affine(raster.transform, u, v)
     longitude, latitude = there.transform(x, y, direction="INVERSE")
     places = frame.enu_from_geodetic(latitude, longitude, np.zeros_like(u))
     return (

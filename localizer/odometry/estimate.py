@@ -45,8 +45,8 @@ class OdometryEstimate:
 
     world_from_camera: the camera's pose; the predicted pose if the status is not OK. covariance:
     (6, 6) as `PosePrior`'s, including that of the start. quality: 0 to 1, of the registration
-    against the keyframe. reason: of a status that is not OK, as text. bridged_s, way_m: time and
-    distance since the pose was last known from elsewhere (`begin`). drift_m: 95 % bound of the
+    against the keyframe. reason: why the status is not OK, as text. bridged_s, way_m: time and
+    distance since the pose was last known from another source (`begin`). drift_m: 95 % bound of the
     horizontal error added since then. keyframe_age_s: since the keyframe's exposure. source: of the
     keyframe's depth. scale_sigma: relative sigma of distance and velocity, equal to that of the
     height above the ground.

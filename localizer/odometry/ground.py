@@ -62,7 +62,7 @@ class FlatGround:
 
 @dataclass(frozen=True)
 class RaisedGround:
-    """Ground raised by a constant: its shape is used, not its datum."""
+    """A terrain model raised by a constant, because its shape is used, not its datum."""
 
     ground: TerrainModel
     by_m: float

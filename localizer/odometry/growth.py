@@ -14,7 +14,7 @@ from localizer.registration.priors import PoseConstraint
 from localizer.types import PosePrior
 
 
-def carried(covariance: Array, lever: Array) -> Array:
+def transferred(covariance: Array, lever: Array) -> Array:
     """Covariance (6, 6) of a pose that is known exactly relative to another with `covariance`.
 
     lever: (3,) position relative to the other's, world axes. A small rotation of the other pose
@@ -50,7 +50,8 @@ def add_scale_error(known: Array, scale: float, displacement: Array) -> Array:
 
 
 def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
-    """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis.
+    """The pose after another sensor's measurement (height, roll and pitch, heading), axis by axis;
+    unchanged without one (None).
 
     The sensor's error is constant over frames and does not average out. So a variance P larger than
     the sensor's R becomes R, however often it is measured, by an update with the noise ``R P / (P -
@@ -95,13 +96,13 @@ def kalman_update(pose: Pose, covariance: Array, constraint: PoseConstraint) -> 
     return moved, 0.5 * (after + after.T)
 
 
-def since(
+def between(
     then: PoseConstraint, now: PoseConstraint, pose: Pose, turn_sigma: Array, rise_sigma: float
 ) -> PoseConstraint | None:
     """Constraint on a later pose from the change between two sensor constraints.
 
-    pose: the earlier one, taken as exact. turn_sigma: (3,) rad, rise_sigma: m. None if both
-    constraints have no component in common.
+    pose: at `then`, taken as exact. turn_sigma: (3,) rad, rise_sigma: m, of the change. None if
+    both constraints have no component in common.
     """
     information, rotation, height = np.zeros(6), pose.rotation, pose.translation[2]
     if _knows_rotation(then) and _knows_rotation(now):

@@ -111,9 +111,9 @@ def in_view(
 ) -> tuple[Array, Array]:
     """The points (N, 3) that the camera sees inside its border, with their pixels.
 
-    sweep: the camera's motion while its rows are read out.
+    sweep: the camera's motion while its rows are read out; None: a global shutter.
     """
-    seen = points if sweep is None else sweep.seen(points, pose, camera)
+    seen = points if sweep is None else sweep.apparent_points(points, pose, camera)
     pixels, inside = camera.project(pose.inverse.apply(seen))
     pixels, points = pixels[inside], points[inside]
     border = max(2.0, _BORDER_SHARE * min(camera.width, camera.height))
@@ -123,7 +123,7 @@ def in_view(
 
 
 def _uncovered(pixels: Array, camera: Camera, count: int, rng: np.random.Generator) -> Array:
-    """About `count` random pixels over the whole image, those left out that lie in a cell with one
+    """About `count` random pixels over the whole image, without those in a cell that contains one
     of `pixels` (N, 2).
     """
     side = min(camera.width, camera.height) / _CELLS

@@ -20,19 +20,19 @@ from localizer.odometry.ground import (
     TerrainModel,
     height_above_ground,
 )
-from localizer.odometry.growth import carried
+from localizer.odometry.growth import transferred
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
 from localizer.odometry.parallax import ParallaxView, align
 from localizer.odometry.track import (
     OdometryStart,
     OdometryTrack,
     aided_rotation,
-    fault,
     growth_of,
+    rejection,
     seconds,
     track_after,
 )
-from localizer.registration.anchors import swept
+from localizer.registration.anchors import apply_sweep
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Registration
@@ -98,11 +98,11 @@ class VisualOdometry:
         """Set a frame with a known pose, from the map or from the last fix before the loss.
 
         pose: world_from_camera, with its covariance (6, 6) as `PosePrior`'s. velocity: (3,) m/s,
-        world axes. surface: (N, 3) world points of the map's surfaces there, the anchors of the
-        reference that it was registered against. constraint: as for `step`, at this frame's time;
-        its difference from the pose is taken as the sensors' constant error and corrected in every
-        step. It takes no time; the first `step` makes a keyframe of the frame. Earlier odometry is
-        discarded.
+        world axes; None: zero. surface: (N, 3) world points of the map's surfaces there, the
+        anchors of the reference that it was registered against. constraint: as for `step`, at this
+        frame's time; its difference from the pose is taken as the sensors' constant error and
+        corrected in every step. This call is cheap; the first `step` makes a keyframe of the frame.
+        Earlier odometry is discarded.
         """
         self._beginning = OdometryStart(frame, pose, covariance, surface, constraint)
         self._keyframe = None
@@ -146,7 +146,7 @@ class VisualOdometry:
         if beginning is None or track is None:
             raise OdometryError("nothing to carry on from: call begin with a known pose first")
         keyframe = self._keyframe or self._first_keyframe(beginning)
-        prior = prediction or track.ahead(self.config, frame.time_ns, constraint)
+        prior = prediction or track.predict(self.config, frame.time_ns, constraint)
         if (gap := seconds(track.time_ns, frame.time_ns)) > self.config.longest_gap_s:
             return self._failed(
                 OdometryStatus.LOST, f"nothing usable for {gap:.1f} s", frame, prior, keyframe
@@ -159,12 +159,12 @@ class VisualOdometry:
         result = self._optimizer.register(
             frame.features,
             camera,
-            swept(keyframe.anchors, frame.sweep, prior.world_from_camera, camera),
+            apply_sweep(keyframe.anchors, frame.sweep, prior.world_from_camera, camera),
             prior,
             motion=prior,
             seed=self._seed + frame.time_ns % 1_000_003,
         )
-        if reason := fault(self.config, result, prior):
+        if reason := rejection(self.config, result, prior):
             return self._failed(OdometryStatus.NOT_REGISTERED, reason, frame, prior, keyframe)
         sensed = (constraint, beginning.corrected(constraint))
         after = track_after(self.config, track, keyframe, result, frame.time_ns, sensed)
@@ -221,7 +221,7 @@ class VisualOdometry:
     def _scale_sigma(
         self, source: DepthSource, points_world: Array, place: Array, covariance: Array
     ) -> float:
-        """Sigma of the height above the ground as a share of it. place: (3,), its covariance."""
+        """Relative sigma of the height above the ground. place: (3,), with its covariance."""
         base, ground = growth_of(self.config, source).scale, self._uncertainty
         if source is DepthSource.RANGE:
             return base
@@ -236,7 +236,7 @@ class VisualOdometry:
         return float(np.hypot(base, np.hypot(sigma_m, unknown_m) / above_m))
 
     def _below(self, time_ns: int) -> tuple[TerrainModel | None, DepthSource]:
-        """The ground where the map has none, and how it is known."""
+        """The ground where the map has none, and the source of its height."""
         if self._ground is not None:
             return self._ground, DepthSource.GROUND
         if (sounded := self._sounded.at(time_ns)) is not None:
@@ -246,7 +246,7 @@ class VisualOdometry:
     def _aligned(
         self, keyframe: Keyframe, frame: OdometryFrame, track: OdometryTrack
     ) -> OdometryTrack:
-        """The track once more, from the keyframe's pose by the parallax over the map's shape."""
+        """The track, recomputed from the keyframe's pose by parallax over the map's shape."""
         noise = self.config.parallax_noise
         is_fine = frame.features.levels[-1].stride == 1  # nothing else shows a parallax of a pixel
         if keyframe.surface is None or noise is None or not is_fine:
@@ -262,11 +262,11 @@ class VisualOdometry:
         if found is None:
             return track
         lever = found.second.translation - found.first.translation
-        covariance = carried(found.covariance, lever) + track.relative
+        covariance = transferred(found.covariance, lever) + track.relative
         return replace(track, pose=found.second, covariance=covariance)
 
     def _hand_over(self, frame: OdometryFrame, track: OdometryTrack, surface: Array | None) -> None:
-        """The frame becomes the keyframe, unless it has too little depth for one."""
+        """Make the frame the keyframe, unless too little of it has depth."""
         made = self._make_keyframe(
             frame, track.pose, track.covariance, track.way_m, surface, track.constraint
         )
@@ -291,7 +291,7 @@ class VisualOdometry:
         prior: PosePrior,
         keyframe: Keyframe,
     ) -> OdometryEstimate:
-        """The prediction, with what may have happened since the last usable frame."""
+        """The prediction, with the error that may have grown since the last usable frame."""
         assert self._track is not None
         dt = seconds(self._track.time_ns, frame.time_ns)
         grown = self._track.covariance + prior.covariance
@@ -315,7 +315,7 @@ class VisualOdometry:
         begun = self._beginning
         covariance = track.covariance + np.diag([track.unmatched_m2] * 2 + [0.0] * 4)
         covariance[:3, :3] += keyframe.scale_covariance_at(pose)
-        known = carried(begun.covariance, pose.translation - begun.pose.translation)
+        known = transferred(begun.covariance, pose.translation - begun.pose.translation)
         added = np.linalg.eigvalsh((covariance - known)[:2, :2])[-1]
         return OdometryEstimate(
             pose, covariance, quality, status, reason, time_ns,

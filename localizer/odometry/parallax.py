@@ -52,7 +52,7 @@ class ParallaxView:
 
 @dataclass(frozen=True)
 class ParallaxAlignment:
-    """Poses of two pictures on the map's shape; covariance: (6, 6) of the first's."""
+    """Poses of two frames on the map's shape; covariance: (6, 6) of the first's."""
 
     first: Pose
     second: Pose
@@ -93,7 +93,7 @@ def align(
 
 
 def _axes(prior: Array) -> Array:
-    """The covariance's axes (6, 6), one a row, each `_REACH` sigmas long."""
+    """Principal axes of the covariance (6, 6), one a row, each `_REACH` sigmas long."""
     scale = np.repeat([1.0, _RADIAN_M], 3)
     values, vectors = np.linalg.eigh(prior * np.outer(scale, scale))
     axes: Array = _REACH * (vectors * np.sqrt(np.maximum(values, 0.0))).T / scale
@@ -101,7 +101,7 @@ def _axes(prior: Array) -> Array:
 
 
 def _plan(n: int) -> tuple[Array, Array, list[tuple[int, int]]]:
-    """Where the cost is sampled (M, n), the quadratic's terms there, and the pairs of its last."""
+    """Sample points of the cost (M, n), the quadratic's terms there, and its pairs of axes."""
     steps = [np.zeros(n), *np.eye(n), *-np.eye(n)]
     for i, j in itertools.combinations(range(n), 2):
         sign = 1.0 if (i + j) % 2 else -1.0
@@ -117,7 +117,7 @@ def _moved(pose: Pose, step: Array) -> Pose:
 
 
 class _Cost:
-    """How badly the second picture fits the first, draped over the shape from another pose."""
+    """Misfit of the second frame with the first, laid on the map's shape from another pose."""
 
     def __init__(
         self, backend: Backend, first: ParallaxView, second: ParallaxView, points: Array
@@ -130,9 +130,9 @@ class _Cost:
         self._scale: float | None = None
 
     def __call__(self, step: Array) -> tuple[float, Pose]:
-        """The cost, inf if too little is in view, and the second pose at which it is reached.
+        """The cost (inf if too little is in view), and the second pose that gives it.
 
-        step: (6,) of the first pose; the second starts at its pose in the same rigid motion.
+        step: (6,) change of the first pose; the second starts at its pose in the same rigid motion.
         """
         first = _moved(self._first, step)
         turn = first.rotation @ self._first.rotation.T

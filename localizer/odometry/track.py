@@ -10,12 +10,12 @@ from localizer.geometry.pose import Array, Pose
 from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.growth import (
-    carried,
+    between,
     distance_covariance,
     distance_squared,
     fuse,
     kalman_update,
-    since,
+    transferred,
     without_constant_error,
 )
 from localizer.odometry.keyframe import DepthSource, Keyframe
@@ -37,7 +37,9 @@ class OdometryStart:
     constraint: PoseConstraint | None
 
     def corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
-        """The constraint without the constant error that it had at the beginning."""
+        """The constraint without the sensors' constant error, which is known at the start; None:
+        none.
+        """
         if constraint is None or self.constraint is None:
             return constraint
         return without_constant_error(constraint, self.constraint, self.pose)
@@ -45,10 +47,11 @@ class OdometryStart:
 
 @dataclass(frozen=True)
 class OdometryTrack:
-    """The last usable estimate. covariance: without the error of scale. constraint: the other
-    sensors' measurements minus their constant error. relative: (6, 6) the covariance beyond the
-    keyframe's own. best: quality of the keyframe's first registration. unmatched_m2: variance of
-    east and north beyond the covariance, which no measurement reduces.
+    """The last usable estimate. covariance: without the scale error. way_m: distance flown since
+    the start. aided_rotation: the sensors' rotation then, if any. constraint: the other sensors'
+    measurements without their constant error. relative: (6, 6) covariance relative to the keyframe.
+    best: quality of the keyframe's first registration. unmatched_m2: variance of east and north
+    beyond the covariance, which no measurement reduces.
     """
 
     pose: Pose
@@ -62,10 +65,10 @@ class OdometryTrack:
     best: float = 0.0
     unmatched_m2: float = 0.0
 
-    def ahead(
+    def predict(
         self, config: OdometryConfig, time_ns: int, constraint: PoseConstraint | None
     ) -> PosePrior:
-        """Predict: constant velocity, with the rotation that the sensors measure."""
+        """Predict the pose: constant velocity, with the sensors' rotation (None: the last one)."""
         dt = seconds(self.time_ns, time_ns)
         rotation, aided = self.pose.rotation, aided_rotation(constraint)
         if aided is not None and self.aided_rotation is not None:
@@ -86,8 +89,8 @@ def growth_of(config: OdometryConfig, source: DepthSource) -> GrowthModel:
     }[source]
 
 
-def fault(config: OdometryConfig, result: Registration, prior: PosePrior) -> str:
-    """Why a registration is rejected; "" if it is used."""
+def rejection(config: OdometryConfig, result: Registration, prior: PosePrior) -> str:
+    """Why a registration against the keyframe is rejected; "" if it is used."""
     if result.status is not RegistrationStatus.OK:
         return str(result.status.value)
     if result.quality < config.min_quality:
@@ -112,7 +115,7 @@ def track_after(
 ) -> OdometryTrack:
     """The track after a registration against the keyframe.
 
-    sensed: what other sensors say of this frame, as they say it and less their constant error.
+    sensed: other sensors' constraint of this frame, as measured and without their constant error.
     """
     constraint, corrected = sensed
     model, begun = growth_of(config, keyframe.source), keyframe.world_from_camera
@@ -123,10 +126,10 @@ def track_after(
         turn = np.radians(
             [config.turn_sigma_deg, config.turn_sigma_deg, config.heading_turn_sigma_deg]
         )
-        if known := since(keyframe.constraint, corrected, begun, turn, config.rise_sigma_m):
+        if known := between(keyframe.constraint, corrected, begun, turn, config.rise_sigma_m):
             pose, relative = kalman_update(pose, relative, known)
     lever = pose.translation - begun.translation
-    pose, covariance = fuse(pose, carried(keyframe.covariance, lever) + relative, corrected)
+    pose, covariance = fuse(pose, transferred(keyframe.covariance, lever) + relative, corrected)
     dt = seconds(track.time_ns, time_ns)
     velocity = (pose.translation - track.pose.translation) / dt if dt > 0 else track.velocity
     unmatched = (model.unmatched * (1.0 - result.quality)) ** 2 * hop

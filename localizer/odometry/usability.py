@@ -41,8 +41,8 @@ _LEAST_SHARPNESS = 0.06  # fine over coarse contrast of a sharp picture
 class Usability:
     """Result of the check of one frame, with its measurements.
 
-    fault: None if it can be used. black, saturated, structured: shares of the area.
-    sharpness: contrast between neighbours over contrast between blocks, 0 for a flat picture.
+    fault: None if it can be used. black, saturated, structured: shares of the area. sharpness:
+    contrast between neighbouring pixels over contrast within blocks, 0 for a flat image.
     """
 
     fault: ImageFault | None
@@ -53,12 +53,13 @@ class Usability:
 
     @property
     def usable(self) -> bool:
-        """Whether it can be registered."""
+        """Whether the frame can be registered."""
         return self.fault is None
 
 
 def examine(image: Image, previous: Image | None = None) -> Usability:
-    """Check an image (H, W, 3) uint8 RGB; previous: the stream's image before it.
+    """Check an image (H, W, 3) uint8 RGB. previous: the stream's image before it; None: it is not
+    tested for a frozen video.
 
     Takes a fraction of a millisecond at the working size.
     """

@@ -62,10 +62,10 @@ class PatchDisplacements:
 
 @dataclass(frozen=True)
 class PatchAgreement:
-    """How the image's patches agree with a registration. parts: number of patches that can be
+    """How the image's patches agree with a registration. patches: number of patches that can be
     compared; votes: number of those that match best at their own position; peak: match of the whole
-    image at its position against its matches at other shifts, in their standard deviations.
-    displacements: shifts of the best matches; patches without a peak are left out.
+    image at its position, minus the mean of its matches at other shifts, in their standard
+    deviations. displacements: shifts of the best matches; patches without a peak are left out.
     """
 
     patches: int
@@ -75,13 +75,13 @@ class PatchAgreement:
 
     @property
     def share(self) -> float:
-        """Of the parts that agree, 0 to 1."""
+        """Share of the patches that agree, 0 to 1."""
         return self.votes / max(self.patches, 1)
 
 
 def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> PatchAgreement:
-    """Test how many patches of the image agree on a pose camera_from_local. problem: a level and
-    some of its anchors.
+    """Test how many patches of the image agree on a pose camera_from_local. problem: a level with
+    all or some of its anchors.
     """
     grid = _patch_grid(problem, rotation, translation)
     able = grid.anchors >= _LEAST_ANCHORS

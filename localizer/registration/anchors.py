@@ -95,7 +95,7 @@ def _candidates(
 
 
 def _stratified(cell: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices of `count` candidates: every cell's first draw, then every cell's second, ..."""
+    """Indices of `count` candidates: one of every cell, then a second of every cell, and so on."""
     place = rng.random(len(cell))
     order = np.argsort(cell + place)
     cells = cell[order]
@@ -121,7 +121,7 @@ def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
     return sample_features(values, uv[:, 0], uv[:, 1])
 
 
-def swept(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> Anchors:
+def apply_sweep(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> Anchors:
     """The anchors, displaced as a rolling shutter shows them.
 
     pose: the camera's approximate pose in the middle of the readout. An error of some degrees
@@ -131,6 +131,6 @@ def swept(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> 
     if sweep is None or len(anchors.points_world) == 0:
         return anchors
     depth_m = float(np.linalg.norm(anchors.points_world.mean(axis=0) - pose.translation))
-    if not sweep.matters(camera, depth_m):
+    if not sweep.displaces_pixels(camera, depth_m):
         return anchors
-    return replace(anchors, points_world=sweep.seen(anchors.points_world, pose, camera))
+    return replace(anchors, points_world=sweep.apparent_points(anchors.points_world, pose, camera))

@@ -22,9 +22,9 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32
 class LMSettings:
     """Levenberg-Marquardt and robust-loss settings (registration.md, sections 3 and 5).
 
-    scale: residual norm at which the loss is no longer quadratic: Huber's threshold, or Geman and
-    McClure's scale if `redescending`. Unit features differ by at most 2. damping: first factor of
-    the diagonal that is added to it (Marquardt's scaling, per axis); it is multiplied by
+    scale: residual norm at which the loss stops to be quadratic: Huber's threshold, or Geman and
+    McClure's scale if `redescending`. Unit features differ by at most 2. damping: share of each
+    diagonal element that is added to it (Marquardt's scaling) in the first step; multiplied by
     damping_down after an accepted step and by damping_up after a rejected one. min_overlap: share
     of the anchors that must project into the image.
     """
@@ -85,7 +85,9 @@ class Refinement:
 
 
 class Backend(Protocol):
-    """Refines many pose hypotheses on one level by Levenberg-Marquardt."""
+    """Implementation of the optimizer's inner loop: refines many pose hypotheses on one pyramid
+    level by Levenberg-Marquardt, on the CPU or a GPU.
+    """
 
     name: str
 
@@ -97,7 +99,9 @@ class Backend(Protocol):
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """Run `iterations` LM steps on each of M poses camera_from_local: rotations (M, 3, 3),
+        translations (M, 3). 0 iterations only score them.
+        """
         ...
 
 
@@ -161,7 +165,10 @@ def sample_bilinear(image: NDArray[np.float32], x: Array, y: Array) -> Array:
 
 
 def camera_from_local(rotations: Array, centres: Array, origin: Array) -> tuple[Array, Array]:
-    """Rotations (M, 3, 3) and translations (M, 3) of M poses world_from_camera, given likewise."""
+    """Rotations (M, 3, 3) and translations (M, 3) of camera_from_local, of M poses
+    world_from_camera with rotations (M, 3, 3) and centres (M, 3). origin: the local frame's, in
+    world coordinates.
+    """
     inverse = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
     return inverse, np.einsum("mij,mj->mi", inverse, origin - centres)
 

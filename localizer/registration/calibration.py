@@ -37,7 +37,7 @@ class CalibrationSigmas(BaseModel):
 
     @classmethod
     def none(cls) -> CalibrationSigmas:
-        """Of a camera and a map that are known exactly."""
+        """Sigmas of a camera and a map without errors."""
         return cls(
             focal_percent=0, principal_percent=0, distortion=0, readout_ms=0, stamp_ms=0, map_m=0
         )  # fmt: skip
@@ -114,7 +114,7 @@ def _pixel_shifts(
     sigmas: CalibrationSigmas, points: Array, pixels: Array, pose: Pose, camera: Camera,
     sweep: Sweep | None,
 ) -> Array:  # fmt: skip
-    """(N, 2, K): by how much each of K numbers, off by its sigma, moves the points' pixels."""
+    """(N, 2, K) shifts of the points' pixels by an error of one sigma in each of K parameters."""
     f = np.array([camera.fx, camera.fy])
     x, y = ((pixels - (camera.cx, camera.cy)) / f).T
     r2, none = x * x + y * y, np.zeros(len(points))
@@ -131,7 +131,7 @@ def _pixel_shifts(
         tangential * f * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1),
     ]
     if sweep is not None and camera.readout_ms > 0:
-        swept, _ = camera.project(pose.inverse.apply(sweep.seen(points, pose, camera)))
+        swept, _ = camera.project(pose.inverse.apply(sweep.apparent_points(points, pose, camera)))
         columns.append((swept - pixels) * (sigmas.readout_ms / camera.readout_ms))
     shifts: Array = np.nan_to_num(np.stack(columns, axis=2))
     return shifts

@@ -67,7 +67,9 @@ class JNGOConfig:
         )
 
     def swarm(self, prior: PosePrior, seed: int) -> tuple[Array, Array]:
-        """Rotations (M, 3, 3) and centres (M, 3) of the hypotheses about a prior."""
+        """Rotations (M, 3, 3) and centres (M, 3), world_from_camera, of hypotheses about a
+        prior.
+        """
         return generate_hypotheses(
             prior,
             self.hypotheses,

@@ -52,7 +52,7 @@ def anchor_model(
     settings: LMSettings,
     cell_px: float,
 ) -> AnchorModel:
-    """The model at one pose, of the anchors in view; `cell_px` is the side of a cell."""
+    """The model of the anchors in view at a pose camera_from_local; cell_px: side of a cell."""
     x, uv = project(problem, rotation, translation)
     visible = in_view(problem, x, uv)
     x, (u, v) = x[visible], uv[visible].T
@@ -108,7 +108,7 @@ class CovarianceSums:
 
 
 def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
-    """The sums of an anchor model, None where no anchor has weight."""
+    """The sums of an anchor model; None if no anchor has weight."""
     scale = model.weights * model.robust
     total = model.weights.sum()
     if not total > 0:
@@ -140,7 +140,7 @@ def mean_motion(projection: Array) -> Array:
 
 
 def curvature_steps(motion: Array, distance_px: float) -> Array:
-    """(13, 6) values of xi: zero, and each axis to and fro by distance_px in the image."""
+    """(13, 6) values of xi: zero, then each axis by plus and by minus distance_px in the image."""
     reach = np.diag(distance_px / np.sqrt(np.maximum(np.diag(motion), 1e-12)))
     return np.concatenate([np.zeros((1, 6)), reach, -reach])
 
@@ -164,9 +164,9 @@ class NoiseModel:
     """Assumptions of the covariance about the noise. correlation: variance factor for correlations
     that the sums do not contain (11b); floor: smallest share of the isotropic model, so that a
     perfect fit does not give a zero covariance; few_anchors: number of anchors in view at which the
-    noise is doubled (11b); shape_cells: number of cells that the isotropic model's shape is
-    weighted with (11c); map_error: standard deviation of the map's displacement times its
-    correlation length, m² (11d).
+    variance is doubled (11b); shape_cells: number of cells that count as much as the isotropic
+    model (11c); map_error: standard deviation of the map's displacement times its correlation
+    length, m² (11d).
     """
 
     correlation: float
@@ -179,7 +179,8 @@ class NoiseModel:
 def sandwich_covariance(
     sums: CovarianceSums, noise: NoiseModel, prior_weight: float = 0.0
 ) -> Array | None:
-    """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
+    """Covariance (6, 6) of xi = (rho, phi) at the optimum; None if it is not determined (H is
+    singular, or 6 image cells or fewer have anchors).
 
     It is the sandwich estimator of equation 11. Variance and correlation of the residuals, between
     channels and within an image cell, come from the data. A prior adds noise of its own, by its
@@ -201,7 +202,7 @@ def sandwich_covariance(
 
 
 def _inverse(matrix: Array) -> Array | None:
-    """Of a positive definite matrix, whatever its rows' units; None where it is singular."""
+    """Inverse of a positive definite matrix with rows of any units; None if it is singular."""
     diagonal = np.diag(matrix)
     if not np.all(diagonal > 0):
         return None
@@ -226,8 +227,8 @@ def _shrunk_meat(sums: CovarianceSums, shape_cells: float) -> Array:
 
 
 def _map_displacement(sums: CovarianceSums, map_error: float) -> Array | None:
-    """Equation 11d: covariance (6, 6) of xi by displaced patches of the map, None where the anchors
-    do not span a pose.
+    """Equation 11d: covariance (6, 6) of xi by displaced patches of the map; None if the anchors do
+    not determine a pose.
     """
     inverse = _inverse(sums.motion)
     if inverse is None:
@@ -239,7 +240,9 @@ def _map_displacement(sums: CovarianceSums, map_error: float) -> Array | None:
 
 
 def pose_covariance(tangent: Array, rotation: Array, translation: Array) -> Array:
-    """`PosePrior`'s covariance (position, left rotation vector; world axes) of a tangent one."""
+    """A tangent covariance (6, 6) converted to `PosePrior`'s (position, left rotation vector; world
+    axes), at the pose camera_from_local.
+    """
     J = pose_tangent_map(rotation, translation)
     covariance: Array = J @ tangent @ J.T
     symmetric: Array = 0.5 * (covariance + covariance.T)
@@ -255,7 +258,7 @@ def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:
     return np.concatenate([centres - other.translation, turn], axis=1)
 
 
-def apart_px(differences: Array, rotation: Array, translation: Array, motion: Array) -> Array:
+def image_gap_px(differences: Array, rotation: Array, translation: Array, motion: Array) -> Array:
     """RMS image displacements (M,), in px of the level of `motion`, of poses that differ by
     `differences` (M, 6) from the pose camera_from_local, to first order.
     """

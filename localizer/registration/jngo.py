@@ -88,7 +88,7 @@ class JNGO:
 
     @property
     def on_gpu(self) -> bool:
-        """Whether features may be on the device now: not any more after the GPU has failed."""
+        """Whether features may be on the device; False without a GPU or after its failure."""
         return self._whole is not None
 
     def register(
@@ -104,10 +104,10 @@ class JNGO:
     ) -> Registration:
         """Pose of the query's camera, a pinhole of the query image's size.
 
-        prior: centre and spread of the swarm. motion: the Kalman prediction of Eq. 10, None before
-        there is one. constraint: attitude, height or position knowledge (`priors`). Deterministic
-        for a seed. On a GPU the query's features may be `DeviceArray`s. If the GPU fails, the CPU
-        takes over for good, and the log says so.
+        prior: centre and spread of the swarm. motion: the Kalman prediction for the motion term of
+        Eq. 10; None before there is one. constraint: attitude, height or position knowledge
+        (`priors`). Deterministic for a seed. On a GPU the query's features may be `DeviceArray`s.
+        If the GPU fails, the CPU is used from then on, and the log says so.
         """
         status = _input_status(query, anchors, self.config)
         if status is not RegistrationStatus.OK:
@@ -141,8 +141,8 @@ class JNGO:
     def _with_agreement(
         self, found: Registration, query: FeaturePyramid, camera: Camera, anchors: Anchors
     ) -> Registration:
-        """A device's registration with the evidence of the image's patches, as the CPU's has it;
-        unchanged where the features are on the device alone.
+        """A GPU registration with the patch agreement that the CPU's has; unchanged if the features
+        are on the device only.
         """
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:
@@ -155,14 +155,14 @@ class JNGO:
             found, agreement=agreement(subsample_anchors(finest, _VOTING_ANCHORS), R[0], t[0])
         )
 
-    def focal_tested(
+    def with_focal_gain(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
     ) -> Registration:
-        """The registration with its `focal_gain`; takes 2 to 3 ms."""
+        """The registration with its `focal_gain` (see `FocalTest.gain`); takes 2 to 3 ms."""
         gain = FocalTest(self.backend, self.config).gain(query, camera, anchors, found)
         return replace(found, focal_gain=gain)
 
-    def focal_fitted(
+    def fit_focal(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
     ) -> FocalFit | None:
         """The focal length that fits a registration best; see `FocalTest.fit`."""
@@ -239,7 +239,7 @@ class JNGO:
         t: Array,
         origin: Array,
     ) -> LevelProblem:
-        """The problem with the constraint's cost in the units of the level's best score."""
+        """The problem with the constraint as its prior, weighted by the level's best score."""
         if constraint is None or self.config.prior_weight == 0:
             return problem
         best = self.backend.refine(problem, R, t, 0, self.config.settings).scores.min()
@@ -256,8 +256,8 @@ class JNGO:
     def _found(
         self, swarm: _Swarm, winner: _Winner, level: LevelProblem, stride: int
     ) -> SearchSurvivors:
-        """The survivors with the winner in the first's place, and the sums at its pose; level: the
-        network's finest, on which the image's parts vote.
+        """The survivors with the winner in the first's place, and the sums at its pose. level: the
+        network's finest level, for the patch agreement.
         """
         c, problem, R, t = self.config, winner.problem, winner.rotation, winner.translation
         return SearchSurvivors(
@@ -273,7 +273,7 @@ class JNGO:
         )
 
     def _sums(self, winner: _Winner, cell_px: float) -> CovarianceSums | None:
-        """Equation 11's sums, of some of the anchors, and 11a's curvature, of all."""
+        """The sums of equation 11 over some of the anchors, and the curvature of 11a over all."""
         R, t, settings = winner.rotation, winner.translation, winner.settings
         few = subsample_anchors(winner.problem, _COVARIANCE_ANCHORS)
         sums = covariance_sums(anchor_model(few, R, t, settings, cell_px))
@@ -297,7 +297,7 @@ class JNGO:
 
 @dataclass(frozen=True)
 class _Swarm:
-    """Survivors, best first, with the problem and the loss that scored them."""
+    """Surviving hypotheses, best first, with the problem and the loss that scored them."""
 
     problem: LevelProblem
     settings: LMSettings
@@ -327,8 +327,9 @@ def _beginning(
     prior: PosePrior,
     seed: int,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The swarm, camera_from_local. For a wide prior it is followed by the best of many draws, by
-    the coarsest level's cost. Also returns which hypotheses are draws (registration.md, section 6).
+    """The first hypotheses, camera_from_local: the swarm, and for a wide prior also the best of
+    many draws, by the coarsest level's cost. Also returns which hypotheses are draws
+    (registration.md, section 6).
     """
     R, t = camera_from_local(*c.swarm(prior, seed), origin)
     variance = float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1])
@@ -388,7 +389,9 @@ def _totals(
 
 
 def make_backend(name: str, threads: int = 2) -> Backend:
-    """The backend called `name`: "numba" or "reference". ValueError for another name."""
+    """The CPU backend called `name`: "numba" (compiled, uses `threads`) or "reference" (slow NumPy,
+    for tests). ValueError for another name. For a GPU see `devices.open_backend`.
+    """
     if name == "numba":
         return NumbaBackend(threads)
     if name == "reference":

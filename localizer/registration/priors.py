@@ -1,7 +1,7 @@
 """Other sensors' knowledge of the camera pose, as constraints of the registration.
 
 Each function makes a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
-(docs/explanation/registration.md, section 9). `fused` applies one to a registered pose afterwards,
+(docs/explanation/registration.md, section 9). `fuse` applies one to a registered pose afterwards,
 weighted by the pose's covariance.
 """
 
@@ -93,7 +93,7 @@ class FusedPose:
 
 def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Array]:
     """(K, 6) rows F and (K,) values z of unit variance, so that ``F d = z`` for the difference d
-    (6,) by which `pose` should move: the constraint in units of its own sigmas.
+    (6,) by which `pose` should move: the constraint, scaled by its own sigmas.
     """
     scale = np.sqrt(np.maximum(np.diag(constraint.information), 1e-300))
     values, vectors = np.linalg.eigh(constraint.information / np.outer(scale, scale))
@@ -108,12 +108,12 @@ def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Arra
 
 
 def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose:
-    """The pose after a constraint of another sensor was applied.
+    """A pose and its covariance (6, 6) after the update with a constraint of another sensor.
 
-    covariance: (6, 6). The sensor's error (mounting, gimbal, air pressure) is constant over frames
-    and does not average out. So along each principal direction a variance P larger than the
-    sensor's R becomes R, by an update with the noise ``R P / (P - R)``; a smaller one is unchanged.
-    `odometry.growth.fuse` follows the same rule.
+    The sensor's error (mounting, gimbal, air pressure) is constant over frames and does not average
+    out. So along each principal direction a variance P larger than the sensor's R becomes R, by an
+    update with the noise ``R P / (P - R)``; a smaller one is unchanged. `odometry.growth.fuse`
+    follows the same rule.
     """
     rows, values = constraint_rows(constraint, pose)
     known = rows @ covariance @ rows.T

@@ -13,7 +13,7 @@ from localizer.registration.backend import world_from_camera
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import (
     CovarianceSums,
-    apart_px,
+    image_gap_px,
     mode_spread,
     pose_covariance,
     pose_differences,
@@ -29,13 +29,13 @@ class Registration:
 
     covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is better, inf on failure.
     overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. evaluations:
-    number of cost evaluations. agreement: of the image's patches, None if unknown (a registration
-    on a GPU, or one that failed). lead: relative difference of the score of the best other mode,
-    inf without another. focal_gain: relative improvement with another focal length
-    (`zoom.FocalTest`), -inf if not tested. mode_covariance: (6, 6), part of the covariance that
-    stems from other modes (equation 14). noise: (6, 6), the part that is independent in each frame,
-    for a filter over frames; None: the whole covariance. earlier_log_odds: smallest log odds of the
-    image's earlier passes (`localizer.integrity.probability`), inf without any.
+    number of cost evaluations. agreement: of the image's patches; None if unknown (features on a
+    GPU, or a failure). lead: relative difference of the score of the best other mode, inf without
+    another. focal_gain: relative improvement with another focal length (`zoom.FocalTest`), -inf if
+    not tested. mode_covariance: (6, 6), part of the covariance that stems from other modes
+    (equation 14). noise: (6, 6), the part that is independent in each frame, for a filter over
+    frames; None: the whole covariance. earlier_log_odds: smallest log odds of the image's earlier
+    passes (`localizer.integrity.probability`), inf without any.
     """
 
     world_from_camera: Pose
@@ -75,7 +75,9 @@ class SearchSurvivors:
 def registration(
     found: SearchSurvivors, config: JNGOConfig, prior: PosePrior, origin: Array
 ) -> Registration:
-    """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE."""
+    """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE. origin: (3,) of the
+    local frame, world.
+    """
     tangent = None
     if found.sums is not None:
         tangent = sandwich_covariance(found.sums, config.noise, found.prior_weight)
@@ -85,7 +87,7 @@ def registration(
     pose = Pose(rotations[0], centres[0])
     differences = pose_differences(rotations, centres, pose)
     R, t = found.rotations[0], found.translations[0]
-    other = apart_px(differences, R, t, found.sums.motion) > config.mode_px
+    other = image_gap_px(differences, R, t, found.sums.motion) > config.mode_px
     probabilities = mode_probabilities(found.scores, found.sums.cells, other)
     spread = mode_spread(differences, probabilities)
     covariance = pose_covariance(tangent, R, t) + spread
@@ -106,7 +108,7 @@ def registration(
 
 
 def _lead(scores: Array, other: NDArray[np.bool_]) -> float:
-    """By how much the best of the `other` modes (M,) is worse than the first, over its score."""
+    """Difference of the best score of the `other` modes (M,) from the first, divided by it."""
     rivals = scores[other & np.isfinite(scores)]
     if len(rivals) == 0:
         return np.inf

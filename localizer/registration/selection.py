@@ -49,8 +49,9 @@ def suppress_duplicates(
 ) -> NDArray[np.int64]:
     """Indices of finite hypotheses, best first, without near copies of better ones.
 
-    Distance: rms over probe anchors of the distance between projections, in pixels of the level.
-    Without this the survivors would be many copies of one mode.
+    R (M, 3, 3), t (M, 3): camera_from_local; totals: (M,) cost. Distance: rms over probe anchors of
+    the distance between projections, in pixels of the level. Without this the survivors would be
+    many copies of one mode.
     """
     order = np.argsort(totals, kind="stable")
     finite = order[np.isfinite(totals[order])]
@@ -71,7 +72,7 @@ def suppress_duplicates(
 
 
 def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float32, Array]:
-    """Of the anchors in view: query and anchor features (n, C), joint weights (n,)."""
+    """Query and anchor features (n, C) and joint weights (n,) of the anchors in view."""
     x, uv = project(problem, R, t)
     visible = in_view(problem, x, uv)
     u, v = uv[visible].T
@@ -89,7 +90,7 @@ def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> 
 
 
 def median_residual(problem: LevelProblem, R: Array, t: Array) -> float:
-    """Weighted median of the residual norms."""
+    """Weighted median of the residual norms at a pose camera_from_local."""
     query, reference, weights = _sampled(problem, R, t)
     norms = np.linalg.norm(query - reference, axis=1)
     order = np.argsort(norms)

@@ -45,7 +45,7 @@ _LEAST_CURVATURE, _SIGMA = 20.0, 0.02
 
 @dataclass(frozen=True)
 class FocalTest:
-    """Refines a pose under other focal lengths, on the registration's own backend."""
+    """Refines a registered pose under other focal lengths, on the registration's own backend."""
 
     backend: Backend
     config: JNGOConfig
@@ -69,9 +69,9 @@ class FocalTest:
     def fit(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
     ) -> FocalFit | None:
-        """The best focal length, as a multiple of the camera's, with the pose refined for each; 5
-        ms. None if the image does not determine it (flat ground seen straight down), if it is
-        beyond `FOCAL_REACH`, and as in `gain`.
+        """The best focal length, as a multiple of the camera's, with the pose refined for each;
+        takes 5 ms. None if the image does not determine it (flat ground seen straight down), if it
+        is beyond `FOCAL_REACH`, and where `gain` gives -inf.
         """
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:
@@ -105,7 +105,7 @@ class FocalTest:
         return _FocalProblem((fine, last), R, t, depth)
 
     def _cost(self, problem: _FocalProblem, factor: float) -> float:
-        """The last level's under that multiple of the focal length."""
+        """Cost on the last level with the focal length multiplied by `factor`."""
         # The camera drawn back as far as the longer focal length seems to bring it on.
         R, t = problem.rotations, problem.translations
         rotations, translations = R, t + np.array([0.0, 0.0, problem.depth_m * (factor - 1.0)])
@@ -126,8 +126,8 @@ class FocalTest:
 
 @dataclass(frozen=True)
 class _FocalProblem:
-    """What is refined under one focal length after the other: rotations (1, 3, 3) and translations
-    (1, 3) of the pose found, camera from local.
+    """Input of a refinement under several focal lengths: levels, and the registered pose
+    camera_from_local, rotations (1, 3, 3) and translations (1, 3).
     """
 
     levels: tuple[LevelProblem, LevelProblem]

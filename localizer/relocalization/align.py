@@ -26,7 +26,7 @@ Complex64 = NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class ImageOffset:
-    """u, v: shift of the frame to the right of and below the rendering, px; score: correlation
+    """Shift of a frame against a rendering. u, v: to the right and down, px; score: correlation
     there times the root of the common share, 0 to 1.
     """
 
@@ -36,7 +36,7 @@ class ImageOffset:
 
 
 class FrameShift:
-    """Estimates the shift between a frame's features and renderings' of the same size."""
+    """Estimates the shift of one frame against renderings of the same size, from features."""
 
     def __init__(self, levels: tuple[FeatureLevel, ...]) -> None:
         level = levels[_LEVEL]
@@ -52,8 +52,10 @@ class FrameShift:
         self._share = np.clip(seen, 0.0, 1.0)
         self._under = self._back(self._ones * self._energy)
 
-    def over(self, levels: tuple[FeatureLevel, ...]) -> ImageOffset:
-        """The best shift over a rendering's pyramid."""
+    def estimate(self, levels: tuple[FeatureLevel, ...]) -> ImageOffset:
+        """The best shift of the frame against a rendering. levels: the rendering's feature
+        pyramid.
+        """
         features = _weighted(levels[_LEVEL])
         raw = self._back((self._transformed(features) * self._spectrum).sum(axis=2))
         energy = self._transformed((features**2).sum(axis=2))
@@ -74,9 +76,10 @@ class FrameShift:
         return values
 
 
-def moved(pose: Pose, camera: Camera, shift: ImageOffset, ground_m: float) -> Array:
-    """Horizontal displacement (2,) m of a camera from a rendering's pose, from their image shift,
-    at equal heading and height. ground_m: ground height. Zero if no ground is seen.
+def displacement(pose: Pose, camera: Camera, shift: ImageOffset, ground_m: float) -> Array:
+    """Horizontal displacement (2,) m of the frame's camera from a rendering's pose, from their
+    image shift, for equal heading and height. ground_m: ground height, world z. Zero if no ground
+    is seen.
     """
     middle = np.array([camera.cx, camera.cy])
     rays = camera.rays(np.stack([middle, middle + np.array([shift.u, shift.v])])) @ pose.rotation.T
@@ -88,7 +91,7 @@ def moved(pose: Pose, camera: Camera, shift: ImageOffset, ground_m: float) -> Ar
 
 
 def _weighted(level: FeatureLevel) -> Float32:
-    """Features (H, W, C) less their mean, by confidence: what an image has everywhere tells no
+    """Features (H, W, C) minus their mean, weighted by confidence; the common mean indicates no
     shift.
     """
     weights = level.confidence.astype(np.float32)[..., None]

@@ -34,7 +34,7 @@ Complex64 = NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class Block:
-    """Origins row to row + STEP and column to column + STEP of the map, in cells; may be < 0."""
+    """Origins (row, column) to (row + STEP, column + STEP) of the map, in cells; may be < 0."""
 
     row: int
     column: int
@@ -107,12 +107,12 @@ class LevelCorrelator:
         self._usual = float(energy[energy > 0].mean()) if (energy > 0).any() else 1.0
 
     def begin(self) -> None:
-        """A search starts: spectra of earlier ones may be dropped."""
+        """Begin a search; spectra that only earlier searches used may then be replaced."""
         with self._lock:
             self._search += 1
 
     def blocks(self) -> list[Block]:
-        """Every block: patches may begin half a block outside the map."""
+        """All blocks; they reach half a block beyond the map, so that patches may, too."""
         rows, columns = self.level.shape
         lead = (SIZE - STEP) // 2
         return [
@@ -186,7 +186,7 @@ class LevelCorrelator:
         return made
 
     def _has_room(self, nbytes: int) -> bool:
-        """Whether there is, after giving up what only earlier searches wanted; under the lock."""
+        """Whether there is room, after dropping earlier searches' spectra. Needs the lock."""
         while self._bytes + nbytes > self._budget and self._kept:
             oldest = next(iter(self._kept))
             if self._used[oldest] == self._search:

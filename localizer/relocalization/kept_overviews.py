@@ -17,7 +17,7 @@ _UNFINISHED_S = 86_400.0  # of a process that was cut off; one that writes takes
 
 
 def mark_used(folder: Path) -> None:
-    """Note that an overview's folder is in use, by its time."""
+    """Set an overview folder's modification time to now, so that `drop_old` keeps it."""
     try:
         os.utime(folder)
     except OSError:  # a map that is only read keeps what it has
@@ -25,8 +25,8 @@ def mark_used(folder: Path) -> None:
 
 
 def drop_old(folder: Path) -> None:
-    """Remove the longest unused overviews beside this folder, and files of an interrupted process.
-    Other files stay.
+    """Remove the overviews beside this folder that were unused for longest, and files of
+    interrupted processes. Other files stay.
     """
     try:
         for left in folder.glob("*.new"):

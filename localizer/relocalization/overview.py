@@ -193,7 +193,7 @@ def _advance(progress: Progress, before: int, total: int, done: int) -> None:
 
 @dataclass(frozen=True)
 class _Squares:
-    """The squares of a level. corners: their first row and column, in cells."""
+    """The squares of a level. corners: row and column of each one's first cell."""
 
     rows: int
     columns: int
@@ -213,7 +213,7 @@ class _Squares:
 
 
 def _require_memory(squares: Sequence[_Squares]) -> None:
-    """A flight that the system ends for want of memory has lost more than its search."""
+    """`MapCacheError` if a search would need more than half of the free memory."""
     cells = [s.rows * s.columns for s in squares]
     wanted, free = CHANNELS * sum(cells) + _SEARCHED_BYTES * cells[0], available_bytes()
     if free is not None and wanted > _MOST_OF_MEMORY * free:
@@ -319,7 +319,7 @@ def _compute(
 
 
 def _principal(squares: Iterable[_SquareFeatures]) -> Projection:
-    """The leading components of the features, each counted with its weight squared."""
+    """Projection to the leading principal components; each feature counts by its weight squared."""
     total, mean, second = 0.0, None, None
     for raw in squares:
         x = raw.features.reshape(-1, raw.features.shape[-1]).astype(np.float64)
@@ -337,7 +337,7 @@ def _principal(squares: Iterable[_SquareFeatures]) -> Projection:
 
 
 def _read(path: Path, gsd_m: float) -> OverviewLevel | None:
-    """A level from the disk; None where there is none, or (named in the log) a damaged one."""
+    """A level from disk; None if there is none, or a damaged one (named in the log)."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -31,8 +31,8 @@ class CameraFootprint:
 
 @dataclass(frozen=True)
 class Patch:
-    """A square of ground, north up. rgb: (n, n, 3) uint8; seen: (n, n) bool; centre: (2,) m from
-    the point below the camera.
+    """A square of ground, north up. rgb: (n, n, 3) uint8; seen: (n, n) mask of the frame's pixels;
+    centre: (2,) m from the point below the camera.
     """
 
     rgb: Image
@@ -40,8 +40,8 @@ class Patch:
     centre: Array
 
 
-def turned(rotation: Array, heading_rad: float) -> Array:
-    """A rotation (3, 3) world_from_camera, rotated by a heading counter-clockwise."""
+def with_heading(rotation: Array, heading_rad: float) -> Array:
+    """A rotation (3, 3) world_from_camera, rotated about up by heading_rad, counter-clockwise."""
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     result: Array = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation
     return result
@@ -50,7 +50,9 @@ def turned(rotation: Array, heading_rad: float) -> Array:
 def footprint(
     camera: Camera, rotation: Array, height_m: float, largest_m: float
 ) -> CameraFootprint:
-    """The useful part of the ground seen by a camera `height_m` above flat ground."""
+    """The useful ground seen by a camera `height_m` above flat ground. rotation: (3, 3)
+    world_from_camera; largest_m: limit of its side.
+    """
     u = np.linspace(0, camera.width, _EDGE_RAYS)
     v = np.linspace(0, camera.height, _EDGE_RAYS)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -72,7 +74,7 @@ def footprint(
 
 
 def patch_side(side_m: float, gsd_m: float, most_px: int) -> int:
-    """Pixels of a patch's side."""
+    """Pixels of a patch's side: a multiple of `_MULTIPLE`, at most most_px."""
     return int(min(-(-side_m / gsd_m // _MULTIPLE) * _MULTIPLE, most_px))
 
 

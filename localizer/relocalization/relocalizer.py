@@ -23,12 +23,12 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
 from localizer.registration.jngo import JNGO
 from localizer.relocalization.align import FrameShift
-from localizer.relocalization.confirm import Confirmation, compared
+from localizer.relocalization.confirm import Confirmation, competitors
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import MapOverview, Progress, open_overview
-from localizer.relocalization.search import SearchView, over_roofs, search
+from localizer.relocalization.search import SearchView, above_roofs, search
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
-from localizer.relocalization.verdict import VerifiedCandidate, answer
+from localizer.relocalization.verdict import VerifiedCandidate, decide
 from localizer.relocalization.verify import QueryFeatures, Verifier
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
@@ -44,7 +44,7 @@ _MOST_UNDISTORTERS = 8
 
 
 class Relocalizer:
-    """Finds a camera on a map from one frame. One thread uses it at a time.
+    """Finds the position of one frame's camera on a map. One thread uses it at a time.
 
     extractor: the network without the detail level. The caller closes all arguments; no other
     thread may use the renderer. height_sigma_m: RMS of the object heights that the map lacks.
@@ -81,7 +81,7 @@ class Relocalizer:
     def find(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> Relocalization | None:
-        """The camera's pose with its evidence; None without a convincing one or if cancelled."""
+        """The camera's pose with its evidence; None if no candidate convinces, or if cancelled."""
         began = time.perf_counter()
         candidates = self.search(query, should_stop)
         searched = time.perf_counter() - began
@@ -96,13 +96,13 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> Relocalization | None:
-        """The candidate that registration confirms; None without one."""
+        """The candidate that registration confirms; None if it confirms none."""
         began = time.perf_counter()
-        judged = self.verify(query, candidates, should_stop) if candidates else []
+        registered = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}
-        if not judged:
+        if not registered:
             return None
-        return answer(query, compared(candidates, judged), judged, stages)
+        return decide(query, competitors(candidates, registered), registered, stages)
 
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
@@ -116,7 +116,7 @@ class Relocalizer:
         ):
             return []
         view = SearchView(image.astype(np.uint8, copy=False), camera)
-        over = over_roofs(query, self.overview.levels[0], self._missing_m, self._config)
+        over = above_roofs(query, self.overview.levels[0], self._missing_m, self._config)
         threads = self._config.threads
         pool = ThreadPoolExecutor(threads, "place-search") if threads > 1 else None
         try:
@@ -136,13 +136,13 @@ class Relocalizer:
         should_stop: Callable[[], bool] = lambda: False,
     ) -> list[VerifiedCandidate]:
         """The registered candidates, best first; the best is refined to the end."""
-        sight, small = self._sights(query)
+        full, small = self._sights(query)
         return Confirmation(
-            self._verifier, sight, small, query, candidates, self._config, should_stop
+            self._verifier, full, small, query, candidates, self._config, should_stop
         ).run()
 
     def _sights(self, query: PlaceQuery) -> tuple[QueryFeatures, QueryFeatures]:
-        """The frame as the tracker sees it, and smaller."""
+        """The frame's features at the tracker's size, and at the smaller size of the screening."""
         camera = working_camera(query.frame.camera, self._width)
         small = working_camera(query.frame.camera, min(_SCREEN_WIDTH, self._width))
         features = self._detail.extract(self._undistorted(query, camera))

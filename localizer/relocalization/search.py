@@ -36,7 +36,7 @@ from localizer.relocalization.patch import (
     footprint,
     patch_side,
     rectify,
-    turned,
+    with_heading,
 )
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.types import Float32, Image
@@ -57,8 +57,9 @@ class SearchView:
 
 @dataclass(frozen=True)
 class Rectification:
-    """One rectification. heading_rad: turn of the query's rotation, counter-clockwise; height_m:
-    above the ground; centre: (2,) m of the patch from the point below the camera; cells: its side.
+    """One trial of the search. heading_rad: rotation of the query's attitude, counter-clockwise;
+    height_m: above the ground; centre: (2,) m of the patch from the point below the camera; cells:
+    side of the patch.
     """
 
     heading_rad: float
@@ -125,11 +126,12 @@ def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> 
     return result
 
 
-def over_roofs(
+def above_roofs(
     query: PlaceQuery, level: OverviewLevel, missing_m: float, config: RelocalizationConfig
 ) -> PlaceQuery:
     """The query with its height above roofs and trees, which stand `missing_m` above the ground of
-    the map; at most half a step of scale lower, so that bare ground is still within a step.
+    the map. It is lowered by at most half a step of scale, so that bare ground is still within a
+    step.
     """
     ground = ground_of(level, query)
     known = ground[np.isfinite(ground)]
@@ -140,8 +142,8 @@ def over_roofs(
 
 @dataclass
 class Scores:
-    """Best score over its trial's noise at each patch origin so far (rows, columns), and the number
-    of that trial.
+    """Best ratio of score to its trial's noise at each patch origin so far (rows, columns), and the
+    number of that trial.
     """
 
     best: Float32
@@ -160,8 +162,9 @@ def search(
 ) -> list[PlaceCandidate] | None:
     """The positions that look most like `view` from above, the best score first.
 
-    Up to `candidates` + 1; none if the map has no ground heights there; None if stopped.
-    correlators: of the levels, finest first. A position's height is the query's.
+    At most `candidates` + 1; none if the map has no ground heights there; None if stopped.
+    correlators: of the levels, finest first. A candidate's height is the query's. pool: threads
+    that share the work; None: this thread only.
     """
     heights = scales(query, ground_of(correlators[0].level, query), config)
     if len(heights) == 0:
@@ -192,7 +195,9 @@ def search(
 
 
 def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
-    """Group height indices by ratio at most `ratio`; each group shares its features."""
+    """Indices of ascending heights in groups that share their features: in a group, the highest is
+    at most `ratio` times the lowest.
+    """
     groups: list[list[int]] = []
     for i, height in enumerate(heights):
         if groups and height <= heights[groups[-1][0]] * ratio:
@@ -204,11 +209,11 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class BlockScores:
-    """Scores (STEP, STEP) of one trial (heading and height) at the origins of each block that it
-    can lie in.
+    """Scores (STEP, STEP) of one trial (heading and height) at the origins of each block that suits
+    its height.
 
     noise: root mean square of the trial's scores. Trials are compared by score divided by noise:
-    close above a hill few cells are seen, and some position always looks similar.
+    low above a hill few cells are seen, and some position always looks similar.
     """
 
     trial: Rectification
@@ -218,7 +223,9 @@ class BlockScores:
 
 @dataclass(frozen=True)
 class _MapSearch:
-    """suited: for each height the blocks that it is right for anywhere, and where (`suits`)."""
+    """Data of one search. suited: for each height, the blocks that it suits, and masks
+    (`suits`).
+    """
 
     view: SearchView
     query: PlaceQuery
@@ -238,7 +245,7 @@ class _MapSearch:
     def at_heading(
         self, heading: float, group: list[int], should_stop: Callable[[], bool]
     ) -> list[BlockScores] | None:
-        """One heading at heights that share an extraction, against every block of theirs."""
+        """Correlate one heading, at heights that share an extraction, with all their blocks."""
         wanted = []
         for scale in group:
             trial = self.trial(heading, float(self.heights[scale]))
@@ -277,18 +284,18 @@ class _MapSearch:
         return Rectification(heading, height, offset, self.cells(height))
 
     def cells(self, height: float) -> int:
-        """Of a patch's side."""
+        """Side of a patch in cells."""
         side = self.seen.side_m * height / self.correlator.level.cell_m
         return int(np.clip(round(side), 8, SIZE - STEP))
 
     def patch(self, trial: Rectification) -> tuple[Float32, Float32]:
-        """Features (n, n, K), weighted, and where they count (n, n), of one rectification."""
+        """Weighted features (n, n, K) of one rectification, and their mask (n, n)."""
         level = self.correlator.level
         side_px = patch_side(self.seen.side_m * trial.height_m, level.gsd_m, _MOST_PX)
         # Exactly the trial's ground, whatever the network's input has to be divisible by.
         gsd = trial.cells * level.cell_m / side_px
         patch = rectify(
-            self.view.image, self.view.camera, turned(self.query.rotation, trial.heading_rad),
+            self.view.image, self.view.camera, with_heading(self.query.rotation, trial.heading_rad),
             trial.height_m, trial.centre, side_px, gsd,
         )  # fmt: skip
         features = comparable_level(self.extractor, patch.rgb)
@@ -300,7 +307,7 @@ class _MapSearch:
         return without_local_mean(weighted.astype(np.float32), known), known
 
     def meets(self, block: Block, trial: Rectification) -> bool:
-        """Whether any origin of a block is a place of the region."""
+        """Whether any origin of a block is a camera position within the region."""
         region = self.query.region
         if region is None:
             return True
@@ -310,17 +317,15 @@ class _MapSearch:
         return not ((first > high).any() or (last < low).any())
 
     def suited_at(self, scale: int) -> dict[Block, NDArray[np.bool_]]:
-        """The blocks of which any origin is at about the scale's height, the same at all headings;
-        where, every `GROUND_CELLS`.
+        """The blocks with an origin that suits the scale's height, at any heading, and the mask of
+        these origins, every `GROUND_CELLS`.
         """
         cells = self.cells(float(self.heights[scale]))
         where = {b: self.suits(self.ground(b, cells), scale) for b in self.correlator.blocks()}
         return {b: suits for b, suits in where.items() if suits.any()}
 
     def ground(self, block: Block, cells: int) -> Float32:
-        """Heights of the ground under the middles of patches of so many cells, every
-        `GROUND_CELLS`.
-        """
+        """Ground heights below the centres of patches of this many cells, every `GROUND_CELLS`."""
         ground = self.correlator.level.ground
         at = np.arange(0, STEP, GROUND_CELLS) + (GROUND_CELLS + cells) // 2
         rows, columns = at + block.row, at + block.column
@@ -330,7 +335,7 @@ class _MapSearch:
         return np.where(out, np.nan, ground[inside]).astype(np.float32)
 
     def suits(self, ground: Float32, scale: int) -> NDArray[np.bool_]:
-        """Where a scale is within its step of what the query's height says, errors included."""
+        """Mask of the ground heights at which the scale fits the query's height, with its error."""
         reach = math.sqrt(self.config.scale_step)
         above = self.query.height_m - ground
         sigma = self.query.height_sigma_m
@@ -388,7 +393,7 @@ class _MapSearch:
             trial, score = chosen.trial, float(best[i, j]) * chosen.noise
             place = self.camera_at(np.array([i - lead, j - lead]), trial)
             pose = Pose(
-                turned(self.query.rotation, trial.heading_rad),
+                with_heading(self.query.rotation, trial.heading_rad),
                 np.array([*place, self.query.height_m]),
             )
             found.append(PlaceCandidate(pose, score))

@@ -68,9 +68,9 @@ class PlaceCandidate:
 class Relocalization:
     """A position that was found and confirmed by registration.
 
-    covariance: (6, 6) as `PosePrior`'s. quality, overlap: of the registration; score: correlation
-    of its candidate, runner_up: of the best candidate elsewhere; rank: of the candidate, from 0;
-    rival_quality: of the best registration elsewhere, 0 without; stage_s: seconds by stage.
+    covariance: (6, 6) as `PosePrior`'s. quality, overlap: of the registration. score: correlation
+    of its candidate, runner_up: of the best candidate elsewhere; rank: of the candidate, from 0.
+    rival_quality: of the best registration elsewhere, 0 without one. stage_s: seconds by stage.
     """
 
     world_from_camera: Pose

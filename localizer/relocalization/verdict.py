@@ -20,8 +20,8 @@ SAME_PLACE_M = 5.0  # answers that are closer are one
 @dataclass(frozen=True)
 class VerifiedCandidate:
     """A candidate after registration. result: fused with attitude and height; prior: for the next
-    pass; log_odds: that the position is right, by the image; credible: whether the other sensors
-    agree, too.
+    pass; log_odds: of the position being right, by the image alone; credible: whether the other
+    sensors agree, too.
     """
 
     candidate: PlaceCandidate
@@ -33,33 +33,36 @@ class VerifiedCandidate:
 
     @property
     def is_decisive(self) -> bool:
-        """Whether no other candidate can be better."""
+        """Whether the evidence is so strong that no other candidate need be registered."""
         return self.credible and self.log_odds >= DECISIVE
 
 
-def answer(
+def decide(
     query: PlaceQuery,
     candidates: list[PlaceCandidate],
-    judged: list[VerifiedCandidate],
+    registered: list[VerifiedCandidate],
     stages: dict[str, float],
 ) -> Relocalization | None:
-    """The best of the registered candidates (at least one, best first); None if another has
-    comparable evidence.
+    """The best of the registered candidates (at least one, best first) as the result; None if it is
+    not credible, or if another has comparable evidence. candidates: the competitors; stages:
+    seconds.
     """
-    best = judged[0]
+    best = registered[0]
     if not best.credible:
         return None
-    elsewhere = [j for j in judged[1:] if _distance(j.result, best.result) > SAME_PLACE_M]
+    elsewhere = [j for j in registered[1:] if _distance(j.result, best.result) > SAME_PLACE_M]
     rival = max((j.result.quality for j in elsewhere), default=0.0)
     # Candidates that registration brings to one place are one: its score is the best of theirs.
-    same = {j.rank for j in judged if _distance(j.result, best.result) <= SAME_PLACE_M}
+    same = {j.rank for j in registered if _distance(j.result, best.result) <= SAME_PLACE_M}
     own = max(candidates[rank].score for rank in same)
     others = {k: c.score for k, c in enumerate(candidates) if k not in same}
     alike = {k for k, score in others.items() if score >= NEARLY * own}
     in_doubt = not best.is_decisive or any(j.credible for j in elsewhere)
     # Where houses are all alike and the right one is none of the candidates, the frame fits several
     # as badly: the winner must stand out from all that look nearly as much like it.
-    stands_out = alike <= {j.rank for j in judged} and best.result.quality >= _STANDS_OUT * rival
+    stands_out = (
+        alike <= {j.rank for j in registered} and best.result.quality >= _STANDS_OUT * rival
+    )
     if in_doubt and not stands_out:
         return None
     return Relocalization(
@@ -77,9 +80,9 @@ def answer(
 
 
 def _distance(a: Registration, b: Registration) -> float:
-    """Between two answers, m."""
+    """Distance between two registered positions, m."""
     away = a.world_from_camera.translation - b.world_from_camera.translation
     return float(np.linalg.norm(away))
 
 
-__all__ = ["CREDIBLE", "DECISIVE", "NEARLY", "SAME_PLACE_M", "VerifiedCandidate", "answer"]
+__all__ = ["CREDIBLE", "DECISIVE", "NEARLY", "SAME_PLACE_M", "VerifiedCandidate", "decide"]

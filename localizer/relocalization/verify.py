@@ -21,9 +21,9 @@ from localizer.registration.priors import (
     height_constraint,
 )
 from localizer.registration.result import Registration, failure
-from localizer.relocalization.align import FrameShift, moved
+from localizer.relocalization.align import FrameShift, displacement
 from localizer.relocalization.config import RelocalizationConfig
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
 from localizer.relocalization.verdict import CREDIBLE
 from localizer.render.base import MapRenderer
@@ -67,7 +67,7 @@ class RenderedReference:
 
 @dataclass(frozen=True)
 class Aligned:
-    """A candidate's prior after alignment. score: of the image shift, 0 with hardly any map."""
+    """A candidate's prior after alignment. score: of the shift; 0 with hardly any map in view."""
 
     prior: PosePrior
     score: float
@@ -119,70 +119,68 @@ class Verifier:
             return None
         return RenderedReference(view, (extractor or self.extractor).extract(fill_holes(view)))
 
-    def screened(self, small: QueryFeatures, prior: PosePrior) -> Aligned:
-        """The prior, moved by the shift between the small frame and its rendering."""
+    def screen(self, small: QueryFeatures, prior: PosePrior) -> Aligned:
+        """The prior, displaced by the shift between the small frame and its rendering."""
         reference = self.reference(prior, small.camera, self.coarse)
         if reference is None:
             return Aligned(prior, 0.0)
-        shift = small.shift.over(reference.features.levels)
-        away = moved(prior.world_from_camera, small.camera, shift, reference.ground_m)
+        shift = small.shift.estimate(reference.features.levels)
+        away = displacement(prior.world_from_camera, small.camera, shift, reference.ground_m)
         near = float(np.linalg.norm(away)) <= _ALIGNED_M
-        return Aligned(shifted(prior, away) if near else prior, shift.score)
+        return Aligned(displaced(prior, away) if near else prior, shift.score)
 
-    def from_place(
-        self, sight: QueryFeatures, place: Aligned, query: PlaceQuery
+    def register_aligned(
+        self, full: QueryFeatures, place: Aligned, query: PlaceQuery
     ) -> tuple[PosePrior, FusedRegistration]:
         """Align a screened candidate again at full size, and register the frame there."""
         prior = place.prior
-        reference = self.reference(prior, sight.camera)
+        reference = self.reference(prior, full.camera)
         for _ in range(_ALIGNMENTS):
             if reference is None:
                 break
-            shift = sight.shift.over(reference.features.levels)
-            away = moved(prior.world_from_camera, sight.camera, shift, reference.ground_m)
+            shift = full.shift.estimate(reference.features.levels)
+            away = displacement(prior.world_from_camera, full.camera, shift, reference.ground_m)
             if not _MOVED_M <= np.linalg.norm(away) <= _ALIGNED_M:
                 break
-            prior = shifted(prior, away)
-            reference = self.reference(prior, sight.camera)
-        return prior, self.register(sight, prior, query, reference)
+            prior = displaced(prior, away)
+            reference = self.reference(prior, full.camera)
+        return prior, self.register(full, prior, query, reference)
 
-    def around(
-        self, sight: QueryFeatures, prior: PosePrior, query: PlaceQuery
+    def register_around(
+        self, full: QueryFeatures, prior: PosePrior, query: PlaceQuery
     ) -> FusedRegistration:
-        """The best of several registrations that start displaced to all sides."""
-        reference = self.reference(prior, sight.camera)
+        """The best of several registrations whose start is displaced to each side."""
+        reference = self.reference(prior, full.camera)
         if reference is None:
             return FusedRegistration(failure(prior, RegistrationStatus.NO_OVERLAP))
         above = prior.world_from_camera.translation[2] - reference.ground_m
         reach = _AROUND * float(np.clip(above, *_AROUND_HEIGHTS_M))
-        starts = [shifted(prior, reach * np.array(side)) for side in _SIDES]
-        found = [self.register(sight, start, query, reference) for start in starts]
+        starts = [displaced(prior, reach * np.array(side)) for side in _SIDES]
+        found = [self.register(full, start, query, reference) for start in starts]
         return max(found, key=lambda each: log_odds(each.registration))
 
     def register(
         self,
-        sight: QueryFeatures,
+        full: QueryFeatures,
         prior: PosePrior,
         query: PlaceQuery,
         reference: RenderedReference | None = None,
     ) -> FusedRegistration:
-        """One pass: register the frame to the view at the prior's pose (rendered if not given) and
-        fuse attitude and height. Another focal length is tried if the result is good.
+        """One pass: register the frame to the view at the prior's pose (None: render it) and fuse
+        attitude and height. A good result is also tested with other focal lengths.
         """
-        reference = reference or self.reference(prior, sight.camera)
+        reference = reference or self.reference(prior, full.camera)
         if reference is None:
             return FusedRegistration(failure(prior, RegistrationStatus.NO_OVERLAP))
         anchors = select_anchors(reference.view, reference.features, self.anchors, self.seed)
-        image = self.optimizer.register(
-            sight.features, sight.camera, anchors, prior, seed=self.seed
-        )
+        image = self.optimizer.register(full.features, full.camera, anchors, prior, seed=self.seed)
         if log_odds(image) >= self.integrity.min_log_odds:
-            image = self.optimizer.focal_tested(sight.features, sight.camera, anchors, image)
+            image = self.optimizer.with_focal_gain(full.features, full.camera, anchors, image)
         known = _constraints(image.world_from_camera, query)
         return fused_registration(with_map_error(image, self.height_sigma_m), known)
 
-    def again(self, prior: PosePrior, result: Registration) -> PosePrior:
-        """The prior of the next pass; the same image is no new evidence, so sigma halves."""
+    def next_prior(self, prior: PosePrior, result: Registration) -> PosePrior:
+        """Prior of the next pass. Sigma only halves, because the same image is no new evidence."""
         return PosePrior(result.world_from_camera, prior.covariance / 4, prior.time_ns)
 
     def is_credible(
@@ -208,16 +206,16 @@ class Verifier:
 
 
 def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseConstraint]:
-    """Roll and pitch as the autopilot has them, at the pose's heading; and the height."""
+    """Constraints by the query: roll and pitch, at the pose's heading, and the height."""
     _, heading = tilt_and_heading(pose.rotation, query.rotation)
     tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
     return (
-        attitude_constraint(turned(query.rotation, heading), tilt, np.pi),
+        attitude_constraint(with_heading(query.rotation, heading), tilt, np.pi),
         height_constraint(query.height_m, max(query.height_sigma_m, _LEAST_HEIGHT_SIGMA_M)),
     )
 
 
-def shifted(prior: PosePrior, away: Array) -> PosePrior:
+def displaced(prior: PosePrior, away: Array) -> PosePrior:
     """A prior displaced by (2,) m to the east and north."""
     pose = prior.world_from_camera
     place = pose.translation + np.array([*away, 0.0])

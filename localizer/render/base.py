@@ -28,7 +28,7 @@ class TileProvider(Protocol):
     def select(
         self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
     ) -> Sequence[TileMesh]:
-        """Meshes to draw for a view."""
+        """Meshes to draw for a view. wait: block until all tiles in view are in memory."""
         ...
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
@@ -119,7 +119,7 @@ class TileRenderer(ABC):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw just these meshes."""
+        """Draw exactly these meshes."""
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
         """See `MapRenderer.prefetch`."""

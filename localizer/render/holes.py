@@ -12,10 +12,10 @@ from localizer.types import Image, RenderedView
 def fill_holes(view: RenderedView) -> Image:
     """The view's image (H, W, 3) uint8 with the map's holes filled from their surroundings.
 
-    In flight there is no edge of a hole, but it would change all features near it. Pixels above the
-    horizon are not filled, because the sky may be seen there. The method is "pull-push", averages
-    from fine to coarse and back (Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.3).
-    Without any surface in view the image is unchanged.
+    The camera's frame has no such edges, and in the reference they would change all features near
+    them. Pixels above the horizon are not filled, because the sky may be seen there. The method is
+    "pull-push", averages from fine to coarse and back (Gortler et al., The Lumigraph, SIGGRAPH
+    1996, section 3.4.3). Without any surface in view the image is unchanged.
     """
     known = view.depth > 0
     holes = ~known & ~_above_horizon(view)
@@ -26,7 +26,7 @@ def fill_holes(view: RenderedView) -> Image:
 
 
 def _above_horizon(view: RenderedView) -> NDArray[np.bool_]:
-    """(H, W): whether the pixel's ray leads upwards in the world (z up)."""
+    """Mask (H, W) of the pixels whose ray leads upwards in the world (z up)."""
     camera, (right, down, ahead) = view.camera, view.world_from_camera.rotation[2]
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy

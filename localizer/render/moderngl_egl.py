@@ -62,7 +62,7 @@ void main() {
 
 @dataclass(eq=False)
 class _Uploaded:
-    """A mesh on the GPU. owner: keeps the arrays, and so their identity, alive."""
+    """A mesh on the GPU. owner: the mesh in memory, referenced so that its id is not reused."""
 
     owner: TileMesh
     array: Any
@@ -121,7 +121,7 @@ class ModernGLRenderer(TileRenderer):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw just these meshes."""
+        """Draw exactly these meshes. `RenderError` on a thread that did not make the renderer."""
         self._assert_owner()
         target = self._target(camera.width, camera.height)
         target.framebuffer.use()

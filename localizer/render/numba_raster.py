@@ -69,7 +69,7 @@ class NumbaRenderer(TileRenderer):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw just these meshes."""
+        """Draw exactly these meshes."""
         meshes = _front_to_back([m for m in meshes if len(m.faces)], world_from_camera)
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.float32)
@@ -145,7 +145,7 @@ class NumbaRenderer(TileRenderer):
 
 
 def _front_to_back(meshes: list[TileMesh], world_from_camera: Pose) -> list[TileMesh]:
-    """Nearest first: what is drawn later then mostly fails the depth test."""
+    """The meshes, nearest first, so that most later pixels fail the depth test."""
     eye: Array = world_from_camera.translation
 
     def distance(mesh: TileMesh) -> float:

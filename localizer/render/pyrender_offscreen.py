@@ -103,7 +103,7 @@ class PyrenderRenderer(TileRenderer):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw just these meshes. `RenderError` on a thread that did not make the renderer."""
+        """Draw exactly these meshes. `RenderError` on a thread that did not make the renderer."""
         if threading.get_ident() != self._owner:
             raise RenderError("an OpenGL renderer was used by a thread that did not make it")
         scene = pyrender.Scene(bg_color=self._sky)

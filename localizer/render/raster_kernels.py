@@ -95,8 +95,8 @@ def list_faces(screen, faces, width, strip_of_row, listed, counts):  # type: ign
 
 @njit(cache=True, nogil=True)
 def clip(positions, uvs, faces, crossing, T, intrinsics, near):  # type: ignore[no-untyped-def]
-    """Faces cut at the near plane, one or two triangles each: their corners as `project` gives
-    them (3 m, 3), and texture coordinates (3 m, 2).
+    """Cut faces at the near plane to one or two triangles each: their corners as `project` gives
+    them (3 m, 3), and texture coordinates (3 m, 2). crossing: indices of the faces.
     """
     screen = np.empty((6 * crossing.shape[0], 3), np.float32)
     cut_uvs = np.empty((6 * crossing.shape[0], 2), np.float32)
@@ -139,7 +139,7 @@ def clip(positions, uvs, faces, crossing, T, intrinsics, near):  # type: ignore[
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _spread(texel):  # type: ignore[no-untyped-def]
-    """RGB bytes to three lanes of 21 bits, so that one multiplication weights all."""
+    """Put RGB bytes into three lanes of 21 bits, so that one multiplication weights all."""
     return (
         (texel & np.uint64(0xFF))
         | (texel & np.uint64(0xFF00)) << np.uint64(13)
@@ -149,7 +149,7 @@ def _spread(texel):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _row_blend(pair, weight):  # type: ignore[no-untyped-def]
-    """A texel and its right neighbour, weight (of 256) to the latter; lanes of 13 bits."""
+    """Blend a texel and its right neighbour, which has `weight` (of 256); lanes of 13 bits."""
     left, right = _spread(pair), _spread(pair >> np.uint64(24))
     both = left * (np.uint64(256) - weight) + right * weight
     return both >> np.uint64(3) & np.uint64(_LANES)

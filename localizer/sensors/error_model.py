@@ -80,7 +80,7 @@ class SensorErrorModel:
 
     @property
     def mounted_tilt_deg(self) -> float:
-        """Sigma of roll and pitch of gimbal and autopilot, constant error included."""
+        """Sigma of roll and pitch of gimbal and autopilot, with the constant error."""
         return math.hypot(self.tilt_deg, self.alignment_deg)
 
     @property

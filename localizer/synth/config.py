@@ -21,7 +21,7 @@ TERRAIN_SPACING_M = 5.0
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """A world's geometry. `relief_m` and `town_radius_m` follow from size and seed when None.
+    """A world's geometry. relief_m, town_radius_m: None: derived from size and seed.
 
     character: use of nearly all cells; mixed: a town surrounded by open country.
     """

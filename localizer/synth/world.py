@@ -135,9 +135,9 @@ def build_world(
 ) -> WorldInfo:
     """Generate a world and write it to the folder `out` as tileset.json, GLB tiles and world.json.
 
-    variant: "survey" is what the map shows, "live" the same place at another visit. config and look
-    replace what seed, size and variant stand for. processes: how many paint at the same
-    time; more than one needs the usual ``if __name__ == "__main__"`` guard in a script.
+    variant: "survey" is what the map shows, "live" the same place at another visit. config, look:
+    replace the defaults of seed, size and variant. processes: number that paint in parallel; more
+    than one needs the usual ``if __name__ == "__main__"`` guard in a script.
     """
     config = config or WorldConfig(seed, size_m)
     visit = Visit(variant, look or look_of(variant))
@@ -152,7 +152,7 @@ def build_visits(
 ) -> list[WorldInfo]:
     """Generate several visits to one world, each in its folder; the plan is made once.
 
-    progress: told the share of all that is done, 0 to 1.
+    progress: called with the share of the work that is done, 0 to 1.
     """
     plan = plan_world(config)
     infos = []
@@ -211,7 +211,7 @@ def _write_visit(
 def painted_blocks(
     scene: TileScene, folder: Path, places: list[tuple[int, int]], processes: int
 ) -> Iterator[Iterable[tuple[tuple[int, int], TilePart]]]:
-    """Painted blocks as they are finished, in this process or in a pool."""
+    """Context manager: iterates over (block, its part) as finished, here or in a pool."""
     if processes <= 1:
         baker = Baker(scene, folder)
         yield ((place, baker.block(*place)) for place in places)

@@ -34,8 +34,8 @@ _H = np.hstack([np.eye(3), np.zeros((3, 3))])
 
 @dataclass(frozen=True)
 class _TrackHypothesis:
-    """A hypothesis. mean: (6,) position m and velocity m/s, world axes; covariance: (6, 6);
-    sightings: how many it was made of.
+    """A hypothesis. weight: probability; mean: (6,) position m and velocity m/s, world axes;
+    covariance: (6, 6); sightings: number of observations in it.
     """
 
     weight: float
@@ -45,7 +45,7 @@ class _TrackHypothesis:
 
 
 class TargetFilter:
-    """Tracks one target; not thread-safe."""
+    """Tracks one target that may move; not thread-safe."""
 
     def __init__(self) -> None:
         self._tracks: list[_TrackHypothesis] = []
@@ -62,7 +62,7 @@ class TargetFilter:
 
     @property
     def velocity_covariance(self) -> Array | None:
-        """Covariance of `velocity`, (3, 3) m²/s²."""
+        """Covariance (3, 3) m²/s² of `velocity`; None without one."""
         if self.velocity is None:
             return None
         covariance: Array = self._tracks[0].covariance[3:, 3:].copy()
@@ -91,7 +91,7 @@ class TargetFilter:
         return self._fix(sighting) if met else None
 
     def _fix(self, sighting: TargetSighting) -> TargetFix:
-        """The most probable track; the covariance is the mean square about it of all of them."""
+        """The most probable track; the covariance is the mean square of all tracks about it."""
         best = self._tracks[0]
         covariance, elsewhere = np.zeros((3, 3)), 0.0
         for track in self._tracks:
@@ -161,7 +161,7 @@ def _met(
 
 
 def _likelihood(track: _TrackHypothesis, surface: TargetSurface) -> float:
-    """Of a surface's point, relative to the best possible one; 0 outside the gate."""
+    """Likelihood of a surface's point relative to the best possible one; 0 outside the gate."""
     S = track.covariance[:3, :3] + surface.covariance
     innovation = surface.position - track.mean[:3]
     distance = float(innovation @ np.linalg.solve(S, innovation))
@@ -172,7 +172,7 @@ def _likelihood(track: _TrackHypothesis, surface: TargetSurface) -> float:
 
 
 def _reduced(tracks: list[_TrackHypothesis]) -> list[_TrackHypothesis]:
-    """Normalised, the heaviest first; the same ones merged, negligible ones dropped."""
+    """The tracks normalised, by falling weight; equal ones are merged, negligible ones dropped."""
     waiting = sorted(tracks, key=lambda t: -t.weight)
     total = sum(t.weight for t in waiting)
     kept: list[_TrackHypothesis] = []

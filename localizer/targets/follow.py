@@ -19,12 +19,12 @@ from localizer.geometry.pose import Array
 from localizer.targets.foreground import (
     AppearanceCoverage,
     TargetAppearance,
-    covered,
+    find_object,
     is_detectable,
     is_ground,
 )
 from localizer.targets.standing import StaticAppearance
-from localizer.targets.track import projected
+from localizer.targets.track import pixel_of
 from localizer.types import PoseEstimate
 
 Gray = NDArray[np.uint8]
@@ -71,8 +71,8 @@ class FollowedPosition:
 class ImageFollower:
     """Tracks one target from a frame with a known position. Not thread-safe.
 
-    half_m: half the side of the target; None for a point. Check `ready` first: plain ground cannot
-    be tracked.
+    position: (3,) world metres; half_m: half the side of the target, None for a point. Check
+    `ready` first: plain ground cannot be tracked.
 
     Above 200 lines: both methods, by appearance alone and against known ground, share the learned
     appearance.
@@ -111,7 +111,7 @@ class ImageFollower:
         was_hidden: bool = False,
     ) -> FollowedPosition | None:
         """Find the target within `reach_m` of the expected position (3,), at most 80 cells from it;
-        None if it is not seen or two places match equally well. A match changes the follower: it
+        None if it is not seen or two positions match equally well. A match changes the follower: it
         learns the target's usual score, its course and its present appearance.
 
         was_hidden: after an occlusion; positions near the expected one are then more likely.
@@ -134,7 +134,7 @@ class ImageFollower:
             return None
         self._usual += _LATELY * (best[0] - self._usual)
         position = expected + self._on_ground(best[1] * self._cell)
-        pixel = projected(estimate, position)
+        pixel = pixel_of(estimate, position)
         if pixel is None:
             return None
         self._course += turn
@@ -143,7 +143,7 @@ class ImageFollower:
             self._renew(gray, estimate, position)
         return FollowedPosition(position, pixel, best[0])
 
-    def find_before(
+    def find_on_ground(
         self,
         gray: Gray,
         estimate: PoseEstimate,
@@ -153,8 +153,8 @@ class ImageFollower:
         *,
         was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:
-        """As `find`, for an isolated target: compares it with `pictures` of the same ground without
-        it, so that road markings and shadows are not mistaken for it.
+        """As `find`, for an isolated target: compares the frame with `pictures` of the same ground
+        without the target, so that road markings and shadows are not mistaken for it.
 
         Returns whether the images can decide, and the target. They cannot decide if the target
         looks like the ground, or is in all images.
@@ -174,13 +174,13 @@ class ImageFollower:
                 if (best is not None and best.share >= _SURE) or look is None:
                     break
                 can_tell = can_tell or is_detectable(ground, look)
-                one = covered(chart, ground, look, _ASIDE if was_hidden else 0.0)
+                one = find_object(chart, ground, look, _ASIDE if was_hidden else 0.0)
                 if one is not None and _is_better(one, best):
                     best, turn = one, angle
         if best is None:
             return can_tell, None
         position = expected + self._on_ground(best.offset * self._cell)
-        pixel = projected(estimate, position)
+        pixel = pixel_of(estimate, position)
         if pixel is None:
             return can_tell, None
         self._course += turn
@@ -188,7 +188,7 @@ class ImageFollower:
         return True, FollowedPosition(position, pixel, best.share)
 
     def _look(self, grey: Grey | None, angle: float) -> TargetAppearance | None:
-        """An isolated target's look, turned by `angle`."""
+        """An isolated target's appearance, rotated by `angle`; None if it leaves the chart."""
         if grey is None or self._outline is None:
             return None
         turned = self._turned(self._outline.astype(np.float32), angle)
@@ -198,8 +198,8 @@ class ImageFollower:
         return TargetAppearance.of(grey, (turned > 0.5).astype(np.uint8))
 
     def _learn(self, gray: Gray, estimate: PoseEstimate, position: Array, share: float) -> None:
-        """Its look as it is now: as it leaves the place where it was clicked, whose ground is about
-        its first look, and then from time to time.
+        """Learn the present appearance: once when the target leaves the ground where it was clicked
+        (which is part of the first appearance), then from time to time. share: visible part.
         """
         gone_m = float(np.linalg.norm(position - self._origin))
         is_due = estimate.exposure_time_ns - self._renewed_ns >= _RENEWED_NS
@@ -246,10 +246,10 @@ class ImageFollower:
         return True
 
     def watch(self, gray: Gray, estimate: PoseEstimate, position: Array) -> bool:
-        """As `is_changed`, after processing the next frame of a static target at (3,)."""
+        """Process a frame of a static target at position (3,); returns whether it `is_changed`."""
         chart = self._chart(gray, estimate, position, self._half, course=0.0)
         if chart is not None:
-            self._stands.see(estimate.exposure_time_ns, chart)
+            self._stands.update(estimate.exposure_time_ns, chart)
         return self._stands.is_changed
 
     @property
@@ -258,14 +258,14 @@ class ImageFollower:
         return self._stands.is_changed
 
     def shows_ground(self, gray: Gray, estimate: PoseEstimate) -> bool:
-        """Whether the ground is seen at the first position of an isolated target, as without it."""
+        """Whether an isolated target's first position shows the ground: the target left."""
         chart = self._chart(gray, estimate, self._origin, self._half, course=0.0)
         if chart is None or self._isolated_look is None or self._ground is None:
             return False
         return is_ground(chart, self._ground, self._isolated_look)
 
     def forget_shape(self) -> None:
-        """Undo `isolate`."""
+        """Undo `isolate`: the target's cells are no longer separated from the ground."""
         self._mask = self._outline = None
 
     @property
@@ -274,7 +274,7 @@ class ImageFollower:
         return self._mask is not None
 
     def _turned(self, chart: Grey | None, angle: float) -> Grey | None:
-        """A chart as it looks from a chart that is turned by `angle`."""
+        """A chart rotated by `angle`."""
         if chart is None or angle == 0.0:
             return chart
         c, s, h = np.cos(angle), np.sin(angle), float(self._half)
@@ -294,7 +294,7 @@ class ImageFollower:
             self._late, self._renewed_ns = fresh, estimate.exposure_time_ns
 
     def _on_ground(self, along: Array) -> Array:
-        """Metres along the chart's rows and columns (2,) as a world vector (3,)."""
+        """A vector (2,) along the chart's rows and columns as a world vector (3,), metres."""
         c, s = np.cos(self._course), np.sin(self._course)
         return np.array([c * along[0] - s * along[1], s * along[0] + c * along[1], 0.0])
 
@@ -306,7 +306,7 @@ class ImageFollower:
         half: int,
         course: float | None = None,
     ) -> Grey | None:
-        """(2 half + 1, 2 half + 1) grey levels about `middle`; None where some are not in view."""
+        """(2 half + 1, 2 half + 1) grey levels about `middle`; None if some are not in view."""
         steps = np.arange(-half, half + 1) * self._cell
         turned = self._course if course is None else course
         c, s = np.cos(turned), np.sin(turned)
@@ -327,8 +327,8 @@ def _is_better(one: AppearanceCoverage, best: AppearanceCoverage | None) -> bool
 
 
 def _outline(differs: NDArray[np.uint8], half: int) -> NDArray[np.uint8] | None:
-    """The convex outline (1 inside) of what differs about the middle of a chart; None where that
-    does not hold the middle: it is something beside.
+    """Mask (1 inside) of the convex outline of what differs about a chart's centre; None if that
+    does not contain the centre, so it is another object.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         cv2.morphologyEx(differs, cv2.MORPH_CLOSE, np.ones((3, 3)))

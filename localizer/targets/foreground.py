@@ -29,8 +29,8 @@ _AHEAD = 3  # an end is a third of the length
 
 @dataclass(frozen=True)
 class TargetAppearance:
-    """A target's appearance in a chart. grey, inside, about: (2 half + 1) square; inside is 1 in
-    the target, about is 1 close by on the ground.
+    """A target's appearance in a chart; squares of 2 half + 1 cells. grey: grey levels; inside: 1
+    in the target; about: 1 on the ground close by.
     """
 
     grey: Grey
@@ -45,7 +45,7 @@ class TargetAppearance:
         return cls(grey, inside.astype(np.float32), about.astype(np.float32))
 
     def ends(self) -> tuple[Grey, Grey]:
-        """The parts of `inside` before and behind the middle third of its longer axis."""
+        """The parts of `inside` ahead of and behind the middle third of its longer axis."""
         rows, columns = np.nonzero(self.inside)
         places = np.column_stack([columns, rows]).astype(np.float64)
         off = places - places.mean(axis=0)
@@ -78,8 +78,8 @@ def is_detectable(ground: Grey, look: TargetAppearance) -> bool:
 
 
 def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
-    """Whether a chart shows the ground and nothing of the target, although the two differ. All are
-    of one size.
+    """Whether a chart shows the ground and nothing of the target. False if both look the same. All
+    are of one size.
     """
     if not is_detectable(ground, look):
         return False
@@ -89,12 +89,12 @@ def is_ground(chart: Grey, ground: Grey, look: TargetAppearance) -> bool:
     return float(share[0, 0]) <= _NOTHING and off <= _AS_GROUND * float(whole[0, 0])
 
 
-def covered(
+def find_object(
     chart: Grey, ground: Grey, look: TargetAppearance, aside: float = 0.0
 ) -> AppearanceCoverage | None:
     """Position at which the target covers the ground; None without one, if it is half hidden, or if
-    a second position is as likely. chart, ground: squares of the same size. aside: by how much
-    evidence at the end of the search range counts less.
+    a second position is as likely. chart, ground: squares of the same size. aside: share by which
+    evidence in the corners of the search range counts less; 0: all counts alike.
 
     With Gaussian noise the log-likelihood ratio of target against ground is proportional to ``sum
     (I - G)² - (I - L)²``. An image ``G + a (L - G)`` gives ``(2 a - 1)`` times the ratio of the
@@ -134,7 +134,7 @@ def covered(
 
 
 def _evidence(chart: Grey, ground: Grey, look: Grey, inside: Grey) -> tuple[Grey, Grey, Grey]:
-    """(share seen, evidence, evidence that the whole look would have), each of every place."""
+    """(visible share, evidence, evidence of the whole target) at every position of the search."""
     as_ground = cv2.matchTemplate((chart - ground) ** 2, inside, cv2.TM_CCORR)
     as_look = cv2.matchTemplate(chart, look, cv2.TM_SQDIFF, mask=inside)
     whole = cv2.matchTemplate(ground, look, cv2.TM_SQDIFF, mask=inside)

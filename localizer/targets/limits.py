@@ -45,7 +45,7 @@ class RefusalReason(enum.Enum):
 
 @dataclass(frozen=True)
 class TargetRefusal:
-    """metres: the distance of `TOO_FAR` and `MOVED`, the sigma of `UNCERTAIN`."""
+    """Why a position is refused. metres: distance (TOO_FAR, MOVED) or sigma (UNCERTAIN)."""
 
     reason: RefusalReason
     metres: float = 0.0
@@ -56,13 +56,13 @@ class TargetRefusal:
 
 @dataclass
 class _Leap:
-    """Another place that was seen again and again since `since_ns`."""
+    """Another position that was observed repeatedly since `since_ns`."""
 
     since_ns: int
     newest: TargetFix
 
 
-class LastPlace:
+class LastPosition:
     """Last reported position of a target. Not thread-safe. confirm_ns: time over which its first
     observations must agree, so that holes in the first frames' depth do not matter.
     """
@@ -73,11 +73,12 @@ class LastPlace:
         self._leap: _Leap | None = None
         self._begun_ns = 0
 
-    def objection(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
-        """Why a position is rejected; None if it is accepted, which makes it the last position.
+    def check(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
+        """Why a position is rejected; None if it is accepted and becomes the last position. moves:
+        whether the target moves.
 
-        A detector may give the same name to another object. The new position is reported once it
-        was seen as long as the old one, at most 3 s.
+        A detector may give the same name to another object. The new position is accepted once it
+        was observed for as long as the old one, at most 3 s.
         """
         last, time_ns = self.fix, fix.exposure_time_ns
         if last is None:
@@ -101,7 +102,7 @@ class LastPlace:
         return TargetRefusal(RefusalReason.MOVED, moved)
 
     def _first(self, fix: TargetFix) -> TargetRefusal | None:
-        """Nothing was told yet: the first place is believed once sightings have agreed on it."""
+        """Check before the first report: the position is accepted once observations have agreed."""
         begun, time_ns = self._leap, fix.exposure_time_ns
         if begun is None:
             begun = _Leap(time_ns, fix)
@@ -164,7 +165,7 @@ def is_at_seen_depth(
 
 
 def _reachable(a: TargetFix, b: TargetFix, *, moves: bool) -> bool:
-    """Whether both may be one target: within their errors, and a vehicle's way between them."""
+    """Whether both may be one target: apart by no more than their errors and a vehicle's way."""
     moved = float(np.linalg.norm(b.position_world - a.position_world))
     both = sum(float(np.sqrt(np.trace(fix.covariance))) for fix in (a, b))
     speed = _FASTEST_MPS if moves or b.velocity is not None else 0.0

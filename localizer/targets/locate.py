@@ -156,7 +156,7 @@ def _nodes() -> tuple[Array, Array]:
 
 
 def _bundle(d: Array, spread: RaySpread, outline_rad: float) -> tuple[Array, Array]:
-    """Directions (N, 3) about d (3,) that sample what may lie under a pixel, and weights (N,)."""
+    """Directions (N, 3) about d (3,) that sample the errors of a pixel's ray, and weights (N,)."""
     nodes, weights = _nodes()
     met = spread.covariance + outline_rad**2 * np.eye(2)
     offsets = nodes @ np.linalg.cholesky(met).T @ spread.sideways
@@ -172,8 +172,8 @@ def _bundle(d: Array, spread: RaySpread, outline_rad: float) -> tuple[Array, Arr
 
 
 def _surfaces(hits: BundleHits, directions: Array, gap: float) -> list[np.ndarray]:
-    """Indices of the hits, grouped where sorted distances leap by more than their surfaces' slope
-    explains; gap: metres between neighbouring rays.
+    """Indices of the hits by surface: sorted distances are split where they differ by more than the
+    slopes explain. gap: metres between neighbouring rays.
     """
     order = np.argsort(hits.distances)
     order = order[np.isfinite(hits.distances[order])]

@@ -25,8 +25,8 @@ _LATELY = 0.2  # weight of the newest in what is usual
 
 
 class StaticAppearance:
-    """Appearance of one target over time. Not thread-safe. is_changed: it changed suddenly and has
-    stayed so.
+    """Appearance of one target over time. Not thread-safe. is_changed: whether it changed suddenly
+    and has stayed so.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class StaticAppearance:
         self._begun_ns = 0
         self.is_changed = False
 
-    def see(self, time_ns: int, chart: Grey) -> None:
+    def update(self, time_ns: int, chart: Grey) -> None:
         """Process the target's chart (square, of one size and course) in the next frame."""
         while len(self._kept) > 1 and time_ns - self._kept[1][0] >= _BEFORE_NS:
             self._kept.popleft()
@@ -60,8 +60,8 @@ class StaticAppearance:
 
 
 def _difference(before: Grey, chart: Grey) -> tuple[float, float]:
-    """Root mean squares of the middle: grey levels by which it differs where it fits best, and how
-    much they change from cell to cell.
+    """Root mean squares over the chart's middle: its grey level difference where it fits best, and
+    its change from cell to cell.
     """
     half = len(before) // 2
     k = max(2, round(_MIDDLE * half))

@@ -40,8 +40,10 @@ _FAR_M = 300.0  # what holds a point along rays that are parallel to its plane
 
 
 @dataclass(frozen=True)
-class SightedRay:
-    """A target's pixel in one frame. eye, direction: (3,) world axes, direction of unit length."""
+class ObservedRay:
+    """A target's pixel in one frame as a ray. eye, direction: (3,) world axes, direction of unit
+    length.
+    """
 
     eye: Array
     direction: Array
@@ -70,13 +72,13 @@ class _View:
     bundles: tuple[tuple[TargetSurface, ...], ...]
 
     @classmethod
-    def of(cls, ray: SightedRay, surfaces: tuple[TargetSurface, ...]) -> _View:
+    def of(cls, ray: ObservedRay, surfaces: tuple[TargetSurface, ...]) -> _View:
         S = ray.spread.sideways
         pixel, pose = S.T @ ray.spread.pixel @ S, S.T @ ray.spread.pose @ S
         return cls(1, ray.eye, ray.direction, S, pixel, pose, (surfaces,))
 
-    def with_(self, other: _View) -> _View:
-        """The mean of both, with the newest bundles of rays."""
+    def merged(self, other: _View) -> _View:
+        """The mean of both views, with the newest ray bundles."""
         n, share = self.count + other.count, other.count / (self.count + other.count)
         mean = {
             name: (1 - share) * getattr(self, name) + share * getattr(other, name)
@@ -91,8 +93,8 @@ class _View:
         information: Array = np.linalg.inv(self.sideways @ C @ self.sideways.T)
         return information
 
-    def sight(self, point: Array) -> float:
-        """Share of the newest bundles' rays that meet what is at (3,)."""
+    def seen_share(self, point: Array) -> float:
+        """Share of the newest bundles' rays that hit the surface at the point (3,)."""
         along = float((point - self.eye) @ self.direction)
         met = 0.0
         for s in (surface for bundle in self.bundles for surface in bundle):
@@ -116,7 +118,7 @@ class _Hypothesis:
 
 
 class StaticTarget:
-    """All hypotheses of a static target; not thread-safe. map_sigma_m: of the surface."""
+    """All position hypotheses of a static target; not thread-safe. map_sigma_m: of the surface."""
 
     def __init__(self, map_sigma_m: float) -> None:
         self._map_sigma_m = map_sigma_m
@@ -125,7 +127,7 @@ class StaticTarget:
         self._hypotheses: list[_Hypothesis] = []
         self.sightings = 0
 
-    def update(self, ray: SightedRay, surfaces: tuple[TargetSurface, ...]) -> bool:
+    def update(self, ray: ObservedRay, surfaces: tuple[TargetSurface, ...]) -> bool:
         """Add an observation of at least one surface; False, unchanged, if it fits none."""
         view = _View.of(ray, surfaces)
         if self._hypotheses:
@@ -135,13 +137,13 @@ class StaticTarget:
             self._recent.append(min(off, _TORN))
         self.sightings += 1
         self._add(view)
-        self._meet(surfaces)
-        self._settle()
+        self._assign_planes(surfaces)
+        self._solve_all()
         return True
 
     @property
-    def strain(self) -> float:
-        """Squared ratio of the newest residuals to their expected errors; 1: consistent."""
+    def residual_ratio(self) -> float:
+        """Squared ratio of the newest residuals to their expected errors, at least 1."""
         n = len(self._recent)
         return max(1.0, sum(self._recent) / (2 * n)) if n else 1.0
 
@@ -169,15 +171,14 @@ class StaticTarget:
         for k, known in enumerate(self._views):
             mean = known.direction / np.linalg.norm(known.direction)
             if float(mean @ view.direction) >= _SAME_VIEW:
-                self._views[k] = known.with_(view)
+                self._views[k] = known.merged(view)
                 return
         self._views.append(view)
         if len(self._views) > _MOST_VIEWS:
             self._views = every_second(self._views)
 
-    def _meet(self, surfaces: tuple[TargetSurface, ...]) -> None:
-        """Assign each surface on which a hypothesis lies to it as its plane, or begin another
-        hypothesis.
+    def _assign_planes(self, surfaces: tuple[TargetSurface, ...]) -> None:
+        """Make each surface the plane of a hypothesis that lies on it, or begin another hypothesis.
 
         A hypothesis never changes to a plane that it is not on. At a ridge or the foot of a wall
         the bundle's mean plane changes with the pixel and would move the hypothesis.
@@ -198,13 +199,15 @@ class StaticTarget:
                 p = h.position - n * float(n @ (h.position - p))
             self._hypotheses.append(_Hypothesis(p, p, n, sigma, surface.covariance))
 
-    def _settle(self) -> None:
-        """Each hypothesis to where plane and rays have it; the unlikely ones go."""
+    def _solve_all(self) -> None:
+        """Move each hypothesis to the position that plane and rays give; drop the unlikely ones."""
         stack = _ViewRays.of(self._views)
         settled = []
         for h in self._hypotheses:
             moved, cost = stack.solve(h)
-            sight = sum(float(np.log(max(v.sight(moved.position), _UNSEEN))) for v in self._views)
+            sight = sum(
+                float(np.log(max(v.seen_share(moved.position), _UNSEEN))) for v in self._views
+            )
             log_weight = -0.5 * cost + max(sight, _LEAST_SIGHT)
             settled.append(replace(moved, log_weight=log_weight))
         settled.sort(key=lambda h: -h.log_weight)
@@ -245,7 +248,7 @@ class _ViewRays:
         )
 
     def solve(self, h: _Hypothesis) -> tuple[_Hypothesis, float]:
-        """The hypothesis where all rays and its plane have it, and what that costs."""
+        """The hypothesis at the position that fits all rays and its plane, and its cost."""
         x = h.position
         plane = np.outer(h.normal, h.normal) / h.sigma_m**2
         weak = np.eye(3) / _FAR_M**2
@@ -262,7 +265,7 @@ class _ViewRays:
         return replace(h, position=x, covariance=np.linalg.inv(H)), cost
 
     def _residuals(self, x: Array) -> tuple[Array, Array, Array]:
-        """Across each ray (rad): residuals (G, 2), their derivative (G, 2, 3), their squares."""
+        """Residuals across each ray (G, 2), rad, their derivatives (G, 2, 3), and squares (G,)."""
         away = x - self.eyes
         distance = np.linalg.norm(away, axis=1)
         r = np.einsum("gij,gj->gi", self.sideways, away / distance[:, None] - self.directions)
@@ -271,7 +274,7 @@ class _ViewRays:
 
 
 def _mahalanobis(view: _View, h: _Hypothesis) -> float:
-    """Squared distance of a new ray from a hypothesis, both uncertain."""
+    """Squared Mahalanobis distance of a new ray from a hypothesis."""
     away = h.position - view.eye
     distance = float(np.linalg.norm(away))
     S = view.sideways

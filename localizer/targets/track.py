@@ -15,7 +15,7 @@ from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import (
-    LastPlace,
+    LastPosition,
     RefusalReason,
     TargetRefusal,
     is_at_seen_depth,
@@ -29,7 +29,7 @@ from localizer.targets.locate import (
     ray_spread,
     surface_covariance,
 )
-from localizer.targets.static import PositionHypothesis, SightedRay, StaticTarget
+from localizer.targets.static import ObservedRay, PositionHypothesis, StaticTarget
 from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
 
 _STANDS_S = 2.0  # for so long it must agree with standing before it stands again
@@ -44,10 +44,10 @@ _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
 
 @dataclass(frozen=True)
 class TargetSettings:
-    """Settings of a target's track. pixel_sigma: of an observation, pixels; map_sigma_m: of the
-    map's surface; max_sigma_m, max_range_m: limits of reported positions; outline_sigma_m: of the
-    map's outlines, across the ray; confirm_s: time over which observations must agree before the
-    first report, 0 for single ones.
+    """Settings of a target's track. pixel_sigma: of an observation, px; map_sigma_m: of the map's
+    surface; bias: errors common to all targets; max_sigma_m, max_range_m: limits of reported
+    positions; outline_sigma_m: of the map's outlines, across the ray; confirm_s: time over which
+    observations must agree before the first report, 0 for single ones.
     """
 
     pixel_sigma: float = 1.5
@@ -60,7 +60,7 @@ class TargetSettings:
 
 
 class TargetTrack:
-    """Track of one target; not thread-safe. refusal: why the last `see` gave no position."""
+    """Track of one target; not thread-safe. refusal: why the last `observe` gave no position."""
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id = target_id
@@ -71,7 +71,7 @@ class TargetTrack:
         self._moves = False
         self._stands_since_ns = 0
         self._outliers = 0
-        self._last = LastPlace(round(settings.confirm_s * 1e9))
+        self._last = LastPosition(round(settings.confirm_s * 1e9))
         self._seen_ns = 0
         self._aim: Array = np.zeros((3, 3))
         self.refusal: TargetRefusal | None = None
@@ -86,7 +86,7 @@ class TargetTrack:
         """(3,) m/s, world axes, of a moving target; None otherwise."""
         return self._moving.velocity if self._moves else None
 
-    def see(
+    def observe(
         self,
         estimate: PoseEstimate,
         pixel: tuple[float, float],
@@ -94,7 +94,7 @@ class TargetTrack:
         drift: tuple[float, float] = (0.0, 0.0),
         pixel_sigma: float | None = None,
     ) -> TargetFix | None:
-        """Add the target's pixel in an accepted frame; None, with `refusal`, without a position."""
+        """Add the target's pixel in an accepted frame; its position, or None with `refusal` set."""
         settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
         time_ns, self.refusal = estimate.exposure_time_ns, None
         eye, d = ray_in_world(estimate, pixel)
@@ -114,7 +114,7 @@ class TargetTrack:
             self._aim = _aim(estimate, pixel, sigma, drift, surfaces[0])
         if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
             self._moving = TargetFilter()
-        ray = SightedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
+        ray = ObservedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
         moving = self._moving.update(TargetSighting(self._id, surfaces, pixel, time_ns))
         fits = self._static.update(ray, surfaces)
         self._outliers = 0 if fits else self._outliers + 1
@@ -149,7 +149,7 @@ class TargetTrack:
         self._moving = TargetFilter()
         self._moves = False
         self._outliers = 0
-        self._last = LastPlace(round(self._settings.confirm_s * 1e9))
+        self._last = LastPosition(round(self._settings.confirm_s * 1e9))
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
         """Predicted position (3,) and covariance (3, 3) at a time; None before the first."""
@@ -171,7 +171,7 @@ class TargetTrack:
         if float(np.sqrt(np.trace(P))) > self._settings.max_sigma_m:
             return None
         bias = self._settings.bias.covariance(position - estimate.world_from_camera.translation)
-        pixel = projected(estimate, position)
+        pixel = pixel_of(estimate, position)
         fix = TargetFix(
             self._id, position, P + bias + self._aim, pixel,
             estimate.exposure_time_ns, 0.0, self._moving.velocity,
@@ -180,12 +180,12 @@ class TargetTrack:
         return fix if pixel is not None and is_on_map(fix, self._cast) else None
 
     def hold(self, estimate: PoseEstimate) -> TargetFix | None:
-        """A static target's position by the pose alone; None for a moving one or before a fix."""
+        """A static target's position in a frame without an observation, by the pose; else None."""
         if self._moves or self._last.fix is None:
             return None
         fix = self._standing(estimate, None)
         away = fix.position_world - estimate.world_from_camera.translation
-        pixel = projected(estimate, fix.position_world)
+        pixel = pixel_of(estimate, fix.position_world)
         if pixel is None:
             return replace(fix, visibility=Visibility.OUTSIDE)
         sigma = float(np.sqrt(away @ fix.covariance @ away)) / float(np.linalg.norm(away))
@@ -193,10 +193,10 @@ class TargetTrack:
         seen = Visibility.HIDDEN if is_hidden else Visibility.HELD
         return replace(fix, pixel=pixel, visibility=seen)
 
-    def is_hiding(self, estimate: PoseEstimate, position: Array) -> bool:
+    def is_being_hidden(self, estimate: PoseEstimate, position: Array) -> bool:
         """Whether the map hides a moving target at (3,) now or within half a second.
 
-        What is seen of one that is half hidden pulls it aside.
+        Observations of a half hidden target are biased to its visible side.
         """
         velocity = self._moving.velocity
         ahead = position if velocity is None else position + _ENTERS_S * velocity
@@ -214,7 +214,7 @@ class TargetTrack:
         return self._static.places() if self._last.fix is not None and not self._moves else ()
 
     def _standing(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
-        """The place of the smallest expected error; the others widen its covariance."""
+        """The position with the smallest expected error; other hypotheses widen its covariance."""
         places = self._static.places()
         best = places[0]
         eye = estimate.world_from_camera.translation
@@ -222,7 +222,7 @@ class TargetTrack:
         covariance, elsewhere = bias.copy(), 0.0
         for place in places:
             offset = place.position - best.position
-            spread = self._static.strain * place.covariance
+            spread = self._static.residual_ratio * place.covariance
             covariance += place.weight * (spread + np.outer(offset, offset))
             if offset @ np.linalg.solve(best.covariance + bias, offset) > _ELSEWHERE:
                 elsewhere += place.weight
@@ -231,7 +231,7 @@ class TargetTrack:
         )
 
     def _objection(
-        self, fix: TargetFix, ray: SightedRay, surfaces: tuple[TargetSurface, ...]
+        self, fix: TargetFix, ray: ObservedRay, surfaces: tuple[TargetSurface, ...]
     ) -> TargetRefusal | None:
         """Why this position may not be reported; None if it may.
 
@@ -253,7 +253,7 @@ class TargetTrack:
             return TargetRefusal(RefusalReason.OFF_MAP)
         if not is_at_seen_depth(fix, ray.eye, ray.direction, surfaces):
             return TargetRefusal(RefusalReason.OTHER_DEPTH)
-        return self._last.objection(fix, moves=self._moves)
+        return self._last.check(fix, moves=self._moves)
 
     def _refuse(self, why: TargetRefusal) -> TargetFix | None:
         self.refusal = why
@@ -276,7 +276,7 @@ def _aim(
     return surface_covariance(offset, normal, spread, 0.0)
 
 
-def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
+def pixel_of(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
     """Pixel of a world point (3,) in a frame; None outside the image.
 
     A lens model may project a point far outside the view into the image. So the pixel counts only

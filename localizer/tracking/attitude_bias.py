@@ -40,7 +40,9 @@ _APART, _LEAST_APART_M = 0.5, 20.0  # of the distance; between two places that s
 
 @dataclass(frozen=True)
 class AttitudePrior:
-    """Accuracy of the camera's roll and pitch from autopilot and gimbal."""
+    """Accuracy of the camera's reported roll and pitch. tilt_sigma_deg: of the varying error;
+    alignment_sigma_deg: of the constant bias.
+    """
 
     tilt_sigma_deg: float = SENSORS.tilt_deg  # smallest error of roll and pitch, without the bias
     alignment_sigma_deg: float = (
@@ -48,8 +50,8 @@ class AttitudePrior:
     )  # their bias before it is estimated in flight
 
     @classmethod
-    def known_to(cls, sigma_deg: float) -> AttitudePrior:
-        """Roll and pitch with this sigma and no constant bias."""
+    def with_sigma(cls, sigma_deg: float) -> AttitudePrior:
+        """Roll and pitch with this sigma and without a constant bias."""
         return cls(max(sigma_deg, _LEAST_SIGMA_DEG), _LEAST_SIGMA_DEG)
 
 
@@ -84,15 +86,15 @@ class AttitudeBias:
 
     @property
     def reported_deg(self) -> tuple[float, float, float]:
-        """The bias (pitch, roll), and the sigma after correction: for reports."""
+        """Rounded bias (pitch, roll) and sigma after correction, degrees, for health reports."""
         pitch, roll, sigma = (
             round(float(v), 2) for v in (*self.off_deg, np.degrees(self.sigma_rad))
         )
         return pitch, roll, sigma
 
 
-def unknown(config: AttitudePrior) -> AttitudeBias:
-    """Before the first measurement."""
+def initial_bias(config: AttitudePrior) -> AttitudeBias:
+    """The bias before the first observation: zero, with the prior's sigmas."""
     alignment, tilt = np.radians([config.alignment_sigma_deg, config.tilt_sigma_deg])
     return AttitudeBias(np.eye(2) * alignment**2, float(tilt**2))
 
@@ -126,7 +128,7 @@ def constraint(bias: AttitudeBias, reported: Array) -> PoseConstraint | None:
 @dataclass(frozen=True)
 class AttitudeObservation:
     """A registration at `time_ns` that did not use the attitude. covariance: (6, 6) of its pose,
-    map and calibration errors included; distance_m: to the ground in view.
+    with map and calibration errors; distance_m: to the ground in view.
     """
 
     pose: Pose
@@ -136,12 +138,12 @@ class AttitudeObservation:
 
 
 def is_new_ground(bias: AttitudeBias, place: Array, distance_m: float) -> bool:
-    """Whether `place` (3,) gives an independent observation: errors repeat over the same ground."""
+    """Whether the position `place` (3,) is independent: errors repeat over the same ground."""
     apart_m = max(_LEAST_APART_M, _APART * distance_m)
     return bias.place is None or bool(np.hypot(*(place[:2] - bias.place)) >= apart_m)
 
 
-def passed(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
+def without_observation(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
     """The bias after uninformative ground at `place` (3,): its covariance grows with time."""
     apart_s = abs(time_ns - bias.time_ns) * 1e-9 if bias.place is not None else 0.0
     walked = np.eye(2) * _WALK_RAD**2 * min(apart_s, 60.0)
@@ -149,16 +151,23 @@ def passed(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
     return replace(bias, covariance=covariance, place=place[:2].copy(), time_ns=time_ns)
 
 
-def measured(
-    bias: AttitudeBias, config: AttitudePrior, reported: Array, sight: AttitudeObservation
+def with_observation(
+    bias: AttitudeBias, config: AttitudePrior, reported: Array, observation: AttitudeObservation
 ) -> AttitudeBias:
-    """The bias after another observation. reported: rotation (3, 3) as in `constraint`."""
+    """The bias after another observation. reported: rotation (3, 3) world_from_camera by the
+    sensors.
+    """
     axes = horizontal_axes(reported)
     if axes is None:
         return bias
-    seen = sight.pose
-    here = passed(bias, seen.translation, sight.time_ns)
-    R = axes.T @ sight.covariance[3:, 3:] @ axes * max(1.0, _HONEST_M / sight.distance_m) ** 2
+    seen = observation.pose
+    here = without_observation(bias, seen.translation, observation.time_ns)
+    R = (
+        axes.T
+        @ observation.covariance[3:, 3:]
+        @ axes
+        * max(1.0, _HONEST_M / observation.distance_m) ** 2
+    )
     if np.linalg.eigvalsh(R)[-1] > _LARGEST_SIGMA_RAD**2:
         return here
     P = here.covariance
@@ -168,7 +177,7 @@ def measured(
     if sigmas > _TAKEN:
         if bias.refused + 1 < _REFUSED_IN_ROW:
             return replace(here, refused=bias.refused + 1)
-        return replace(unknown(config), place=here.place, time_ns=here.time_ns)
+        return replace(initial_bias(config), place=here.place, time_ns=here.time_ns)
     S = S * max(1.0, sigmas / _CAUTIOUS) ** 2
     gain = P @ np.linalg.inv(S)
     count = min(bias.count + 1.0, _MOST_SPREAD_COUNT)
@@ -184,40 +193,42 @@ def measured(
 class AttitudeBiasEstimator:
     """Estimates the attitude bias of one camera; use it on the localization thread.
 
-    config: None constrains nothing. rotation_at: reported (3, 3) world_from_camera at a time in ns,
-    or None.
+    config: None: there is no bias and no constraint. rotation_at: returns the reported (3, 3)
+    world_from_camera at a time in ns, or None.
     """
 
     def __init__(self, config: AttitudePrior | None, rotation_at: RotationAt) -> None:
         self._config, self._rotation_at = config, rotation_at
-        self.bias = None if config is None else unknown(config)
+        self.bias = None if config is None else initial_bias(config)
         """None where nothing is constrained."""
 
     def constraint(self, time_ns: int) -> PoseConstraint | None:
-        """Constraint of the camera's roll and pitch at a frame's exposure."""
+        """Constraint of the camera's roll and pitch at a frame's exposure; None if unknown."""
         reported = self._rotation_at(time_ns)
         if self.bias is None or reported is None:
             return None
         return constraint(self.bias, reported)
 
     def is_due(self, place: Array, distance_m: float) -> bool:
-        """Whether an observation from `place` (3,) is wanted."""
+        """Whether an observation from the position `place` (3,) is wanted."""
         return self.bias is not None and is_new_ground(self.bias, place, distance_m)
 
-    def pass_by(self, place: Array, time_ns: int) -> None:
-        """Ground seen from `place` (3,) is uninformative: wait for an observation from another
-        place.
+    def skip_ground(self, place: Array, time_ns: int) -> None:
+        """Call instead of `learn` if the ground seen from `place` (3,) is uninformative: the next
+        observation is due at another position.
         """
         if self.bias is not None:
-            self.bias = passed(self.bias, place, time_ns)
+            self.bias = without_observation(self.bias, place, time_ns)
 
-    def learn(self, sight: AttitudeObservation) -> None:
-        """Add an observation."""
-        reported = self._rotation_at(sight.time_ns)
-        if self.bias is not None and self._config is not None and reported is not None:
-            self.bias = measured(self.bias, self._config, reported, sight)
+    def learn(self, observation: AttitudeObservation) -> None:
+        """Add an observation; without a reported attitude it only counts as made."""
+        reported = self._rotation_at(observation.time_ns)
+        if reported is None:
+            self.skip_ground(observation.pose.translation, observation.time_ns)
+        elif self.bias is not None and self._config is not None:
+            self.bias = with_observation(self.bias, self._config, reported, observation)
 
 
 def _sigmas(off: Array, covariance: Array) -> float:
-    """Mahalanobis distance of two numbers from zero."""
+    """Mahalanobis distance of a vector (2,) from zero."""
     return float(np.sqrt(off @ np.linalg.solve(covariance, off)))

@@ -57,7 +57,7 @@ class PropagationResult(Enum):
 @dataclass(frozen=True)
 class PropagatedPose:
     """The odometry's result for one frame. pose, covariance (6, 6), scale_sigma (see
-    `OdometryEstimate`): set if the status is CARRIED.
+    `OdometryEstimate`): None unless the status is CARRIED.
     """
 
     status: PropagationResult
@@ -77,10 +77,11 @@ _TRIED_NS = 10_000_000_000  # a map that comes into view, until it is searched
 
 
 class DeadReckoning:
-    """Odometry beside the map's registration; use it on the localization thread.
+    """Odometry in parallel to the map's registration; use it on the localization thread.
 
     camera: the working pinhole, adapted to a lens that zooms. sensors: other sensors' data of the
-    camera; terrain: the shape of the ground; ground: uncertainty of the ground, see `Localizer`.
+    camera. terrain: shape of the ground; None: flat. ground: uncertainty of the ground, see
+    `Localizer`.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class DeadReckoning:
         self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array,
         sweep: Sweep | None = None,
     ) -> None:  # fmt: skip
-        """The map located this frame: end earlier dead reckoning and start here."""
+        """Start, or start again, from a frame that the map located. velocity: (3,) m/s, world."""
         camera = with_field_of_view(self._pinhole, estimate.camera)
         frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
         self._odometry.begin(
@@ -116,11 +117,13 @@ class DeadReckoning:
             constraint=self._constraint(estimate.exposure_time_ns, estimate.world_from_camera),
         )
 
-    def carry(
+    def propagate(
         self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None,
         sweep: Sweep | None = None,
     ) -> PropagatedPose:  # fmt: skip
-        """Propagate the pose to a frame. anchors: of the reference at the prediction, if any."""
+        """Propagate the pose to a frame. prediction: the motion model's; anchors: of the reference
+        at the prediction, None without one.
+        """
         if not self._odometry.ready:
             return _NOTHING
         camera = with_field_of_view(self._pinhole, frame.camera)
@@ -156,7 +159,7 @@ class DeadReckoning:
         )  # fmt: skip
 
     def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
-        """about: where the camera is, to some metres."""
+        """Constraint by attitude and height at a time; about: the camera's approximate pose."""
         rotation, height_m = self._sensors.rotation_at(time_ns), self._sensors.height_at(time_ns)
         known = []
         if rotation is not None:

@@ -117,7 +117,7 @@ class DualThreadEngine:
                 _log.warning("the %s thread does not end, it is left behind", thread.name)
 
     def submit(self, frame: Frame) -> None:
-        """Offer a frame. It replaces a waiting one. Never blocks."""
+        """Offer a frame, from any thread; it replaces a frame that waits. Never blocks."""
         self._ahead.put(frame)
         self._book.count(frames_in=1)
 
@@ -183,8 +183,8 @@ class DualThreadEngine:
         self._book.set_searching(begun_ns is not None)
 
     def _search_hangs(self) -> bool:
-        """Whether the search has stopped calling its stop condition; callers report it instead of
-        waiting.
+        """Whether the search no longer calls its stop condition; it is then reported, not waited
+        for.
         """
         alive_ns = self._search_alive_ns
         hangs = alive_ns is not None and self._clock() - alive_ns > _SEARCH_HANGS_NS
@@ -192,7 +192,7 @@ class DualThreadEngine:
         return hangs
 
     def _knows_place(self) -> bool:
-        """Whether a search has become idle: the place is known or on probation, or we end."""
+        """Whether a search is pointless: the position is known or tentative, or we stop."""
         return self._stop.is_set() or not self._localizer.tracker.track_status.wants_prior
 
     def _render_once(self) -> None:
@@ -213,7 +213,7 @@ class DualThreadEngine:
         self._ahead.prepare(_IDLE_S)
 
     def _may_extract_ahead(self) -> bool:
-        """Whether a frame's features will be asked for, and may be computed beside another's."""
+        """Whether the next frame's features will be needed, and may be computed in parallel."""
         return self._registers
 
     def _localize_once(self) -> None:
@@ -227,9 +227,7 @@ class DualThreadEngine:
             self._registers = registered
 
     def _localize(self, prepared: PrefetchedFrame) -> bool:
-        """Register a frame and publish the estimate; False if there is nothing to
-        register against.
-        """
+        """Register a frame and publish the estimate; False if that is not possible yet."""
         frame = prepared.frame
         self._seek(frame)
         if self._is_left_to_search() or not self._has_prior(frame.exposure_time_ns):
@@ -259,7 +257,7 @@ class DualThreadEngine:
         """Whether there is a prediction to start from.
 
         Until the first acceptance, and when LOST, a found position or an external pose replaces the
-        prediction. An external pose that does not derive from our own fixes starts at once. Any
+        prediction. An external pose that does not derive from our own fixes starts tracking. Any
         other one is tentative until it is confirmed.
         """
         tracker = self._localizer.tracker
@@ -276,7 +274,7 @@ class DualThreadEngine:
         return True
 
     def _seek(self, frame: Frame) -> None:
-        """Offer the frame to the search, once the poses known outside have led nowhere."""
+        """Give the frame to the search, after the external poses were tried without success."""
         if self._searcher is None:
             return
         wanting = self._localizer.tracker.track_status.wants_prior
@@ -288,7 +286,7 @@ class DualThreadEngine:
             self._sought.put(frame)
 
     def _is_left_to_search(self) -> bool:
-        """Whether a frame is left out so that a search that runs has the processor."""
+        """Whether a frame is skipped so that a running search gets the processor."""
         runs = self._search_alive_ns is not None and not self._search_hangs()
         if not runs or self._found is not None or self._knows_place():
             self._left_frames = 0
@@ -307,7 +305,7 @@ class DualThreadEngine:
         return abs(age_s) > self._localizer.reference_age_s
 
     def _next_exposure(self, frame: Frame) -> int:
-        """When the frame after this one is expected, from a smoothed frame interval."""
+        """Expected exposure of the next frame, from a smoothed frame interval."""
         last = self._last_exposure_ns
         if last is not None:
             interval = frame.exposure_time_ns - last

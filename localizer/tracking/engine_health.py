@@ -53,7 +53,7 @@ class HealthCounters:
     def read(
         self, frames_dropped: int, optimizer: str, bias: AttitudeBias | None = None
     ) -> EngineHealth:
-        """A snapshot, with values that only the engine has."""
+        """A snapshot, with values that only the engine has. bias: None: not estimated."""
         with self._lock:
             error = next(iter(self._errors.values()), None)
             return replace(

@@ -42,9 +42,9 @@ class Mailbox(Generic[T]):
             return True
 
     def take(self, timeout_s: float | None = None) -> T | None:
-        """Remove and return the item, waiting for one; None after the timeout or once closed.
+        """Remove and return the item; waits for one. None after the timeout or once closed.
 
-        Raises what the producer failed with (`close`).
+        Raises the error that `close` was given.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None or self._closed, timeout_s)
@@ -56,7 +56,9 @@ class Mailbox(Generic[T]):
             return item
 
     def close(self, error: Exception | None = None) -> None:
-        """Wake the consumer for good, with an error or without. Only the first call counts."""
+        """End the mailbox and wake the consumer, with an error or none. Only the first call
+        counts.
+        """
         with self._changed:
             if self._closed:
                 return

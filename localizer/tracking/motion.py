@@ -69,13 +69,13 @@ class MotionState:
 
     @property
     def prior(self) -> PosePrior:
-        """The pose and its covariance (6, 6)."""
+        """The state's pose and covariance (6, 6) as a `PosePrior`."""
         pose = Pose(self.rotation, self.mean[:3].copy())
         return PosePrior(pose, self.covariance[:6, :6].copy(), self.time_ns)
 
 
 def start(prior: PosePrior, config: MotionConfig) -> MotionState:
-    """Filter state from a prior; the velocity is unknown."""
+    """Filter state from a prior. Without a velocity in the prior, the velocity is unknown."""
     mean = np.zeros(12)
     mean[:3] = prior.world_from_camera.translation
     known = prior.velocity is not None
@@ -94,15 +94,15 @@ def predict(
 ) -> MotionState:
     """The state at `time_ns`, which may be earlier than the state's own time.
 
-    Over more than 10 s it is `kept`.
-    turn: rotation (3, 3) of the camera since the state's time in world axes (new = turn @ old), if
-    something measured it; else the angular rate is taken as constant.
+    Over more than 10 s the motion is unknown (`reset_motion`). turn: measured rotation (3, 3) of
+    the camera since the state's time in world axes (new = turn @ old); None: the angular rate is
+    taken as constant.
     """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
         return state
     if abs(dt) > _LONGEST_S:
-        return kept(state, time_ns, config, turn)
+        return reset_motion(state, time_ns, config, turn)
     F = np.eye(12)
     F[:6, 6:] = np.eye(6) * dt
     Q = _process_noise(abs(dt), config)
@@ -127,10 +127,10 @@ def update(ahead: MotionState, pose: Pose, covariance: Array) -> MotionState:
     return _fold_rotation(mean, P, ahead.rotation, ahead.time_ns)
 
 
-def inflated(state: MotionState, config: MotionConfig) -> MotionState:
-    """The state with up to doubled sigmas, after a good registration contradicted it: the vehicle
-    manoeuvred, or the registration is wrong. After a manoeuvre a frame or two later is accepted. A
-    wrong registration would have to be wrong in the same way again.
+def inflate(state: MotionState, config: MotionConfig) -> MotionState:
+    """The state with sigmas enlarged up to twofold (up to those of a search), after a registration
+    of good quality was rejected by it. If the vehicle manoeuvred, one of the next frames is then
+    accepted. A wrong registration would have to be wrong in the same way again.
     """
     sigma = np.sqrt(state.covariance.diagonal())
     scale = np.clip(_limits(config) / sigma, 1.0, 2.0)
@@ -153,7 +153,7 @@ def place_sigma_m(prior: PosePrior) -> float:
 
 
 def is_beyond_capture(prior: PosePrior) -> bool:
-    """Whether a prediction is too uncertain for a registration to succeed."""
+    """Whether a prediction is too uncertain for a registration to converge."""
     turn = float(np.sqrt(prior.covariance.diagonal()[3:].max()))
     return place_sigma_m(prior) >= _FULL * _MAX_SIGMA_M or turn >= _FULL * _MAX_SIGMA_RAD
 
@@ -163,11 +163,13 @@ def pose_difference(a: Pose, b: Pose) -> Array:
     return np.concatenate([b.translation - a.translation, so3_log(b.rotation @ a.rotation.T)])
 
 
-def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None) -> MotionState:
+def reset_motion(
+    state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None
+) -> MotionState:
     """The state's pose at another time with the sigmas of a search and unknown motion.
 
-    It is used for a camera whose clock jumped: the frames are consecutive, their times are not.
-    turn: as in `predict`.
+    Used for a camera whose clock jumped: its frames are consecutive, their times are not. turn: as
+    in `predict`; None: the rotation is kept.
     """
     mean = np.concatenate([state.mean[:3], np.zeros(9)])
     rotation = state.rotation if turn is None else turn @ state.rotation
@@ -176,12 +178,13 @@ def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | N
 
 @dataclass(frozen=True)
 class AuxiliarySensors:
-    """Data of other sensors (autopilot and gimbal) about the camera; None where unknown.
+    """Data of other sensors (autopilot and gimbal) about the camera; functions of a time in ns,
+    None where unknown.
 
-    rotation_at: (3, 3) world_from_camera at a time in ns. displacement_between: the way (3,)
-    between two times in world axes (m) with its sigma (m). height_at: the camera's height above
-    the ellipsoid, less that of the world's origin (m), which may have a constant error.
-    clearance_at: the height above what lies below (m), by a rangefinder.
+    rotation_at: (3, 3) world_from_camera. displacement_between: displacement (3,) between two times
+    in world axes (m), and its sigma (m). height_at: the camera's height above the ellipsoid minus
+    that of the world's origin (m); may have a constant error. clearance_at: height above the
+    surface below (m), by a rangefinder.
     """
 
     rotation_at: RotationAt = lambda _time_ns: None
@@ -191,23 +194,23 @@ class AuxiliarySensors:
 
 
 class MeasuredMotion:
-    """The motion model with the rotation measured by another sensor."""
+    """The motion model with the rotation measured by another sensor where known."""
 
     def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
         self._config, self._rotation_at = config, rotation_at
 
-    def ahead(self, state: MotionState, time_ns: int) -> MotionState:
+    def predict(self, state: MotionState, time_ns: int) -> MotionState:
         """Predict the state at `time_ns`."""
         turn = self._turn(state.time_ns, time_ns)
         return predict(state, time_ns, self._config, turn)
 
     def at_frame(self, state: MotionState, time_ns: int) -> MotionState:
-        """The state at a frame's exposure."""
+        """The state at a frame's exposure; its motion is unknown if the exposure is earlier."""
         if time_ns >= state.time_ns:
-            return self.ahead(state, time_ns)
+            return self.predict(state, time_ns)
         # The camera's clock jumped: by its velocity the state would be moved the wrong way.
         turn = self._turn(state.time_ns, time_ns)
-        return kept(state, time_ns, self._config, turn)
+        return reset_motion(state, time_ns, self._config, turn)
 
     def sweep(self, ahead: MotionState, readout_ms: float) -> Sweep | None:
         """The camera's motion during the readout of a frame at the state's time; None for a global
@@ -229,7 +232,7 @@ class MeasuredMotion:
 
 
 def _limits(config: MotionConfig) -> Array:
-    """Sigmas (12,) of a state of which nothing is known but about where it is."""
+    """Sigmas (12,) of a state of which only the approximate pose is known."""
     return np.repeat(
         [_MAX_SIGMA_M, _MAX_SIGMA_RAD, config.initial_velocity_sigma,
          config.initial_angular_rate_sigma], 3,
@@ -246,7 +249,7 @@ def _fold_rotation(mean: Array, P: Array, rotation: Array, time_ns: int) -> Moti
 
 
 def _turn_variance(turn: Array, dt: float, config: MotionConfig) -> float:
-    """Of a measured turn, rad² per axis: its noise, the sensor's wander, and its lateness."""
+    """Variance (rad², per axis) of a measured turn: noise, drift and delay of the sensor."""
     late = config.turn_delay_s * float(np.linalg.norm(so3_log(turn))) / dt
     return config.turn_sigma**2 + config.turn_walk**2 * dt + late**2
 

@@ -108,7 +108,7 @@ def _warm_up(
     camera: Camera,
     config: LocalizerConfig,
 ) -> None:
-    """Compile and load everything now: the first frame of a flight must not wait ten seconds."""
+    """Compile and load everything now; the first frame in flight must not wait ten seconds."""
     size = working_camera(camera, config.width)
     black = np.zeros((size.height, size.width, 3), np.uint8)
     pyramid = extractor.extract(black)

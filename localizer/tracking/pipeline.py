@@ -29,7 +29,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.integrity.probability import log_odds
 from localizer.map.kind import MapKind
 from localizer.odometry import GroundUncertainty, TerrainModel
-from localizer.registration.anchors import select_anchors, swept
+from localizer.registration.anchors import apply_sweep, select_anchors
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration
@@ -127,8 +127,8 @@ def _shrink(image: Image, camera: Camera) -> Image:
 
 
 def mask_unseen_features(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
-    """The features with zero confidence outside the lens's image circle, where anchors would
-    otherwise be compared with black.
+    """The features with zero confidence outside `seen` (H, W), the lens's image circle, where
+    anchors would otherwise be compared with black. seen None: unchanged.
     """
     if seen is None:
         return pyramid
@@ -328,12 +328,14 @@ class Localizer:
     def _register_again(
         self, frame: Frame, features: FeaturePyramid, anchors: Anchors, prior: PosePrior
     ) -> Registration:
-        """Register, and start from the result. The same image is no new evidence: sigma is only
-        halved.
+        """Register, then make the result the prior. Sigma only halves: the same image is no new
+        evidence.
         """
         seen = self.tracker
         ahead = self._ahead(seen, frame)
-        image = self._register(frame, features, self._swept(anchors, frame, ahead), seen, ahead)
+        image = self._register(
+            frame, features, self._apply_sweep(anchors, frame, ahead), seen, ahead
+        )
         found = self._fusion.fuse(image, frame.exposure_time_ns).registration
         if found.status is RegistrationStatus.OK:
             self.set_prior(PosePrior(found.world_from_camera, prior.covariance / 4, prior.time_ns))
@@ -346,11 +348,11 @@ class Localizer:
     def reference_for(
         self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
     ) -> ReferenceBundle:
-        """The last reference while it is usable (`reference_shift_px`), otherwise a new one."""
+        """The last reference while it is usable (`reference_shift`), otherwise a new one."""
         track_status = self.tracker.track_status
         holds = track_status.state is TrackingState.TRACKING and track_status.rejected_in_row == 0
         steady = holds and not self._is_loading()
-        shift_px = self._config.reference_shift_px
+        shift_px = self._config.reference_shift * self.camera.width
         pose, time_ns = prior.world_from_camera, prior.time_ns
         interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
         if last is None or not steady or shift_px == 0:
@@ -408,10 +410,10 @@ class Localizer:
             raise OutsideMapError(_NO_PRIOR)
         return ahead
 
-    def _swept(self, anchors: Anchors, frame: Frame, ahead: MotionState) -> Anchors:
+    def _apply_sweep(self, anchors: Anchors, frame: Frame, ahead: MotionState) -> Anchors:
         """The anchors as the rows of a rolling shutter see them."""
         about = ahead.prior.world_from_camera
-        return swept(anchors, self._tracker.sweep(frame, ahead), about, frame.camera)
+        return apply_sweep(anchors, self._tracker.sweep(frame, ahead), about, frame.camera)
 
     def _register(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors, seen: TrackerState,
@@ -427,7 +429,7 @@ class Localizer:
             seed=self._config.seed + frame.sequence,
         )
         if seen.track_status.tentative and not seen.track_status.independent:
-            image = self._optimizer.focal_tested(query, camera, anchors, image)
+            image = self._optimizer.with_focal_gain(query, camera, anchors, image)
         return image
 
     def localize(
@@ -450,7 +452,7 @@ class Localizer:
         result, image, sweep = None, None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
-                seen_anchors = self._swept(anchors, frame, ahead)
+                seen_anchors = self._apply_sweep(anchors, frame, ahead)
                 image = self._register(frame, query, seen_anchors, seen, ahead)
                 image = replace(image, earlier_log_odds=earlier_log_odds)
                 result = self._fusion.fuse(image, frame.exposure_time_ns)
@@ -468,12 +470,12 @@ class Localizer:
                 away_m = distance_m(anchors.points_world, pose.translation)
                 self._fusion.learn(image, pose, unknown, away_m, frame.exposure_time_ns)
             if self._is_focal_due(estimate):
-                focal = self._optimizer.focal_fitted(query, camera, seen_anchors, image)
+                focal = self._optimizer.fit_focal(query, camera, seen_anchors, image)
                 estimate = replace(estimate, focal=focal)
         return replace(estimate, stage_ms=stage_ms)
 
     def _is_focal_due(self, estimate: PoseEstimate) -> bool:
-        """Whether this picture is one whose focal length is to be fitted."""
+        """Whether this frame's focal length is to be fitted."""
         every_ns = round(1e9 * self._config.focal_fit_s)
         if not every_ns or not estimate.accepted or estimate.state is not TrackingState.TRACKING:
             return False

@@ -34,11 +34,11 @@ class ProcessingTimes:
     extract_s: float = 0.0
     busy_s: float = 0.0
 
-    def extracted(self, spent_s: float) -> None:
+    def add_extraction(self, spent_s: float) -> None:
         """Add the duration of an extraction."""
         self.extract_s += _SHARE * (spent_s - self.extract_s)
 
-    def worked(self, spent_s: float) -> None:
+    def add_registration(self, spent_s: float) -> None:
         """Add the duration of a registration."""
         self.busy_s += _SHARE * (spent_s - self.busy_s)
 
@@ -52,8 +52,8 @@ class ProcessingTimes:
 class FeaturePrefetcher:
     """Passes on the newest frame with its features; replaced frames are counted.
 
-    extract: computes a frame's features. may: whether features may be extracted ahead now; if not,
-    the newest frame is passed on without them when the receiver waits for it.
+    extract: computes a frame's features. may: whether features may be extracted ahead now;
+    otherwise the newest frame is passed on without features, when the receiver waits for it.
     """
 
     def __init__(self, extract: Callable[[Frame], FeaturePyramid], may: Callable[[], bool]) -> None:
@@ -106,14 +106,14 @@ class FeaturePrefetcher:
         except Exception:  # the taker's own attempt reports it
             return PrefetchedFrame(frame)
         spent_s = time.monotonic() - begun_s
-        self._pace.extracted(spent_s)
+        self._pace.add_extraction(spent_s)
         return PrefetchedFrame(frame, features, 1e3 * spent_s)
 
     def take(self, timeout_s: float) -> PrefetchedFrame | None:
         """The next frame, waiting for one; None after the timeout or once closed."""
         if not self._waits.is_set():
             if self._taken_s:
-                self._pace.worked(time.monotonic() - self._taken_s)
+                self._pace.add_registration(time.monotonic() - self._taken_s)
             self._waits.set()
         prepared = self._prepared.take(timeout_s)
         if prepared is not None:

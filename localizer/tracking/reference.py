@@ -48,7 +48,7 @@ def lead_share(
 def _apart_px(
     bundle: ReferenceBundle, one: tuple[Pose, Camera], other: tuple[Pose, Camera]
 ) -> float:
-    """How far apart two cameras see the anchors, 95 of 100 of them; inf for too few."""
+    """Distance (px) between two cameras' views of the anchors, 95 % of them; inf for too few."""
     points = bundle.anchors.points_world
     if len(points) < _LEAST_PROBES:
         return np.inf

@@ -22,29 +22,30 @@ from localizer.integrity.confirmation import (
     consistency_test,
 )
 
-_LEAST_RUN = 8  # answers in a row
+_LEAST_RUN = 8  # registrations in a row
 _DRIFT_SIGMA_M = 0.2  # of the odometry over such a way
 
 
 @dataclass(frozen=True)
 class Rejoining:
-    """Rejected registrations compared with the propagated pose; immutable, `with_answer` returns
-    the next state.
+    """Rejected registrations compared with the propagated pose; immutable, `with_registration`
+    gives the next state.
 
     begun: the first registration of the series; carried: the odometry's position (3,) at its time.
+    registrations: length of the series. confirmed: whether the series refutes the propagated pose.
     """
 
     begun: TentativeTrack | None = None
     carried: Array | None = None
-    answers: int = 0
+    registrations: int = 0
     confirmed: bool = False
 
-    def with_answer(
+    def with_registration(
         self, pose: Pose, covariance: Array, time_ns: int, carried: Pose, rotation: Array | None,
         config: IntegrityConfig,
     ) -> Rejoining:  # fmt: skip
-        """Add a rejected registration of good quality. rotation: the camera's, by the autopilot, or
-        None.
+        """Add a rejected registration of good quality, covariance (6, 6). carried: the propagated
+        pose at its time. rotation: the camera's, by the autopilot; None: unknown.
         """
         first = Rejoining(TentativeTrack(pose, covariance, time_ns), carried.translation, 1)
         if self.begun is None or self.carried is None:
@@ -55,12 +56,12 @@ class Rejoining:
         )
         if verdict is Consistency.CONTRADICTED or self._jumps(pose, way[0], covariance):
             return first
-        answers = self.answers + 1
-        confirmed = verdict is Consistency.CONFIRMED and answers >= _LEAST_RUN
-        return replace(self, answers=answers, confirmed=self.confirmed or confirmed)
+        registrations = self.registrations + 1
+        confirmed = verdict is Consistency.CONFIRMED and registrations >= _LEAST_RUN
+        return replace(self, registrations=registrations, confirmed=self.confirmed or confirmed)
 
     def _jumps(self, pose: Pose, way: Array, covariance: Array) -> bool:
-        """Whether this answer lies elsewhere than the run's others, but for their own noise."""
+        """Whether this registration deviates from the series by more than the noise."""
         if self.begun is None:
             return False
         moved = pose.translation - self.begun.world_from_camera.translation

@@ -126,10 +126,10 @@ class SensorFusion:
                 votes.displacements, result.world_from_camera, combine(*known) if known else None
             )
             if likelihood is not None:
-                self.height_error = self.height_error.after(likelihood)
+                self.height_error = self.height_error.updated(likelihood)
         seen = self._with_map_error(result)
         if seen.status is not RegistrationStatus.OK:
-            self.attitude_bias.pass_by(place.translation, time_ns)
+            self.attitude_bias.skip_ground(place.translation, time_ns)
             return
         self.attitude_bias.learn(
             AttitudeObservation(
@@ -138,7 +138,7 @@ class SensorFusion:
         )
 
     def _constraints(self, about: Pose, time_ns: int) -> list[PoseConstraint]:
-        """What attitude and height say of a camera that is `about` there."""
+        """Constraints by attitude and height at a time; about: the camera's approximate pose."""
         known = []
         tilt = self.attitude_bias.constraint(time_ns)
         if tilt is not None:

@@ -42,7 +42,7 @@ class TrackStatus:
 
     @property
     def trusts_prediction(self) -> bool:
-        """Whether the prediction may reject an estimate."""
+        """Whether the motion model's prediction may reject a registration."""
         return self.state in _SEES
 
     @property
@@ -52,7 +52,7 @@ class TrackStatus:
         """
         return self.state not in _SEES and self.accepted_in_row == 0
 
-    def begun(self) -> TrackStatus:
+    def restarted(self) -> TrackStatus:
         """The status after a start from a known pose."""
         return TrackStatus(last_fix_ns=self.last_fix_ns)
 
@@ -66,8 +66,8 @@ class TrackStatus:
 @dataclass(frozen=True)
 class RegistrationOutcome:
     """A tested registration. covariance: (6, 6); time_ns: the frame's exposure; carry: the
-    odometry's result if the map rejected the frame; beyond_capture: the prediction was too
-    uncertain for a registration; counts: False without a reference and odometry.
+    odometry's result if the map rejected the frame; beyond_capture: whether the prediction was too
+    uncertain for a registration; counts: False if there was neither a reference nor odometry.
     """
 
     acceptable: bool
@@ -162,8 +162,8 @@ def _after_rejection(
 def _worse(
     state: TrackingState, count: int, config: IntegrityConfig, outcome: RegistrationOutcome
 ) -> TrackingState:
-    """The state after `count` rejections in a row. At a low frame rate the prediction is lost long
-    before they are many.
+    """The state after `count` rejections in a row. With beyond_capture it worsens at once, because
+    at a low frame rate the prediction is useless long before `count` is large.
     """
     carry = outcome.carry
     if state is TrackingState.BRIDGING:

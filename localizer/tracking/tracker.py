@@ -30,7 +30,7 @@ from localizer.types import (
 
 @dataclass(frozen=True)
 class TrackerState:
-    """Shared state of both threads; immutable, replaced as one object."""
+    """State of both threads; immutable, replaced as one object. motion: None without a prior."""
 
     motion: MotionState | None = None
     track_status: TrackStatus = field(default_factory=TrackStatus)
@@ -51,7 +51,7 @@ class Tracker:
     """Tests registrations, filters the motion, and propagates the pose without the map.
 
     `update` belongs to the localization thread; other methods may be called from any thread.
-    bridging: None if features are not in host memory.
+    dead_reckoning: None if features are not in host memory.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Tracker:
         """Start (again) from an external pose."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
-            self._state = TrackerState(state, self._state.track_status.begun())
+            self._state = TrackerState(state, self._state.track_status.restarted())
 
     def propose(self, prior: PosePrior) -> None:
         """Start a tentative track; the state does not change."""
@@ -89,7 +89,7 @@ class Tracker:
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction; None before the first prior."""
         state = self.state.motion
-        return self._motion.ahead(state, time_ns).prior if state else None
+        return self._motion.predict(state, time_ns).prior if state else None
 
     def at_frame(self, seen: TrackerState, time_ns: int) -> MotionState | None:
         """The motion of `seen`, extrapolated to a frame's exposure; None before the first prior.
@@ -170,13 +170,13 @@ class Tracker:
         self, seen: TrackerState, ahead: MotionState, frame: Frame, query: FeaturePyramid,
         anchors: Anchors | None, acceptable: bool,
     ) -> PropagatedPose:  # fmt: skip
-        """The odometry's answer: for frames that the map rejected, and until it has confirmed."""
+        """The odometry's result: for frames that the map rejected, and until it has confirmed."""
         track_status = seen.track_status
         wanted = not acceptable or track_status.state is TrackingState.BRIDGING
         if self._dead_reckoning is None or not track_status.trusts_prediction or not wanted:
             return PropagatedPose(PropagationResult.NONE)
         swept = self.sweep(frame, ahead)
-        return self._dead_reckoning.carry(frame, query, ahead.prior, anchors, swept)
+        return self._dead_reckoning.propagate(frame, query, ahead.prior, anchors, swept)
 
     def _rejoins(
         self,
@@ -185,7 +185,7 @@ class Tracker:
         carried: PropagatedPose,
         frame: Frame,
     ) -> bool:
-        """Whether the map's answers, refused by the gate alone, refute the pose that is carried."""
+        """Whether registrations that the acceptance test rejects refute the propagated pose."""
         pose = carried.world_from_camera
         good = result is not None and is_acceptable(self._config.integrity, result, 0.0)
         if track_status.state is not TrackingState.BRIDGING or result is None or not good:
@@ -194,7 +194,7 @@ class Tracker:
         if pose is None:  # a gap of the odometry says nothing of the map's answers
             return False
         rotation = self._sensors.rotation_at(frame.exposure_time_ns)
-        self._rejoining = self._rejoining.with_answer(
+        self._rejoining = self._rejoining.with_registration(
             result.world_from_camera, result.covariance, frame.exposure_time_ns, pose, rotation,
             self._config.integrity,
         )  # fmt: skip
@@ -203,7 +203,7 @@ class Tracker:
     def _evidence(
         self, track_status: TrackStatus, outcome: RegistrationOutcome
     ) -> IndependentEvidence:
-        """What other sensors say of a place on trial."""
+        """Evidence of other sensors about a tentative position."""
         if not track_status.tentative or not outcome.acceptable:
             return IndependentEvidence()
         rotation = self._sensors.rotation_at(outcome.time_ns)
@@ -223,20 +223,20 @@ class Tracker:
         if carried.world_from_camera is not None and carried.covariance is not None:
             return motion.update(ahead, carried.world_from_camera, carried.covariance)
         if result is not None and is_acceptable(self._config.integrity, result, 0.0):
-            return motion.inflated(ahead, self._config.motion)
+            return motion.inflate(ahead, self._config.motion)
         if lost:  # its velocity is of long ago, and would carry the search out of the map
-            return motion.kept(ahead, ahead.time_ns, self._config.motion, None)
+            return motion.reset_motion(ahead, ahead.time_ns, self._config.motion, None)
         return ahead
 
     def _store(self, seen: TrackerState, state: MotionState, track_status: TrackStatus) -> None:
-        """Keep the new state unless a prior from outside replaced it meanwhile."""
+        """Store the new state unless an external prior replaced it meanwhile."""
         with self._lock:
             if self._state is seen:
                 self._state = TrackerState(state, track_status)
 
 
 def _restart(result: Registration, ahead: MotionState) -> PosePrior:
-    """A beginning at the map's answer, with the velocity that the odometry measured."""
+    """Prior at the map's registration, with the velocity that the odometry measured."""
     return PosePrior(
         result.world_from_camera, result.covariance, ahead.time_ns, ahead.velocity.copy()
     )
@@ -248,7 +248,7 @@ def _given(
     carried: PropagatedPose,
     track_status: TrackStatus,
 ) -> tuple[_Pose, bool]:
-    """What is given out, and whether it may be used."""
+    """The published pose, and whether it may be used."""
     if track_status.state is TrackingState.BRIDGING:
         pose, covariance = carried.world_from_camera, carried.covariance
         if pose is not None and covariance is not None:

@@ -114,7 +114,7 @@ def contact_sheet_of(
 
 
 def _generating(config: TrainConfig) -> Future[None]:
-    """Generation on a thread that ends with the process."""
+    """Start `_generate` on a thread that ends with the process."""
     done: Future[None] = Future()
 
     def generate() -> None:
@@ -130,7 +130,7 @@ def _generating(config: TrainConfig) -> Future[None]:
 
 
 def _generate(config: TrainConfig) -> None:
-    """In the order in which training asks: first scenes, mesh worlds, the other scenes."""
+    """Generate shards in the order of their use: first scenes, mesh worlds, other scenes."""
     data = config.data
     if isinstance(data, LiveSection):
         return  # it makes its pairs while it trains

@@ -28,7 +28,7 @@ def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read the state of a `Trainer`; `ModelError` for another file."""
+    """Read a checkpoint's state of a `Trainer`; `ModelError` for another file."""
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except OSError as error:
@@ -41,8 +41,10 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     return state
 
 
-def fill(network: nn.Module, weights: Mapping[str, Any], path: Path) -> None:
-    """Load checkpoint weights into a network; `ModelError` if they are another network's."""
+def load_weights(network: nn.Module, weights: Mapping[str, Any], path: Path) -> None:
+    """Load checkpoint weights into a network. `ModelError`, with `path` in its text, if they are
+    another network's.
+    """
     try:
         network.load_state_dict(weights)
     except (RuntimeError, TypeError, AttributeError) as error:

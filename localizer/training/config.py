@@ -34,7 +34,7 @@ class _Frozen(BaseModel):
 
 
 class _PlacesSection(_Frozen):
-    """What every place and visit is made of. workers: processes that make them."""
+    """Keys of the places and visits of both kinds of data. workers: processes that make places."""
 
     first_seed: int = Field(ge=1000, lt=2**31)
     scenes: int = Field(gt=0, lt=2**31)

@@ -35,9 +35,9 @@ class TrainingProcess:
         return cls(dist.get_rank(), count, device)
 
     def average_gradients(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Give every process the mean gradient, so that all take the same step.
+        """Replace every process's gradients by their mean, so that all take the same step.
 
-        All gradients are sent as one message. The networks are small, so overlapping it with the
+        All gradients are sent as one message: the networks are small, so overlapping with the
         backward pass would gain nothing.
         """
         if self.count == 1:

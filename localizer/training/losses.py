@@ -50,9 +50,10 @@ def contrast_loss(
 ) -> Tensor:
     """Cross entropy of finding each anchor's true position (B, N, 2, level pixels) in the query.
 
-    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched
-    completely. On finer ones the negatives are the neighbourhood, which decides the basin of
-    convergence, for `count` of the anchors.
+    reference: (B, N, C) anchor features; query: (B, C, h, w); visible: (B, N) mask; scale: factor
+    of the similarities. Levels of at most `whole_map_cells` are searched completely. On finer ones
+    the negatives are the neighbourhood, which decides the basin of convergence, for `count` of the
+    anchors.
     """
     if query.shape[2] * query.shape[3] <= whole_map_cells:
         loss = _whole_map(reference, query, truth, scale)
@@ -72,9 +73,10 @@ def alignment_loss(
 ) -> tuple[Tensor, Tensor]:
     """Eq. 3: Barron's loss of the reprojection error after each LM iteration on one level.
 
-    reference: anchor features (B, N, C) and confidences (B, N); query: maps (B, C, h, w) and
-    (B, h, w); start: (B, 4, 4) initial query_from_reference. Returns the loss and each pair's pixel
-    error (B,) (image pixels, mean over visible anchors) after the last iteration.
+    reference: anchor features (B, N, C) and confidences (B, N); query: maps (B, C, h, w) and (B, h,
+    w) of a level of this stride; start: (B, 4, 4) initial query_from_reference. Returns the loss
+    and each pair's pixel error (B,) (image pixels, mean over visible anchors) after the last
+    iteration.
     """
     pose = start
     total = reference[0].new_zeros(())

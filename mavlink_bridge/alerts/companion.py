@@ -12,7 +12,7 @@ _TAKE_OVER = "take over"
 _VIDEO = f"{_TAKE_OVER}; check the camera and its link"
 _SENT = "fixes continue"
 _NO_FIX = "no fixes"
-_LOAD = "check the computer's load and temperature"
+_LOAD = "take over; after landing check the computer's load and temperature"
 _RECORD = "check the disk after landing"
 _SEARCH = "send the approximate position (console: *I am here*)"
 _CLICK = "click again"
@@ -25,25 +25,27 @@ _NUMBER_WHY: dict[str, Kind] = {"number": "", "why": "name"}
 HEALTH: tuple[AlertSpec, ...] = (
     condition(A.INITIALIZING, INFO, "localization initializing", {},
               "frames are processed, and the position is not confirmed yet",
-              "three or more frames in a row are accepted, and the position is confirmed",
+              "three or more frames in a row are accepted, and the position is confirmed; or ten "
+              "are rejected (`lost`)",
               f"the position is not known yet; {_NO_FIX}", _TAKE_OVER),
     condition(A.TRACKING, INFO, "localization tracking", {}, "frames are accepted",
               "the status changes to `degraded`, `bridging` or `lost`",
               "fixes are made; they are sent if injection is on", _NONE),
     condition(A.DEGRADED, WARNING, "localization degraded", {},
               "three frames in a row are rejected, and odometry cannot bridge",
-              "a frame is accepted; or ten frames are rejected (`lost`)", _NO_FIX,
+              "a frame is accepted, or the status changes to `bridging` or `lost`", _NO_FIX,
               "wait for `tracking` or `lost`"),
     condition(A.BRIDGING, WARNING, "bridging {seconds:.0f} s, {metres:.0f} m",
               {"seconds": "s", "metres": "m"},
-              "no frame has matched the map for 2 s; odometry continues the position",
+              "no frame has matched the map for 2 s; odometry (the motion in the video) continues "
+              "the position",
               "three frames in a row match the map, or odometry fails (`lost`)",
               f"{_SENT}, with a covariance that grows, until `hpl_over_limit`; N s: time since the "
               "last match; N m: 95 % bound of the position error",
               "fly back over mapped ground with buildings and roads"),
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
-              "ten frames in a row are rejected, the predicted position is too old, or odometry "
-              "fails",
+              "ten frames in a row are rejected; or one is, while the predicted position is too "
+              "uncertain and odometry fails; or odometry fails during `bridging`",
               "a position is found and confirmed", f"{_NO_FIX}; N: time since the last fix",
               "take over"),
     condition(A.EKF_UNCERTAIN, WARNING, "autopilot position +-{metres:.0f} m", {"metres": "m"},
@@ -112,8 +114,8 @@ HEALTH: tuple[AlertSpec, ...] = (
     event(A.COMPANION_RESTARTS, CRITICAL, "companion {how} ({what}), restarting",
           {"how": ProcessFault, "what": "name"}, "with `companion run --supervised`: the flight "
           "process crashed, was killed, or hangs (a thread for 4 s, the process for 3 s)",
-          f"the supervisor starts it again at once; {_NO_FIX} for some seconds; WHAT: thread or "
-          "signal", _TAKE_OVER),
+          f"the supervisor starts it again at once; {_NO_FIX} for some seconds; HOW: *died* or "
+          "*hangs*; WHAT: thread or signal", _TAKE_OVER),
     event(A.COMPANION_WAITS, CRITICAL, "companion {how} ({what}), again in {seconds:.0f} s",
           {"how": ProcessFault, "what": "name", "seconds": "s"},
           "with `companion run --supervised`: the flight process crashed, was killed or hung for "
@@ -159,8 +161,8 @@ TARGETS: tuple[AlertSpec, ...] = (
           "an error while the position of a click is computed", "no target is made",
           "click again; after landing read the first such error in the log"),
     event(A.NO_TARGET, WARNING, "no target: {why}", {"why": ClickRefusal},
-          "a click in any other status than `tracking`, or the position at the clicked frame is "
-          "not known",
+          "within 2 s the position at the clicked frame is not known (*position not known*), or "
+          "the status there is not `tracking` (*position not confirmed yet*)",
           "no target is made",
           "wait for `tracking`, then click again"),
     event(A.TARGET_OUT_OF_VIEW, INFO, "target {number} ended: out of view", _NUMBER,
@@ -173,7 +175,8 @@ TARGETS: tuple[AlertSpec, ...] = (
           "the position of a moving target cannot be computed for 4 s", "the target is deleted",
           _CLICK),
     event(A.TARGET_LEFT, WARNING, "target {number} lost: it left its place", _NUMBER,
-          "a target is not seen for 1.2 s, and the image shows the ground in its place",
+          "a target that moved when it was clicked is not seen for 1.2 s, and the image shows the "
+          "ground in its place",
           "the target is deleted", _CLICK),
     condition(A.TARGET_MAY_HAVE_LEFT, WARNING, "target {number} may have left: look changed",
               _NUMBER, "the target is not seen for 3 s, after a sudden change of its image",
@@ -210,7 +213,6 @@ CONSOLE: tuple[AlertSpec, ...] = (
     event(A.CONSOLE_HINT, NOTICE, "hint {latitude:.4f} {longitude:.4f} +-{metres:.0f} m",
           {"latitude": "deg", "longitude": "deg", "metres": "m"},
           "the operator sends *I am here* in the console",
-          "the map is searched within N m of this position, until the position is found, at most "
-          "for 2 min",
+          "searches of the next 2 min look within N m of this position; it is never sent as a fix",
           _NONE, lead=_CONSOLE),
 )  # fmt: skip

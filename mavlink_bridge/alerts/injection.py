@@ -28,7 +28,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               lead=_NOT_SENT),
     condition(A.NO_FRESH_FIX, WARNING, "no fresh fix", {},
               "for 1 s nothing could be sent: the newest fix that passed the checks is older than "
-              "`bridge.injection.delay_ms` + 0.5 s, or two usual intervals passed without one",
+              "`bridge.injection.delay_ms` + 0.5 s, or twice the usual interval has passed "
+              "without one",
               "a fix passes the checks",
               "vision makes no fix, or an *output held* alert is active",
               "if an *output held* alert is active, act on it; otherwise take over",
@@ -66,8 +67,9 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the position is too uncertain", _TAKE_OVER, lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
-              "the yaw guard blocks: in three of five fixes vision's yaw is 3.5 deg off the "
-              "autopilot's, or has turned 3.5 deg differently from the gyros since earlier fixes",
+              "the yaw guard blocks: in three of five fixes vision's yaw is over 3.5 deg off the "
+              "autopilot's (20 deg, if fixes passed in the last 60 s), or has turned over 3.5 deg "
+              "differently from the gyros since earlier fixes",
               "five fixes in a row are within 70 % of the limit",
               "compass, camera mounting or map is rotated",
               f"{_TAKE_OVER}; check compass and camera mounting", lead=_NOT_SENT),
@@ -138,7 +140,8 @@ INJECTION: tuple[AlertSpec, ...] = (
           "fixes that pass the checks are sent; N: age of the stored state",
           "to disable it use the RC channel or the command"),
     event(A.JUMP_REPEATED, NOTICE, "the EKF missed a jump: announced again", {},
-          "after an increment of `reset_counter` the EKF is still elsewhere in three comparisons; "
+          "after an increment of `reset_counter` the EKF is still over 1 m + 3 sigma off in the "
+          "median of three comparisons; "
           "at most five times", f"{_SENT}; the next one increments `reset_counter` again", _NONE),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
           "3 s after the first fix is sent; also 1.5 s after the end of an alert from "
@@ -148,7 +151,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               {"hertz": "Hz", "needed": "Hz"},
               "the rate of sent fixes over 3 s is below 4 Hz (message gps_input: 4.65 Hz)",
               "the rate is above this minimum", f"{_SENT}; the EKF may stop using them",
-              "check the computer's load"),
+              "compare with landmarks; after landing check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
               "EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED (ArduPilot)",
               "the flag is cleared", f"{_SENT}; the EKF uses none yet",
@@ -158,7 +161,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the flag is cleared", f"{_SENT}; the EKF uses none",
               f"{_TAKE_OVER}; {_PARAMETERS}"),
     condition(A.EKF_NO_POSITION, WARNING, "the EKF reports no local position", {},
-              "LOCAL_POSITION_NED is not received for the times of the sent fixes",
+              "for 3 s no LOCAL_POSITION_NED is received for the times of the sent fixes",
               "LOCAL_POSITION_NED is received",
               f"{_SENT}; whether the EKF uses them is unknown", f"{_TAKE_OVER}; {_PARAMETERS}"),
     condition(A.EKF_OFF_FIXES, WARNING, "the EKF is {metres:.1f} m from what is sent",
@@ -175,16 +178,18 @@ INJECTION: tuple[AlertSpec, ...] = (
               {"age_ms": "ms", "limit_ms": "ms"},
               "each of the last 50 fixes (PX4, unknown firmware: their median) is over 10 ms older "
               "than `bridge.injection.delay_ms` when it is made",
-              "that age is below 90 % of delay_ms + 10 ms for 15 s",
+              "that age is below 90 % of (delay_ms + 10 ms) for 15 s",
               f"{_SENT}; the EKF uses them as if they were newer",
-              "raise delay_ms and the autopilot's delay parameter"),
+              "compare with landmarks; after landing raise delay_ms and the autopilot's delay "
+              "parameter"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
               "the median age of the last 50 fixes is above what the firmware can use (ArduPilot "
               "250 ms, PX4 300 ms)",
               "it is below 90 % of the limit for 15 s",
               "fixes are extrapolated by at most 0.5 s and sent; older ones are not sent",
-              "use a faster computer or a smaller `localizer.width`"),
+              "compare with landmarks; after landing use a faster computer or a smaller "
+              "`localizer.width`"),
     event(A.FIXES_IN_TIME, INFO, "fixes are in time again", {},
           "no late fix for 15 s (up to 60 s if it recurs)", "delay_ms is right again",
           _NONE),

@@ -7,6 +7,7 @@ from mavlink_bridge.alerts.ids import AlertId as A
 from mavlink_bridge.alerts.words import CalibrationError, GnssDisagreement
 
 WARNING, ERROR = Severity.WARNING, Severity.ERROR
+_WITHIN = "the difference + 2 sigma is below the limit for 10 s"
 _CALIBRATE = "before the next flight run `companion calibrate flight` on this flight's record"
 _TAKE_OVER = "take over; if it lasts without good GNSS, land"
 _SENT = "fixes continue"
@@ -39,7 +40,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VISION_IMU_MISMATCH, ERROR, "vision/IMU mismatch",
               "vision/IMU mismatch {metres:.0f} m", {"metres": "m"},
               "the mean distance between fixes and the positions that the IMU predicts exceeds a "
-              "limit for 0.2 s: 1.5 m over 1 s, 1.0 m over 3 s or 0.8 m over 10 s, + 4 sigma",
+              "limit for 0.2 s: 1.5 m over 1 s, 1.0 m over 3 s or 0.8 m over 10 s, + 4 sigma of "
+              "this mean + 1.5 sigma of a fix",
               "the distance is below half of the limit, and the position moves, for 5 s",
               "the position from vision does not move as the vehicle does: it is wrong", _TAKE_OVER,
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=0.2, clear_s=5.0),
@@ -51,8 +53,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=2.0, clear_s=5.0),
     AlertSpec(A.POSITION_JUMP, ERROR, "position jump", "position jumped {metres:.0f} m",
               {"metres": "m"},
-              "at once: a fix is 3 m farther from the last one than the vehicle can have flown; 10 "
-              "m if the localizer announced the jump (it found the position again)",
+              "at once: a fix is 3 m farther from the last one than flight and 4 sigma explain; "
+              "10 m if the localizer announced the jump (it found the position again)",
               "the new position moves as the IMU for 5 s (up to 60 s if vision's heading turned "
               "and the gyros did not), or the old position is back",
               "the old or the new position is wrong",
@@ -60,12 +62,14 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               action=OutputAction.EXCLUDE_AND_RESET),
     AlertSpec(A.POSITION_STEP, WARNING, "position step",
               "position step {metres:.0f} m, unexplained", {"metres": "m"},
-              "the position steps by more than 1 m and 4 sigma, but by less than a jump",
+              "the mean of five fixes is off that of the five before by more than 1 m, and by "
+              "more than motion and 4 sigma explain; but by less than a jump (3 m)",
               "the position steps back; or the vehicle is disarmed; or, for a step along the "
-              "course, the measured time offset is within its limit; or, for a step across, the "
-              "position is lost and found again",
-              f"{_WIDER}; the position may be wrong by N, at most 3 m, which the protection level "
-              "now includes",
+              "course, the measured time offset is within 80 ms (`time_offset`) or half of the "
+              "delay that would explain the step; or, for a step "
+              "across, the position is lost and found again",
+              f"{_WIDER}; the position may be wrong by N (sum of the steps, at most 3 m; in a "
+              "hover each counts as across), which the protection level now includes",
               "increase the distance to obstacles by N", repeat_s=60.0),
     AlertSpec(A.TILT_MISMATCH, WARNING, "tilt mismatch", "tilt {degrees:.0f} deg off autopilot",
               {"degrees": "deg"},
@@ -108,7 +112,7 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               raise_s=0.5, clear_s=3.0),
     AlertSpec(A.HPL_OVER_LIMIT, ERROR, "HPL over limit", "HPL {metres:.0f} m over limit",
               {"metres": "m"},
-              "the horizontal protection level (HPL, bound of the position error) is above "
+              "the horizontal protection level (HPL) is above "
               "`bridge.injection.alert_limit_m` (default 10 m) for 1 s",
               "it is below the limit for 3 s",
               "the position may be wrong by N; no position is sent, but during `bridging` "
@@ -117,24 +121,25 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               action=OutputAction.HOLD, raise_s=1.0, clear_s=3.0),
     AlertSpec(A.FOCAL_LENGTH, WARNING, "focal length", "focal length {percent:.1f} % {direction}",
               {"percent": "%", "direction": CalibrationError},
-              "the estimated focal length differs from the calibration by 2.5 % + 4 sigma for 2 "
-              "s", "it is within the limit for 10 s",
+              "the estimated focal length differs from the calibration by more than 2.5 %, and by "
+              "more than 4 sigma, for 2 s", _WITHIN,
               f"{_WIDER}; positions are wrong by about N % of the height above ground",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=2.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.BORESIGHT, WARNING, "boresight", "camera {degrees:.0f} deg off in {axis}",
               {"degrees": "deg", "axis": CalibrationError},
-              "the attitude from vision differs from that of gimbal and autopilot by 3 deg + 4 "
-              "sigma for 3 s", "it is within the limit for 10 s",
-              f"{_SENT}; the mounting angles in the deployment file, the gimbal or the compass are "
-              "wrong",
+              "the attitude from vision differs from that of gimbal and autopilot by more than 3 "
+              "deg, and by more than 4 sigma, for 3 s", _WITHIN,
+              f"{_SENT}; AXIS: roll, pitch or yaw; the mounting angles in the deployment file, "
+              "the gimbal or the compass are wrong",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=3.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.TIME_OFFSET, WARNING, "time offset",
               "video timestamps {milliseconds:.0f} ms {direction}",
               {"milliseconds": "ms", "direction": CalibrationError},
-              "vision's motion is 80 ms + 4 sigma late or early for 1 s",
-              "it is within the limit for 10 s",
+              "vision's motion is late or early by more than 80 ms, and by more than 4 sigma, for "
+              "1 s",
+              _WITHIN,
               f"{_WIDER}; positions are behind (late) or ahead of (early) the vehicle by speed "
               "times N",
               "fly slowly; before the next flight set `camera.settings.time_offset_ms`",
@@ -165,7 +170,7 @@ SOURCES: tuple[AlertSpec, ...] = (
               {"size": "m or m/s", "why": GnssDisagreement},
               "the EKF uses vision, GNSS has a 3D fix, and for 2 s its position or velocity "
               "differs from vision or IMU, scatters, or has a stated accuracy above 5 m",
-              "GNSS agrees for 5 s",
+              "GNSS has no 3D fix, or the EKF uses GNSS, or GNSS agrees for 5 s",
               f"{_SENT}, and the EKF stays on vision; the receiver is jammed, spoofed or not "
               "settled, or the map has an offset",
               "stay on vision; select GNSS only if landmarks confirm it",

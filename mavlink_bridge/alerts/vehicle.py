@@ -52,10 +52,12 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "after `gnss_lost`: a 3D fix for 5 s, and no `gnss_refused`", "GNSS can be used again",
           "select the GNSS source set if you want it"),
     event(A.ARMED_WITHOUT_GNSS, WARNING, "armed without GNSS, {output}", {"output": Output},
-          "the vehicle is armed without a 3D fix",
+          "at arming, or at the start of the program with an armed vehicle: no 3D fix within 1.5 "
+          "s (no GNSS report yet: 3 s)",
           "*injecting*: fixes continue, but cannot be compared with GNSS; *nothing is injected*: "
           "the EKF has no position",
-          "do not take off unless this is planned"),
+          "on the ground: do not take off unless this is planned; in flight, *nothing is "
+          "injected*: take over"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
           "on UDP, MAVLink arrives from an address other than `bridge.sender` (if that is not set: "
           "than the first autopilot's); on `bridge.ground_connection`: than the first ground "
@@ -170,8 +172,9 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "their commands are denied",
           "if they are yours: add them to `bridge.ground_systems`, or sign their link"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
-          "the ground station sends an approximate position with an accuracy of N",
-          "the map is searched within 2 N of it, until the position is found, at most for 2 min",
+          "the ground station sends an approximate position (MAV_CMD_EXTERNAL_POSITION_ESTIMATE "
+          "to the localizer); N: its sigma, at least 10 m, 100 m if none is given",
+          "searches of the next 2 min look within 2 N of it; it is never sent as a fix",
           _NONE),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
           "the position that the ground station sent is farther from the map than twice its stated "

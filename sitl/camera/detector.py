@@ -27,7 +27,7 @@ class Observed(Protocol):
         """The label of its detections."""
 
     def position_at(self, time_ns: int) -> Array:
-        """(3,) world metres at a time on CLOCK_MONOTONIC."""
+        """True position (3,), metres in the map's ENU frame, at a CLOCK_MONOTONIC time."""
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ class Detector:
         return Detection(target.name, stamp_ns, float(u), float(v))
 
     def _mistaken(self, seen: list[Detection], stamp_ns: int) -> list[Detection]:
-        """What was seen, with two names exchanged or one too many, as often as `DetectorErrors`
-        says.
+        """The detections with two names exchanged or a false one added, as often as
+        `DetectorErrors` says.
         """
         if not seen:
             return seen

@@ -61,11 +61,10 @@ class RenderedLens:
         return np.asarray(cv2.remap(depth, self.maps[0], None, cv2.INTER_NEAREST))
 
     def roll(self, image: Image, depth: Float32, middle_from_row: Array) -> tuple[Image, Float32]:
-        """Warp image and depth for a rolling shutter.
+        """Warp image and depth of the pinhole for lens distortion and rolling shutter.
 
-        middle_from_row: (H, 3, 4), from the camera at each row's time to the camera at the rendered
-        time. The depth is taken at the unwarped pixel: the motion during a readout is a few pixels,
-        so only silhouettes have an error.
+        middle_from_row: (H, 3, 4), see `row_motion`. The depth gets the lens distortion only: the
+        motion during a readout is a few pixels, so only silhouettes have an error.
         """
         still = self.distort_depth(depth)
         p = self.pinhole
@@ -93,7 +92,7 @@ def row_motion(middle: Pose, pose_of_row: Callable[[float], Pose], height: int) 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _row_maps(rays, depth, motion, intrinsics, out):  # type: ignore[no-untyped-def]
-    """Where each pixel is looked up, as ``cv2.remap`` counts, (H, W, 2)."""
+    """Write to `out` (H, W, 2) where ``cv2.remap`` looks each pixel up in the pinhole's image."""
     half, far = np.float32(0.5), np.float32(1e4)
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for v in range(depth.shape[0]):

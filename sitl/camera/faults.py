@@ -21,8 +21,10 @@ _GAMMA, _QUALITY = 2.2, 70
 _MOST_GAIN = 16.0
 
 
-def darkened(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
-    """An image (H, W, 3) with so much of its light, coded as JPEG; smaller ones count as binned."""
+def darken(rgb: Image, light: float, most_gain: float, rng: np.random.Generator) -> Image:
+    """An image (H, W, 3) as the camera takes it with the share `light` of the light: amplified by
+    at most most_gain, with noise, coded as JPEG. An image below the native width counts as binned.
+    """
     binned = (_NATIVE_PX / rgb.shape[1]) ** 2
     white, read = _WHITE * binned, _READ * np.sqrt(binned)
     electrons = (rgb.astype(np.float32) / 255.0) ** _GAMMA * (white * light)
@@ -40,10 +42,10 @@ class PictureFault:
     """A video fault that lasts until the next one.
 
     covered: a lens cap. blinded: cloud or fog. darkens: the light halves every `seconds`, with a
-    gain of up to 16. frozen: the last frame is encoded again and sent with new timestamps.
+    gain of up to 16. frozen: the last frame is sent again and again with new timestamps.
     stamped_late: the timestamp is `seconds` after the exposure. late: the frame is sent `seconds`
-    late and its timestamp is that of sending, as of a camera that ignores its own latency. silent:
-    nothing is sent.
+    late with the time of sending as its timestamp, as by a camera that ignores its latency. silent:
+    no frame is sent.
     """
 
     kind: PictureFaultKind
@@ -68,8 +70,8 @@ class VideoFaultInjector:
         """Set the fault from the next frame on; None ends it."""
         self._fault, self._began_ns = fault, None
 
-    def picture(self, image: Image, time_ns: int) -> Image:
-        """The frame that is sent instead of `image` (H, W, 3) uint8."""
+    def apply(self, image: Image, time_ns: int) -> Image:
+        """The frame that is sent instead of `image` (H, W, 3) uint8, exposed at time_ns."""
         kind = self._fault.kind if self._fault is not None else None
         if self._began_ns is None:
             self._began_ns = time_ns
@@ -82,7 +84,7 @@ class VideoFaultInjector:
             return self._even(image, _BLINDED_LEVEL, _BLINDED_NOISE)
         if self._fault is not None and kind == "darkens":
             halvings = (time_ns - self._began_ns) * 1e-9 / self._fault.seconds
-            return darkened(image, 0.5**halvings, _MOST_GAIN, self._rng)
+            return darken(image, 0.5**halvings, _MOST_GAIN, self._rng)
         return image
 
     def stamp(self, exposure_ns: int) -> int:

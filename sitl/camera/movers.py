@@ -67,7 +67,7 @@ class Mover:
         return np.asarray(chord / max(float(np.linalg.norm(chord)), 1e-9))
 
 
-def there_and_back(lane: ArrayLike, out_m: float, back_m: float) -> Array:
+def round_trip(lane: ArrayLike, out_m: float, back_m: float) -> Array:
     """Closed path (2 N, 3) from an open lane (N, 3): forward with an offset of `out_m` to the right
     of the lane, then back with an offset of `back_m` to the right of that direction.
     """
@@ -87,21 +87,21 @@ def _parallel(line: Array, offset_m: float) -> Array:
 
 @dataclass(frozen=True)
 class Crowd:
-    """A kind of moving objects. prefix: of their names; speeds_mps: lowest and highest."""
+    """A kind of moving objects. prefix: start of their names; speeds_mps: lowest and highest."""
 
     prefix: str
     meshes: Sequence[TileMesh]
     speeds_mps: tuple[float, float]
 
 
-def spread(
+def place_movers(
     crowd: Crowd,
     paths: Sequence[Array],
     count: int,
     rng: np.random.Generator,
     epoch_ns: int = 0,
 ) -> tuple[Mover, ...]:
-    """`count` objects with random path, start position, mesh and speed."""
+    """Make `count` objects with random mesh and speed, at random places of the closed paths."""
     lengths = np.array(
         [np.linalg.norm(np.diff(np.vstack([p, p[:1]]), axis=0), axis=1).sum() for p in paths]
     )

@@ -70,10 +70,10 @@ def _truth_sample(pilot: Pilot, cache: TileCache) -> TruthSample | None:
     roll, pitch, yaw = gimbal.roll_pitch_yaw
     frame = GimbalFrame.HEADING if gimbal.yaw_in_vehicle_frame else GimbalFrame.EARTH
     angles = GimbalAngles(roll, pitch, yaw, frame)
-    return TruthSample(truth.time_ns, enu(truth.location, cache), truth.quaternion, angles)
+    return TruthSample(truth.time_ns, map_enu(truth.location, cache), truth.quaternion, angles)
 
 
-def enu(place: Location, cache: TileCache) -> Any:
+def map_enu(place: Location, cache: TileCache) -> Any:
     """ENU coordinates (3,) m in the map's frame of a geodetic position (altitude AMSL)."""
     height = place.altitude_m + cache.manifest.geoid_separation_m
     return cache.frame.enu_from_geodetic(place.latitude_deg, place.longitude_deg, height)

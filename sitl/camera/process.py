@@ -131,7 +131,7 @@ class WorldCameraProcess:
         self._send(fault)
 
     def zoom(self, zooming: Zooming) -> None:
-        """Change the focal length as given."""
+        """Change the focal length over time, from now on."""
         self._send(zooming)
 
     def stop(self) -> None:
@@ -186,10 +186,10 @@ class WorldCameraProcess:
 
 
 def _run(config: WorldCameraConfig, connection: Connection) -> None:
-    """The child's main function: an empty string says ready, any other one is an error."""
+    """Main function of the camera's process. Sends "" when it is ready, or the text of an error."""
     cv2.setNumThreads(1)
     try:
-        with _Studio(config) as studio:
+        with _CameraServer(config) as studio:
             connection.send("")
             inbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
             threading.Thread(target=_listen, args=(connection, inbox), daemon=True).start()
@@ -211,8 +211,8 @@ def _listen(connection: Connection, inbox: queue.SimpleQueue[Message]) -> None:
 
 
 @dataclass(frozen=True)
-class _Waiting:
-    """A picture that is sent when it is due."""
+class _DelayedFrame:
+    """A frame that waits until it is sent at due_ns."""
 
     due_ns: int
     exposure_ns: int
@@ -220,8 +220,8 @@ class _Waiting:
     image: Image
 
 
-class _Studio:
-    """Owns renderer, encoder and log for the life of the process."""
+class _CameraServer:
+    """Owns renderer, encoder and log in the camera's process, and answers its messages."""
 
     def __init__(self, config: WorldCameraConfig) -> None:
         c = self._config = config
@@ -256,12 +256,12 @@ class _Studio:
             else None
         )
         self._lens, self._zoom = VideoFaultInjector(c.seed), ZoomLens(c.camera)
-        self._outbox: deque[_Waiting] = deque()
+        self._outbox: deque[_DelayedFrame] = deque()
         self._track = PoseTrack()
         self._paused = self._stopped = False
         self._frames = self._skipped = 0
 
-    def __enter__(self) -> _Studio:
+    def __enter__(self) -> _CameraServer:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -275,7 +275,9 @@ class _Studio:
         self._streamer.close()
 
     def run(self, inbox: queue.SimpleQueue[Message]) -> CameraStatistics:
-        """Exposes at the configured rate as far as the truth is known, until told to stop."""
+        """Expose frames at the configured rate, as far as true poses are known, until "stop"
+        arrives.
+        """
         period_ns = round(1e9 / self._config.rate_hz)
         real = self._config.realism
         margin_ns = round(max(self._config.shutter_s * 0.5e9, real.readout_ms * 0.5e6))
@@ -323,11 +325,11 @@ class _Studio:
             return
         stamp_ns = self._stamps.of(time_ns)
         self._outbox.append(
-            _Waiting(
+            _DelayedFrame(
                 time_ns + self._lens.delay_ns,
                 time_ns,
                 self._lens.stamp(stamp_ns),
-                self._lens.picture(self._zoom.picture(exposure.image, time_ns), time_ns),
+                self._lens.apply(self._zoom.apply(exposure.image, time_ns), time_ns),
             )
         )
         if self._detector is not None:
@@ -336,7 +338,7 @@ class _Studio:
         self._log.add(self._frames, stamp_ns, exposure.world_from_camera, time_ns)
         self._frames += 1
 
-    def _send(self, waiting: _Waiting) -> None:
+    def _send(self, waiting: _DelayedFrame) -> None:
         self._sender.send(waiting.image, waiting.exposure_ns, waiting.stamped_ns)
 
     def _statistics(self) -> CameraStatistics:

@@ -41,8 +41,8 @@ class Vibration:
         self._omega = 2 * np.pi * rng.uniform(*_VIBRATION_HZ, (3, _WAVES))
         self._phase = rng.uniform(0, 2 * np.pi, (3, _WAVES))
 
-    def shaken(self, pose: Pose, time_ns: int) -> Pose:
-        """world_from_camera with the vibration at a time."""
+    def vibrating(self, pose: Pose, time_ns: int) -> Pose:
+        """world_from_camera with the vibration of a time added."""
         if self._rms == 0:
             return pose
         waves = np.sin(self._omega * (time_ns * 1e-9) + self._phase).sum(axis=1)
@@ -50,7 +50,7 @@ class Vibration:
         return Pose(pose.rotation @ so3_exp(turn), pose.translation)
 
 
-class ShakenTrack:
+class VibratingTrack:
     """A camera trajectory with vibration, with the interface of `PoseTrack`."""
 
     def __init__(self, track: PoseTrack, vibration: Vibration) -> None:
@@ -59,7 +59,7 @@ class ShakenTrack:
     def at(self, time_ns: int) -> Pose | None:
         """world_from_camera at a time; None outside the track."""
         pose = self._track.at(time_ns)
-        return None if pose is None else self._vibration.shaken(pose, time_ns)
+        return None if pose is None else self._vibration.vibrating(pose, time_ns)
 
 
 class CameraClock:
@@ -72,7 +72,7 @@ class CameraClock:
         self._last_ns = -(2**62)
 
     def of(self, exposure_ns: int) -> int:
-        """The time stamp of a frame exposed at `exposure_ns`; time stamps never decrease."""
+        """The timestamp of a frame exposed at `exposure_ns`. Timestamps always increase."""
         noise = self._jitter_ns * float(self._rng.standard_normal()) if self._jitter_ns else 0.0
         stamp = exposure_ns + round(self._offset_ns + noise)
         self._last_ns = max(stamp, self._last_ns + 1)

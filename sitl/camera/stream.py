@@ -20,7 +20,7 @@ _DATAGRAM = 1316  # bytes: seven TS packets, what fits an Ethernet frame
 
 
 class LossyLink:
-    """Output of FFmpeg: sends datagrams to ``udp://host:port`` and drops a random share."""
+    """Output file for FFmpeg: sends datagrams to ``udp://host:port`` and drops a random share."""
 
     def __init__(self, url: str, loss: float, seed: int = 0) -> None:
         parts = urlsplit(url)
@@ -102,7 +102,7 @@ class VideoSender:
     def send(self, image: Image, exposure_ns: int, stamped_ns: int | None = None) -> None:
         """Send an RGB image (H, W, 3) uint8 exposed at `exposure_ns` (CLOCK_MONOTONIC).
 
-        stamped_ns: exposure time stated by a camera with a wrong clock.
+        stamped_ns: exposure time stated by a camera with a wrong clock; None: the true one.
         """
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         picture = picture.reformat(format="yuv420p")

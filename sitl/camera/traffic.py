@@ -9,7 +9,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.synth.tiles.props import CAR_COLOURS, car_mesh, person_mesh
 from localizer.synth.world import WorldInfo
-from sitl.camera.movers import Crowd, Mover, spread, there_and_back
+from sitl.camera.movers import Crowd, Mover, place_movers, round_trip
 
 # From the right-hand lane that a world gives: the lane of the other direction is 4.4 m to its left.
 _OTHER_LANE_M = 4.4
@@ -45,15 +45,15 @@ def traffic(
     all_cars = Crowd("car", car_meshes, _CAR_MPS)
     all_people = Crowd("person", person_meshes, _WALK_MPS)
     return (
-        *spread(all_cars, driving, cars, rng, epoch_ns),
-        *spread(all_people, walking, people, rng, epoch_ns),
+        *place_movers(all_cars, driving, cars, rng, epoch_ns),
+        *place_movers(all_people, walking, people, rng, epoch_ns),
     )
 
 
 def _path(
     world: WorldInfo, frame: LocalFrame, lane: NDArray[np.float64], out_m: float, back_m: float
 ) -> Array:
-    path = there_and_back(lane, out_m, back_m)
+    path = round_trip(lane, out_m, back_m)
     path[:, 2] = world.ground_height(path[:, 0], path[:, 1])
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
     return frame_from_world.apply(path)

@@ -50,13 +50,13 @@ class PoseTrack:
             self.add(time_ns, pose)
 
     def add(self, time_ns: int, pose: Pose) -> None:
-        """Append; a sample that is not newer than the newest is ignored."""
+        """Append a sample; one that is not newer than the newest is ignored."""
         if not self._samples or time_ns > self._samples[-1][0]:
             self._samples.append((time_ns, pose))
 
     @property
     def newest_ns(self) -> int | None:
-        """Time of the newest sample."""
+        """Time of the newest sample; None without samples."""
         return self._samples[-1][0] if self._samples else None
 
     def at(self, time_ns: int) -> Pose | None:

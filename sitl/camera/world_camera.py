@@ -23,7 +23,7 @@ from localizer.types import Float32, Image, RenderedView
 from sitl.camera.distortion import RenderedLens, row_motion
 from sitl.camera.imaging import Sensor
 from sitl.camera.movers import Mover
-from sitl.camera.realism import CameraRealism, ShakenTrack, Vibration
+from sitl.camera.realism import CameraRealism, VibratingTrack, Vibration
 from sitl.camera.true_motion import PoseTrack
 
 FRAME_COLUMNS = (
@@ -85,14 +85,14 @@ class WorldCamera:
 
     def expose(self, time_ns: int, track: PoseTrack) -> Exposure | None:
         """Render the frame at a time; None if `track` has no pose at that time."""
-        shaken = ShakenTrack(track, self._vibration)
-        pose = shaken.at(time_ns)
+        vibrating = VibratingTrack(track, self._vibration)
+        pose = vibrating.at(time_ns)
         if pose is None:
             return None
 
         def pose_of_row(row: float) -> Pose:
             away_ns = round((row + 0.5 - self.camera.height / 2) * self._row_ns)
-            return shaken.at(time_ns + away_ns) or pose
+            return vibrating.at(time_ns + away_ns) or pose
 
         view = self._render(pose, time_ns)
         if self._row_ns:
@@ -100,7 +100,7 @@ class WorldCamera:
             image, depth = self._lens.roll(view.rgb, view.depth, motion)
         else:
             image, depth = self._lens.distort(view.rgb), self._lens.distort_depth(view.depth)
-        length_px, angle_deg = self._blur(shaken, pose, depth, time_ns)
+        length_px, angle_deg = self._blur(vibrating, pose, depth, time_ns)
         image = self._sensor.apply(image, depth, length_px, angle_deg)
         return Exposure(image, depth, time_ns, pose, pose_of_row)
 
@@ -114,9 +114,9 @@ class WorldCamera:
         return self._renderer.render(scene, self._lens.pinhole, extra, wait=True)
 
     def _blur(
-        self, track: ShakenTrack, pose: Pose, depth: Float32, time_ns: int
+        self, track: VibratingTrack, pose: Pose, depth: Float32, time_ns: int
     ) -> tuple[float, float]:
-        """Length (pixels) and direction (degrees) of the motion during the shutter."""
+        """Length (pixels) and direction (degrees) of the image motion while the shutter is open."""
         before = track.at(time_ns - self._shutter_ns // 2) or pose
         after = track.at(time_ns + self._shutter_ns // 2) or pose
         flow = centre_flow(before, after, self.camera, _typical_depth(depth))
@@ -124,7 +124,7 @@ class WorldCamera:
 
 
 def centre_flow(before: Pose, after: Pose, camera: Camera, depth_m: float) -> Array:
-    """Motion (2,) px of the image centre's point, at distance depth_m, between two poses."""
+    """Image motion (2,) px, between two poses, of the point depth_m in front of the first."""
     point = before.apply(np.array([0.0, 0.0, depth_m]))
     start, _ = camera.project(before.inverse.apply(point))
     end, _ = camera.project(after.inverse.apply(point))
@@ -151,7 +151,7 @@ class FrameLog:
         self, sequence: int, time_ns: int, world_from_camera: Pose, true_ns: int | None = None
     ) -> None:
         """Append one frame; it is on disk when this returns. time_ns: by the stream, used to match
-        estimates; true_ns: exposure time, if it differs.
+        estimates; true_ns: exposure time; None: time_ns.
         """
         t, q = world_from_camera.translation, quaternion_from_matrix(world_from_camera.rotation)
         row = (time_ns, sequence, *(f"{x:.5f}" for x in t), *(f"{x:.9f}" for x in q))

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from localizer.geometry.camera import Camera
 from localizer.types import Image
-from sitl.ground.connection import silence
+from sitl.ground.connection import disable_reconnect
 from sitl.ground.vehicle_record import VEHICLE
 
 MOST = 2.0  # focal length at level 100 over that at level 0
@@ -58,7 +58,7 @@ class ZoomLens:
         """Set the change of the focal length."""
         self._zooming = zooming
 
-    def picture(self, image: Image, time_ns: int) -> Image:
+    def apply(self, image: Image, time_ns: int) -> Image:
         """The zoomed image (H, W, 3) uint8 of an exposure, enlarged about the principal point."""
         factor = 1.0 if self._zooming is None else self._zooming.at(time_ns)
         if factor == 1.0:
@@ -77,7 +77,7 @@ class ReportingCamera:
         self._link = mavutil.mavlink_connection(
             endpoint, source_system=VEHICLE, source_component=_CAMERA, dialect="ardupilotmega"
         )
-        silence(self._link)
+        disable_reconnect(self._link)
         self._zooming = Zooming(1.0, 1.0, 0, 0)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="camera component", daemon=True)

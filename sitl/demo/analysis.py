@@ -17,10 +17,11 @@ _CHI2_95 = 5.991  # of two degrees of freedom
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """Pose errors of every frame exposed in a time span; arrays (F,), NaN without an estimate.
+    """Pose errors of every frame exposed in a time span; arrays (F,), NaN without an accepted
+    estimate.
 
     translation_m: 3-D; horizontal_m: comparable with the EKF's. processed: whether the localizer
-    processed the frame or dropped it for a newer one.
+    processed the frame; False if it dropped the frame for a newer one.
     """
 
     time_ns: np.ndarray
@@ -31,7 +32,9 @@ class FrameErrors:
 
 
 def frame_errors(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> FrameErrors:
-    """Errors of pose estimates, matched to true camera poses by exposure time."""
+    """Errors of pose estimates against true camera poses, matched by exposure time. span_ns: first
+    and last exposure.
+    """
     inside = (truth["exposure_time_ns"] >= span_ns[0]) & (truth["exposure_time_ns"] <= span_ns[1])
     times = truth["exposure_time_ns"][inside]
     true_poses = [p for p, keep in zip(poses(truth), inside, strict=True) if keep]
@@ -53,7 +56,7 @@ def frame_errors(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -
 def localization_summary(errors: FrameErrors) -> LocalizationMetrics:
     """Summarize the errors of the processed frames in the columns of the PiLoT paper.
 
-    fps: localized frames per second of flight. It is not the throughput of the machine.
+    fps: localized frames per second of flight, not the throughput of the computer.
     """
     done = errors.processed
     localized = int(np.isfinite(errors.translation_m).sum())
@@ -97,8 +100,9 @@ def ekf_errors(
 
 @dataclass(frozen=True)
 class BoundFigures:
-    """Share of fixes that were within their stated bounds. inside_bound: per cent within their 95 %
-    ellipse; inside_level: per cent within their protection level; level_m: the protection levels.
+    """How often fixes were within their stated bounds, per cent. inside_bound: within their 95 %
+    ellipse; inside_level: within their protection level; None: not known. level_m: the protection
+    levels.
     """
 
     inside_bound: float | None

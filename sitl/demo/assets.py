@@ -36,7 +36,9 @@ class FlightAssets:
 
 
 def _import(folder: Path, progress: Callable[[float], None], number: int) -> None:
-    """A visit's tileset into the cache beside it; the first or second of two imports."""
+    """Import a visit's tileset (`folder`) into the cache beside it. progress: receives the share
+    done. number: 0 or 1, which of the two imports this is.
+    """
     each = (1.0 - _PAINTED) / 2
     begun = _PAINTED + each * number
     build_cache(
@@ -65,9 +67,9 @@ def prepare(
 ) -> FlightAssets:
     """Generate the world of a seed and import it as tile caches; existing parts are reused.
 
-    ideal: map and live world have the same geometry and texture. satellite: the map is a satellite
-    mosaic instead. progress: called with the step and the share done, 0 to 1; not called if nothing
-    is missing.
+    folder: None: `default_folder`. ideal: map and live world have the same geometry and texture.
+    satellite: the map is this satellite mosaic; None: the survey. progress: called with the step
+    and the share done, 0 to 1; not called if nothing is missing.
     """
     generation = _IDEAL_GENERATION if ideal else _GENERATION
     name = f"world-{generation}-{seed}-{size_m:.0f}"

@@ -33,7 +33,7 @@ THIS_PROGRAM = (sys.executable, "-m", "companion")
 
 @dataclass(frozen=True)
 class Ports:
-    """Local UDP ports of one flight."""
+    """Local UDP ports of one flight, and the console's TCP port (None: no console)."""
 
     video: int
     detections: int
@@ -59,9 +59,9 @@ def free_console_port() -> int | None:
     return None
 
 
-def answers(port: int, companion: subprocess.Popen[bytes]) -> bool:
-    """Wait up to 30 s until the console at `port` answers; False if it does not or the companion
-    has ended.
+def wait_for_console(port: int, companion: subprocess.Popen[bytes]) -> bool:
+    """Wait up to 30 s until the console at `port` accepts connections. Returns False after that
+    time, or if the companion has ended.
     """
     end_s = time.monotonic() + _CONSOLE_START_S
     while time.monotonic() < end_s and companion.poll() is None:
@@ -116,8 +116,8 @@ def write_deployment(
 
 
 def _known_to(scenario: Scenario) -> dict[str, float]:
-    """How well the deployment knows its camera: the sigmas from which the flight's errors are
-    drawn, as the calibration's report states them; not the draw.
+    """The deployment's calibration uncertainty: the standard deviations from which the flight's
+    errors are drawn.
     """
     drawn = scenario.errors
     return {
@@ -133,9 +133,10 @@ def _known_to(scenario: Scenario) -> dict[str, float]:
 def running_companion(
     config: Path, folder: Path, *options: str, program: Sequence[str] = THIS_PROGRAM
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Context manager: ``companion run`` as a process; interrupted (SIGINT) at the end.
+    """Context manager: ``companion run`` as a process; interrupted (SIGINT) at the end. `folder`
+    receives its log.
 
-    program: the command line before ``run``.
+    program: the command line before ``run``; options: after the configuration.
     """
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "160"}
     with (folder / "companion.log").open("wb") as log:

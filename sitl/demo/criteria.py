@@ -48,9 +48,10 @@ class FlightFigures:
     fixed_inside: float | None
 
 
-def judge(flight: FlightFigures, *, satellite: bool = False) -> tuple[Criterion, ...]:
-    """Check a flight against the pass criteria. satellite: over satellite imagery without building
-    heights, positions are less accurate; the criteria then check the stated error bounds.
+def check_criteria(flight: FlightFigures, *, satellite: bool = False) -> tuple[Criterion, ...]:
+    """Compare a flight with the pass criteria. satellite: the map is satellite imagery without
+    building heights. Positions are then less accurate, and the criteria check the stated error
+    bounds instead.
     """
     m = flight.localizer
     if satellite:
@@ -88,8 +89,9 @@ def headline(flight: FlightFigures, home_error_m: float, denied_s: float) -> str
 
 @dataclass(frozen=True)
 class ComputingRates:
-    """Computing speed of a flight. sent_hz, wanted_hz: real and configured frame rate; taken: share
-    of frames that the localizer processed; latency_ms: p95 from exposure to estimate.
+    """Computing speed of a flight. sent_hz, wanted_hz: real and configured frame rate. taken: share
+    of frames that the localizer processed. latency_ms: p95 from exposure to estimate; None without
+    estimates. delay_ms: the autopilot's VISO_DELAY_MS. load: mean load of the computer.
     """
 
     sent_hz: float
@@ -99,8 +101,8 @@ class ComputingRates:
     delay_ms: float
     load: float
 
-    def complaint(self) -> str | None:
-        """Why the computer was too slow for this flight; None if it was not."""
+    def slow_reason(self) -> str | None:
+        """Why the computer was too slow for this flight; None if it was fast enough."""
         limit_ms = min(self.delay_ms, _MAX_LATENCY_MS)
         said = []
         if self.sent_hz < _SLOW * self.wanted_hz:

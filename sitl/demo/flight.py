@@ -22,7 +22,7 @@ from localizer.synth.appearance.model import sample_appearance
 from sitl.camera.detector import Observed
 from sitl.camera.gimbal_error import GimbalError
 from sitl.camera.movers import Mover
-from sitl.camera.pose_sender import enu, truth_feed
+from sitl.camera.pose_sender import map_enu, truth_feed
 from sitl.camera.process import CameraStatistics, WorldCameraConfig, WorldCameraProcess
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
@@ -30,9 +30,9 @@ from sitl.demo.budget import FlightErrors, draw_errors
 from sitl.demo.companion_process import (
     THIS_PROGRAM,
     Ports,
-    answers,
     free_udp_port,
     running_companion,
+    wait_for_console,
     write_deployment,
 )
 from sitl.demo.scenario import Scenario, VehicleChoice
@@ -54,9 +54,9 @@ from sitl.vehicles.launch import (
 @dataclass(frozen=True)
 class DemoRecord:
     """Records of a flight. denied_ns: span from GNSS off to the end of the mission, or to the
-    abort. errors: calibration and map errors drawn; gimbal_alignment_deg: unreported roll, pitch,
-    yaw. broken: why the flight was aborted, otherwise None. load: mean load of the computer in the
-    last minute.
+    abort. home_error_m: true distance from home at the end. errors: the drawn calibration and map
+    errors. gimbal_alignment_deg: roll, pitch, yaw that the gimbal does not report. broken: why the
+    flight was aborted; None otherwise. load: mean load of the computer in the last minute.
     """
 
     folder: Path
@@ -74,15 +74,16 @@ class DemoRecord:
 
 @dataclass(frozen=True)
 class FlightObservers:
-    """Callbacks that report a flight's progress. progress: (phase, share done); connectable:
-    address for a ground station ("tcp:HOST:PORT"); console: port of the console, if wanted;
-    watchable: its address once it answers.
+    """Callbacks that report a flight's progress. progress: gets (phase, share done).
+    on_connectable: gets the address for a ground station ("tcp:HOST:PORT"). console: port of the
+    console; None: no console. on_console: gets the console's address when the console accepts
+    connections.
     """
 
     progress: Progress = lambda _phase, _share: None
-    connectable: Callable[[str], None] = lambda _endpoint: None
+    on_connectable: Callable[[str], None] = lambda _endpoint: None
     console: int | None = None
-    watchable: Callable[[str], None] = lambda _address: None
+    on_console: Callable[[str], None] = lambda _address: None
 
 
 def fly(
@@ -91,26 +92,26 @@ def fly(
     kind: VehicleChoice,
     seed: int,
     folder: Path,
-    onlookers: FlightObservers | None = None,
+    observers: FlightObservers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
 ) -> DemoRecord:
-    """Fly a scenario without GNSS; `folder` receives all records, also of an aborted flight.
+    """Fly a scenario without GNSS. `folder` receives all records, also those of an aborted flight.
 
-    program: command of the companion.
+    program: command line that starts the companion. observers: None: nothing is reported.
     """
-    onlookers = onlookers or FlightObservers()
-    progress = onlookers.progress
+    observers = observers or FlightObservers()
+    progress = observers.progress
     folder.mkdir(parents=True, exist_ok=True)
     cache = TileCache.open(assets.map_cache)
     home = home_of(assets)
-    ports = Ports(free_udp_port(), free_udp_port(), onlookers.console)
+    ports = Ports(free_udp_port(), free_udp_port(), observers.console)
     with ExitStack() as stack:
         progress("starting the vehicle", 0.0)
         setup = VehicleSetup(
             parameters=vehicle_parameters(scenario), seed=seed, log=folder / "vehicle.log"
         )
         vehicle = stack.enter_context(open_vehicle(kind, home, setup))
-        onlookers.connectable(vehicle.spare_endpoint)
+        observers.on_connectable(vehicle.spare_endpoint)
         pilot = stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
         progress("waiting for GNSS and the EKF", 0.0)
         with pilot.fast_forward():
@@ -130,8 +131,8 @@ def fly(
         progress("starting the companion", 0.0)
         begun_ns, broken = time.monotonic_ns(), None
         companion = stack.enter_context(running_companion(config, folder, program=program))
-        if ports.console is not None and answers(ports.console, companion):
-            onlookers.watchable(f"http://127.0.0.1:{ports.console}/")
+        if ports.console is not None and wait_for_console(ports.console, companion):
+            observers.on_console(f"http://127.0.0.1:{ports.console}/")
         run = FlightScript(pilot, scenario, home, folder, companion, progress)
         try:
             denied_ns = run.fly()
@@ -181,7 +182,9 @@ def vehicle_parameters(scenario: Scenario) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class FilmedFlight:
-    """Scene and output ports of a flight's world camera. targets: reported by the detector."""
+    """What a flight's world camera shows, and its output ports. targets: the objects that the
+    simulated detector reports.
+    """
 
     assets: FlightAssets
     scenario: Scenario
@@ -224,5 +227,5 @@ def write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
         writer.writerow(("time_ns", *names, *(f"ekf_{n}" for n in names)))
         for sample, true in pilot.record.ekf_pairs():
             if sample.location is not None:
-                values = (*enu(true, cache), *enu(sample.location, cache))
+                values = (*map_enu(true, cache), *map_enu(sample.location, cache))
                 writer.writerow((sample.time_ns, *(f"{v:.4f}" for v in values)))

@@ -29,10 +29,10 @@ _ACCELERATION = 2.5  # m/s²
 
 
 def camera_path(scenario: Scenario, ground_m: float) -> Iterator[tuple[int, Pose]]:
-    """Camera poses (time ns, world_from_camera) every 20 ms along the scenario's legs, with a stop
-    and a turn at each corner.
+    """Yield camera poses (time ns, world_from_camera in ENU) every 20 ms along the scenario's legs.
+    The path stops and turns at each corner.
 
-    ground_m: home's ENU height.
+    ground_m: ENU height of the ground at home.
     """
     position = np.array([0.0, 0.0, ground_m + scenario.takeoff_height_m])
     first = scenario.legs[0]

@@ -22,7 +22,7 @@ class LogProgress:
         self._phase: str | None = None
 
     def __call__(self, phase: str, share: float) -> None:
-        """It is in a phase; share of it all that is done, 0 to 1."""
+        """Report a phase; share: how much of the whole work is done, 0 to 1."""
         now_s = self._clock() - self._begun
         if phase == self._phase and now_s - self._printed_s < LINE_EVERY_S:
             return

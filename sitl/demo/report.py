@@ -39,8 +39,8 @@ from sitl.demo.criteria import (
     ComputingRates,
     Criterion,
     FlightFigures,
+    check_criteria,
     headline,
-    judge,
 )
 from sitl.demo.flight import DemoRecord
 from sitl.demo.scenario import Scenario
@@ -50,14 +50,14 @@ from sitl.demo.scenario import Scenario
 class FlightReport:
     """The flight's figures over the span without GNSS.
 
-    localizer: the paper's columns over processed frames; localizer_m: errors of the accepted
-    estimates. ekf_in_map_m: EKF errors in the map's frame; ekf_horizontal_m: EKF errors in GNSS's
-    frame; the map is shifted by map_shift_m against GNSS. inside_bound: per cent of fixes within
-    their own 95 % ellipse; inside_level: within their protection level; protection_m: the
-    horizontal protection levels. fixed_inside: per cent of the standing targets' fixes within their
-    own 95 % ellipse. map_kind: kind of the map's data. targets: 3-D error by name, in the map's
-    frame. won: the flight in one line; broken: why it ended early; slow: what the computer was too
-    slow for.
+    won: the flight in one line. localizer: the paper's columns over processed frames. localizer_m:
+    errors of the accepted estimates. ekf_horizontal_m: EKF errors in GNSS's frame; ekf_in_map_m: in
+    the map's frame, which is shifted by map_shift_m against GNSS. inside_bound: per cent of fixes
+    within their 95 % ellipse; inside_level: within their protection level; protection_m: the
+    horizontal protection levels. fixed_inside: per cent of the fixed targets' positions within
+    their 95 % ellipse. targets_m: 3-D error by name, in the map's frame. map_kind: kind of the
+    map's data. stages_ms: latency of each processing stage. broken: why the flight ended early;
+    slow: why the computer was too slow; None otherwise.
     """
 
     won: str
@@ -157,10 +157,10 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
         fixed_targets_m=fixed_targets,
         targets_m={name: Spread.of(e) for name, e in by_target.items()},
         stages_ms=stages,
-        criteria=judge(judged, satellite=scenario.satellite is not None),
+        criteria=check_criteria(judged, satellite=scenario.satellite is not None),
         fixed_inside=judged.fixed_inside,
         broken=record.broken,
-        slow=_pace(record, scenario, errors, latency, config).complaint(),
+        slow=_pace(record, scenario, errors, latency, config).slow_reason(),
     )
     _write_json(folder, report, record, scenario, seed, config)
     _write_frames(folder / "frames_report.csv", errors)

@@ -41,7 +41,7 @@ _TINT = np.array([1.05, 1.0, 1.12], np.float32)  # red, green, blue: haze
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is photographed, and from where. image_from_world: of the whole view, without limits."""
+    """The imaged world and the satellite's view."""
 
     world: WorldInfo
     spec: SatelliteMap
@@ -50,7 +50,7 @@ class _Scene:
 
     @property
     def world_from_camera(self) -> Pose:
-        """x lies in the map's plane, z towards the world's middle."""
+        """Pose of the distant camera: x lies in the map's plane, z points to the world's centre."""
         tilt, azimuth = np.radians([self.spec.off_nadir_deg, self.spec.azimuth_deg])
         eye = np.array(
             [np.sin(azimuth) * np.sin(tilt), np.cos(azimuth) * np.sin(tilt), np.cos(tilt)]
@@ -65,11 +65,11 @@ class _Scene:
 
     @property
     def cache_from_world(self) -> Pose:
-        """The cache's frame may have another origin than the world's."""
+        """Transform from the world's ENU frame to the cache's, whose origin may differ."""
         return self.cache.frame.ecef_from_enu.inverse @ self.world.frame.ecef_from_enu
 
     def ground(self, x: Array, y: Array) -> Array:
-        """Terrain (..., 3), world ENU m, at places of the map's CRS."""
+        """Terrain points (..., 3), world ENU m, at x, y (m) of the map's CRS."""
         there = Transformer.from_crs(self.crs, CRS.from_epsg(4326), always_xy=True)
         longitude, latitude = there.transform(x, y)
         level = np.full(np.shape(x), self.world.origin.height_m)
@@ -78,7 +78,7 @@ class _Scene:
         return np.stack([flat[..., 0], flat[..., 1], height], axis=-1)
 
     def heights(self, x: Array, y: Array) -> Array:
-        """Ellipsoidal, m, of the terrain."""
+        """Ellipsoidal terrain heights (...), m, at x, y (m) of the map's CRS."""
         return self.world.frame.geodetic_from_enu(self.ground(x, y))[..., 2]
 
 
@@ -89,8 +89,8 @@ def build_satellite_map(
     out: Path,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> None:
-    """Import a satellite mosaic of the cache `seen` over the world's bare-earth terrain as a tile
-    cache at `out`. progress: called with the share done.
+    """Make a satellite mosaic of the world in the cache `seen`, and import it over the world's
+    bare-earth terrain as a tile cache at `out`. progress: called with the share done.
     """
     cache = TileCache.open(seen)
     zone = int((world.origin.longitude_deg + 180) // 6) + 1
@@ -142,7 +142,9 @@ def _mosaic(
 def _block(
     scene: _Scene, renderer: NumbaRenderer, corner: tuple[float, float], size: tuple[int, int]
 ) -> Image:
-    """A part of the mosaic, (rows, columns, 3): what the satellite sees where the terrain is."""
+    """One part of the mosaic, (rows, columns, 3): the satellite's view, resampled onto the terrain.
+    corner: upper left, m of the map's CRS; size: columns, rows.
+    """
     texel_m, (columns, rows) = scene.spec.texel_m, size
     x = corner[0] + np.linspace(0.0, columns * texel_m, _GRID)
     y = corner[1] - np.linspace(0.0, rows * texel_m, _GRID)

@@ -110,8 +110,8 @@ class CameraSpec(StrictModel):
 
 
 class SatelliteMap(StrictModel):
-    """A satellite mosaic over bare-earth terrain as the map: off-nadir angle, and azimuth
-    (clockwise from north) of the viewing direction.
+    """A satellite mosaic over bare-earth terrain as the map. off_nadir_deg: angle between the line
+    of sight and the vertical. azimuth_deg: direction to the satellite, clockwise from north.
     """
 
     off_nadir_deg: float = Field(12.0, ge=0, le=45)

@@ -53,7 +53,7 @@ class FlightScript:
         """When GNSS went off, CLOCK_MONOTONIC; None before."""
 
     def fly(self) -> tuple[int, int]:
-        """Fly the mission; returns the span without GNSS to the last waypoint (CLOCK_MONOTONIC)."""
+        """Fly the mission; returns the span from GNSS off to the last waypoint, CLOCK_MONOTONIC."""
         pilot, scenario = self._pilot, self._scenario
         self._progress("starting the companion", 0.0)
         self.await_companion()
@@ -86,7 +86,7 @@ class FlightScript:
     def _deny(self) -> None:
         if self._scenario.injection != "gps_input":  # that is a second receiver of the same set
             self._pilot.use_source_set(VISION_SOURCE)
-        self._pilot.gps(False)
+        self._pilot.switch_gnss(False)
 
     def _follow(self, last_item: int) -> None:
         """Wait for the mission's last item, watching the companion."""
@@ -135,7 +135,7 @@ class FlightScript:
         return health is not None and list(health["alerts"]) == [AlertId.TRACKING.value]
 
     def _health(self) -> dict[str, Any] | None:
-        """What the companion says of itself; None while it is not up."""
+        """The companion's newest health report as JSON data; None before the first."""
         try:
             health = json.loads((self._folder / "companion" / "health.json").read_text())
         except (OSError, ValueError):

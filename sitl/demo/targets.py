@@ -25,13 +25,13 @@ _FLATNESS_M = 0.1
 def observed_targets(
     assets: FlightAssets, scenario: Scenario, movers: tuple[Mover, ...]
 ) -> tuple[Observed, ...]:
-    """Named fixed points on surfaces that the flight passes, and the cars; map ENU."""
+    """Named fixed points on flat surfaces along the path, and all cars; map ENU."""
     cars = tuple(m for m in movers if m.name.startswith("car"))
     return (*_fixed_points(assets, scenario), *cars)
 
 
 def _fixed_points(assets: FlightAssets, scenario: Scenario) -> tuple[FixedPoint, ...]:
-    """The flattest places that the camera's axis meets in each third of the way."""
+    """The flattest point on the camera's axis in each third of the path."""
     cache, live = TileCache.open(assets.map_cache), TileCache.open(assets.live_cache)
     live_from_map = live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu
     ground_m = float(assets.world.ground_height(0.0, 0.0))
@@ -56,7 +56,9 @@ def _fixed_points(assets: FlightAssets, scenario: Scenario) -> tuple[FixedPoint,
 
 
 def _flat_point(streamer: TileStreamer, pose: Pose, camera: Camera) -> tuple[float, Array] | None:
-    """(roughness in m, point (3,)) where the camera's axis meets the world, if it is flat there."""
+    """Where the camera's axis meets the world: (roughness in m, point (3,)); None if it misses the
+    world or the surface there is not flat.
+    """
     meshes = streamer.select(pose, camera, wait=True)
     centre = _hit(meshes, pose, np.array([0.0, 0.0, 1.0]))
     if centre is None:

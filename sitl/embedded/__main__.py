@@ -72,7 +72,7 @@ def main(argv: list[str] | None = None) -> int:
 def _run(
     home: Location, heading_deg: float, parameters: Parameters, server: MavlinkServer, seed: int
 ) -> None:
-    """From power on until a reboot is ordered; the parameters live on."""
+    """Run the vehicle until a reboot is ordered. The parameters outlive the reboot."""
     try:
         vehicle = EmbeddedVehicle(home, heading_deg, parameters, server, seed)
         for number, link in enumerate(server.links):
@@ -84,7 +84,7 @@ def _run(
 
 
 def _compile(home: Location, parameters: Parameters) -> None:
-    """Fly a moment without links, so that no client waits for the kernels' first compilation."""
+    """Run a vehicle briefly without links, so that no client waits for compilation."""
     vehicle = EmbeddedVehicle(home, 0.0, parameters, MavlinkServer((), 1))
     vehicle.aircraft.modes.arm()
     for _ in range(60):

@@ -33,7 +33,8 @@ _GUST_CORRELATION_S = 3.0
 
 
 class Aircraft:
-    """A quadrotor with its autopilot. home: AMSL.
+    """A quadrotor with its autopilot. home: start position, altitude AMSL. heading_deg: from true
+    north. seed: of sensor noise and gusts.
 
     Above 200 lines: commands and telemetry read all of it, as ArduPilot's do of `copter`.
     """
@@ -95,7 +96,7 @@ class Aircraft:
     # --- a tick ------------------------------------------------------------------------------
 
     def begin_tick(self) -> None:
-        """Update what commands of this tick read."""
+        """Update what the tick's commands read: whether the simulated receiver has a fix."""
         simulated = self.parameters["GPS1_TYPE"] in GPS_SIMULATED
         self.injection.receiver_has_fix = simulated and self.gps_has_fix
 
@@ -214,11 +215,11 @@ class Aircraft:
     # --- autopilot ---------------------------------------------------------------------------
 
     def notify(self, severity: int, text: str) -> None:
-        """STATUSTEXT on every link."""
+        """Send a STATUSTEXT (at most 50 bytes of `text`) on every link. severity: MAV_SEVERITY."""
         self.server.broadcast(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
 
     def use_source(self, source: int) -> None:
-        """Switch the filter to a source set, 1 to 3."""
+        """Switch the EKF to a source set, 1 to 3, and report a change as STATUSTEXT."""
         if self.estimator.sources.source_set != source:
             self.estimator.sources.source_set = source
             self.notify(INFO, f"Using EKF Source Set {source}")
@@ -244,7 +245,7 @@ class Aircraft:
         )
 
     def report_failures(self, prefix: str) -> bool:
-        """Send each failing check as a STATUSTEXT; True when there are any."""
+        """Send each failing arming check as a STATUSTEXT after `prefix`; True if there are any."""
         failures = self.arming_failures()
         for text in failures:
             self.notify(CRITICAL, f"{prefix}: {text}")

@@ -139,16 +139,16 @@ class Parameters:
         """MAV_PARAM_TYPE of a known parameter."""
         return _DEFAULTS[name][1]
 
-    def sent(self, name: str) -> float:
-        """What PARAM_VALUE carries."""
+    def encode_value(self, name: str) -> float:
+        """Value of a parameter as PARAM_VALUE carries it."""
         return self[name]
 
-    def received(self, _name: str, value: float) -> float:
-        """What a value of PARAM_SET stands for."""
+    def decode_value(self, _name: str, value: float) -> float:
+        """Value of a parameter from a PARAM_SET message's float."""
         return value
 
     def name_at(self, index: int) -> str | None:
-        """The parameter at a list index."""
+        """Name of the parameter at a list index; None outside the list."""
         names = list(self)
         return names[index] if 0 <= index < len(names) else None
 

@@ -55,7 +55,7 @@ _DEFAULTS: dict[str, tuple[float, int]] = {
 
 
 class Px4Parameters(Parameters):
-    """PX4's table over the shared model's own values: those can be set, and are not listed."""
+    """PX4's parameters. The vehicle model's own can be set, but only SIM_* are listed."""
 
     is_px4 = True
 
@@ -77,14 +77,14 @@ class Px4Parameters(Parameters):
         """See `Parameters.type_of`; the simulator's own are floats."""
         return _DEFAULTS[name][1] if name in _DEFAULTS else REAL32
 
-    def sent(self, name: str) -> float:
-        """See `Parameters.sent`."""
+    def encode_value(self, name: str) -> float:
+        """See `Parameters.encode_value`."""
         if self.type_of(name) == REAL32:
             return self[name]
         return float(struct.unpack("<f", struct.pack("<i", int(self[name])))[0])
 
-    def received(self, name: str, value: float) -> float:
-        """See `Parameters.received`."""
+    def decode_value(self, name: str, value: float) -> float:
+        """See `Parameters.decode_value`."""
         if self.type_of(name) == REAL32:
             return value
         return float(struct.unpack("<i", struct.pack("<f", value))[0])

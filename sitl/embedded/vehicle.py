@@ -64,7 +64,7 @@ class EmbeddedVehicle:
         self._server.flush()
 
     def _announce(self) -> None:
-        """Origin and home when they are set, TIMESYNC every 10 s (PX4: ten times a second)."""
+        """Broadcast origin and home once set, and TIMESYNC every 10 s (PX4: ten times a second)."""
         aircraft, server = self.aircraft, self._server
         if aircraft.tick % self._sync_ticks == 0:
             server.broadcast(mavlink.MAVLink_timesync_message(0, aircraft.time_ms * 1_000_000))

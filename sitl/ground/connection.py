@@ -18,7 +18,7 @@ from sitl.errors import PilotError
 SYSTEM, COMPONENT = 255, 190  # of the ground station
 
 
-def silence(link: Any) -> None:
+def disable_reconnect(link: Any) -> None:
     """Keep pymavlink from printing and reconnecting when the vehicle closes a TCP link."""
     link.handle_eof = link.handle_disconnect = lambda: None
 
@@ -50,7 +50,7 @@ class Connection:
                         f"no vehicle listens at {self.endpoint}: {error}; is it started?"
                     ) from error
                 time.sleep(0.1)
-        silence(self._link)
+        disable_reconnect(self._link)
 
     def shut_down(self) -> None:
         """Wake and end the receiving thread."""
@@ -68,7 +68,7 @@ class Connection:
         with self._send_lock:
             self._link.mav.send(message)
 
-    def beat(self) -> None:
+    def send_heartbeat(self) -> None:
         """Send the ground station's heartbeat if the link is open."""
         with contextlib.suppress(OSError):
             self.send(

@@ -16,8 +16,8 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.errors import PilotError
-from sitl.ground.answers import Answers
 from sitl.ground.connection import Connection
+from sitl.ground.message_queues import AutopilotQueues
 from sitl.ground.vehicle_record import AUTOPILOT, VEHICLE, VehicleRecord
 
 _HEARTBEAT_S = 0.5  # wall time
@@ -42,10 +42,9 @@ _TRIES = 80
 class GroundLink:
     """A link to a vehicle at a MAVLink endpoint ("tcp:127.0.0.1:5760"), with its record.
 
-    answers: messages of the autopilot, for callers that wait for one. Seconds are simulated
-    seconds, unless they are called wall time. speedup: simulated seconds per real second, as the
-    vehicle was started. alive: called while waiting; it raises if the vehicle has died
-    (`VehicleProcess.check`).
+    answers: queues of the autopilot's messages, for callers that wait for one. Seconds are
+    simulated unless called wall time. speedup: simulated seconds per real second of the started
+    vehicle. alive: called while waiting; raises if the vehicle has died (`VehicleProcess.check`).
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class GroundLink:
         self.record = VehicleRecord(speedup)
         self.speedup = speedup
         self._connection, self._alive = Connection(endpoint), alive
-        self.answers = Answers()
+        self.answers = AutopilotQueues()
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -131,7 +130,7 @@ class GroundLink:
     # --- parameters --------------------------------------------------------------------------
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter and wait until the vehicle confirms it."""
+        """Set a parameter and wait until the vehicle confirms it; `PilotError` if it does not."""
         with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(_TRIES):
                 self.send(
@@ -144,7 +143,7 @@ class GroundLink:
         raise PilotError(f"the vehicle did not confirm {name} = {value:g}; does it know it?")
 
     def parameter(self, name: str, tries: int = _TRIES) -> float:
-        """Read a parameter, with `tries` requests; a vehicle does not answer for unknown ones."""
+        """Read a parameter; `PilotError` if `tries` requests get no answer (unknown name)."""
         with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(tries):
                 self.send(
@@ -162,7 +161,7 @@ class GroundLink:
         return None if answer is None else float(answer.param_value)
 
     def _answer(self, box: queue.SimpleQueue[Any], fits: Callable[[Any], bool]) -> Any | None:
-        """The first message that fits; None after `_REPEAT_S`."""
+        """The first message for which `fits` is true; None after `_REPEAT_S`."""
         self._alive()
         deadline = time.monotonic() + _REPEAT_S
         while (left := deadline - time.monotonic()) > 0:
@@ -181,7 +180,7 @@ class GroundLink:
     # --- commands ----------------------------------------------------------------------------
 
     def command(self, number: int, *parameters: float) -> None:
-        """COMMAND_LONG; PilotError unless it is accepted."""
+        """Send COMMAND_LONG and wait for its answer; `PilotError` unless it is accepted."""
         started = time.monotonic_ns()
         result = self.try_command(number, *parameters)
         if result != mavlink.MAV_RESULT_ACCEPTED:
@@ -189,7 +188,7 @@ class GroundLink:
             raise PilotError(f"command {number} was refused (MAV_RESULT {result}): {texts}")
 
     def try_command(self, number: int, *parameters: float) -> int | None:
-        """COMMAND_LONG; returns its MAV_RESULT, or None without an answer."""
+        """Send COMMAND_LONG; returns its MAV_RESULT, or None without an answer."""
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         with self.answers.expect("COMMAND_ACK") as box:
             for attempt in range(_TRIES):
@@ -226,7 +225,7 @@ class GroundLink:
             now = time.monotonic()
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_S
-                self._connection.beat()
+                self._connection.send_heartbeat()
             try:
                 messages = self._connection.receive()
             except OSError:  # the socket is being closed, or the vehicle died
@@ -234,8 +233,8 @@ class GroundLink:
                     time.sleep(0.05)
                 continue
             for message in messages:
-                self.record.take(message, time.monotonic_ns())
-                self.answers.take(message)
+                self.record.add(message, time.monotonic_ns())
+                self.answers.add(message)
             if messages:
                 with self._changed:
                     self._changed.notify_all()

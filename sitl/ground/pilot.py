@@ -25,9 +25,10 @@ _SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 
 
 class Pilot:
-    """Flies a vehicle. link: commands; record: received data; missions: mission protocol.
+    """Flies a vehicle by MAVLink. link: commands; record: received data; missions: mission
+    protocol.
 
-    The arguments are those of `GroundLink`. It connects as a context manager.
+    The arguments are those of `GroundLink`. Entering the context manager connects.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class Pilot:
         self.link.wait(lambda: self.record.mode == name, _SHOWN_S, f"mode {name}")
 
     def arm(self, timeout_s: float = 60.0) -> None:
-        """Arm, asking again until the checks pass; PilotError with the refusals otherwise."""
+        """Arm, asking again until the checks pass; `PilotError` with the refusals on timeout."""
         start_s, start_ns = self.record.time_s, time.monotonic_ns()
         while True:
             if self.link.try_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == 0:
@@ -104,11 +105,11 @@ class Pilot:
         self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196.0 if force else 0.0)
 
     def reboot(self) -> None:
-        """Reboot the disarmed autopilot; afterwards connect anew."""
+        """Reboot the disarmed autopilot; the caller then needs a new connection."""
         self.link.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
 
     def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
-        """Take off in GUIDED and wait for the true height above the take-off position."""
+        """Take off in GUIDED; returns when the true height above the ground is height_m - 2 m."""
         ground = self.record.truth.altitude_m
         self._ground_m = ground
         height = height_m + ground if self.record.is_px4 else height_m  # PX4: AMSL
@@ -139,7 +140,7 @@ class Pilot:
         )
 
     def _reposition(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
-        """PX4 follows SET_POSITION_TARGET in Offboard only; Hold takes a place by this."""
+        """Send a PX4 vehicle to a position: PX4's Hold ignores SET_POSITION_TARGET."""
         self.link.send(
             mavlink.MAVLink_command_int_message(
                 VEHICLE,
@@ -163,12 +164,12 @@ class Pilot:
         self.set_mode("LAND")
         self.link.wait(lambda: not self.record.armed, timeout_s, "the landing")
 
-    def gps(self, on: bool) -> None:
+    def switch_gnss(self, on: bool) -> None:
         """Switch the simulated receiver on or off."""
         self.link.set_parameter("SIM_GPS1_ENABLE", 1.0 if on else 0.0)
 
     def use_source_set(self, number: int) -> None:
-        """MAV_CMD_SET_EKF_SOURCE_SET."""
+        """Order an EKF source set, 1 to 3 (MAV_CMD_SET_EKF_SOURCE_SET)."""
         self.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
     def set_origin(self, origin: Location) -> None:
@@ -194,7 +195,7 @@ class Pilot:
         return self.record.origin
 
     def point_gimbal(self, pitch_deg: float, yaw_deg: float, *, earth_yaw: bool = False) -> None:
-        """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; yaw from the nose, or from north."""
+        """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; yaw from the nose, or (earth_yaw) from north."""
         flags = _GIMBAL_YAW_LOCK if earth_yaw else 0.0
         self.link.command(
             mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,

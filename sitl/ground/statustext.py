@@ -26,8 +26,8 @@ class TextLog:
         self.lines: list[StatusText] = []
         self._open: dict[tuple[int, int], tuple[int, int, int]] = {}
 
-    def take(self, message: Any, received_ns: int) -> None:
-        """Take in one STATUSTEXT."""
+    def add(self, message: Any, received_ns: int) -> None:
+        """Add one STATUSTEXT: a new text, or the next chunk of one that is not complete."""
         source = (message.get_srcSystem(), message.get_srcComponent())
         number, chunk = message.id, message.chunk_seq
         line = StatusText(received_ns, message.severity, message.text, source[1])

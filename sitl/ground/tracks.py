@@ -28,7 +28,7 @@ class TimedSample(Protocol):
 
     @property
     def time_ns(self) -> int:
-        """When it was so."""
+        """CLOCK_MONOTONIC time of the sample."""
 
 
 _Sample = TypeVar("_Sample", bound=TimedSample)
@@ -86,7 +86,7 @@ class GimbalState:
 
 @dataclass(frozen=True)
 class EkfSample:
-    """LOCAL_POSITION_NED with the EKF origin and flags of its time; times as in `Truth`."""
+    """LOCAL_POSITION_NED with EKF origin (None: not set) and flags; times as in `Truth`."""
 
     time_ns: int
     boot_s: float
@@ -97,7 +97,7 @@ class EkfSample:
 
     @property
     def location(self) -> Location | None:
-        """The location that the EKF reports."""
+        """The location that the EKF reports; None without an origin."""
         return self.origin.offset(*self.position_ned) if self.origin else None
 
 
@@ -114,7 +114,7 @@ class LeastLatencyClock:
         self._offsets.clear()
 
     def observe(self, boot_ms: int, received_ns: int) -> None:
-        """A message of boot time boot_ms was received."""
+        """Learn from a message of boot time boot_ms that arrived at received_ns."""
         self._offsets.append(received_ns - boot_ms * self._scale)
 
     def monotonic_ns(self, boot_ms: int) -> int:
@@ -142,7 +142,7 @@ class SampleTrack(Generic[_Sample]):
                 del self._times[: self._limit]
                 del self._samples[: self._limit]
 
-    def around(self, time_ns: int) -> tuple[_Sample, _Sample] | None:
+    def neighbours(self, time_ns: int) -> tuple[_Sample, _Sample] | None:
         """The samples before and after a time, for interpolation; None outside the track."""
         with self._lock:
             i = bisect.bisect_left(self._times, time_ns)
@@ -150,26 +150,26 @@ class SampleTrack(Generic[_Sample]):
                 return None
             return self._samples[max(i - 1, 0)], self._samples[i]
 
-    def all(self) -> list[_Sample]:
+    def samples(self) -> list[_Sample]:
         """A copy of the track."""
         with self._lock:
             return list(self._samples)
 
     @property
     def newest(self) -> _Sample | None:
-        """The last sample."""
+        """The last sample; None without samples."""
         with self._lock:
             return self._samples[-1] if self._samples else None
 
 
-def share(before_ns: int, after_ns: int, time_ns: int) -> float:
+def fraction(before_ns: int, after_ns: int, time_ns: int) -> float:
     """Position of a time between two others as a fraction, 0 to 1."""
     return (time_ns - before_ns) / (after_ns - before_ns) if after_ns > before_ns else 0.0
 
 
 def slerp(a: Array, b: Array, t: float) -> Array:
-    """Interpolate two close unit quaternions (20 ms apart): normalised linear interpolation; its
-    error is far below sensor noise.
+    """Interpolate between close unit quaternions a (t = 0) and b (t = 1), 20 ms apart: normalised
+    linear interpolation, whose error is far below sensor noise.
     """
     if float(a @ b) < 0:
         b = -b
@@ -177,9 +177,9 @@ def slerp(a: Array, b: Array, t: float) -> Array:
     return np.asarray(q / np.linalg.norm(q))
 
 
-def between(a: Truth, b: Truth, time_ns: int) -> Truth:
-    """The true state at a time from a's to b's, interpolated linearly."""
-    t = share(a.time_ns, b.time_ns, time_ns)
+def interpolate(a: Truth, b: Truth, time_ns: int) -> Truth:
+    """The true state at time_ns, interpolated linearly between a and b."""
+    t = fraction(a.time_ns, b.time_ns, time_ns)
     return Truth(
         time_ns,
         a.boot_s + t * (b.boot_s - a.boot_s),

@@ -17,8 +17,8 @@ from sitl.ground.tracks import (
     LeastLatencyClock,
     SampleTrack,
     Truth,
-    between,
-    share,
+    fraction,
+    interpolate,
     slerp,
 )
 
@@ -105,31 +105,31 @@ class VehicleRecord:
 
     def truth_at(self, time_ns: int) -> Truth | None:
         """The true state at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
-        pair = self._truth.around(time_ns)
+        pair = self._truth.neighbours(time_ns)
         if pair is None:
             return None
-        return between(*pair, time_ns)
+        return interpolate(*pair, time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalState | None:
         """The gimbal at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
-        pair = self._gimbal.around(time_ns)
+        pair = self._gimbal.neighbours(time_ns)
         if pair is None:
             return None
         a, b = pair
-        t = share(a.time_ns, b.time_ns, time_ns)
+        t = fraction(a.time_ns, b.time_ns, time_ns)
         return GimbalState(time_ns, slerp(a.quaternion, b.quaternion, t), b.flags)
 
     def newest_common_ns(self) -> int | None:
-        """The latest time at which both truth and gimbal are known."""
+        """The newest time at which both true state and gimbal are known; None without it."""
         truth, gimbal = self._truth.newest, self._gimbal.newest
         return min(truth.time_ns, gimbal.time_ns) if truth and gimbal else None
 
     def ekf_pairs(self) -> Iterator[tuple[EkfSample, Location]]:
         """Yield every reported EKF position with the true location at the same time."""
         # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
-        truth = self._truth.all()
+        truth = self._truth.samples()
         times = np.array([t.boot_s for t in truth])
-        for sample in self._ekf.all():
+        for sample in self._ekf.samples():
             i = int(np.searchsorted(times, sample.boot_s))
             if sample.location is None or not 0 < i < len(times):
                 continue
@@ -144,11 +144,11 @@ class VehicleRecord:
         """Reset the clock after a change of the speed of simulated time."""
         self._clock.restart(speedup)
 
-    def take(self, message: Any, received_ns: int) -> None:
+    def add(self, message: Any, received_ns: int) -> None:
         """Store a message received at a CLOCK_MONOTONIC time."""
         kind = message.get_type()
         if kind == "STATUSTEXT":
-            self._text_log.take(message, received_ns)
+            self._text_log.add(message, received_ns)
         if not from_autopilot(message):
             return
         self.latest[kind] = message

@@ -14,7 +14,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.synth.tiles.props import CAR_COLOURS, CAR_LENGTH_M, car_mesh
 from localizer.synth.world import WorldInfo
-from sitl.camera.movers import Mover, there_and_back
+from sitl.camera.movers import Mover, round_trip
 
 CAR = "followed car"
 SPEED_MPS = 6.0
@@ -56,14 +56,14 @@ class Chase:
 def make_chase(
     world: WorldInfo, frame: LocalFrame, epoch_ns: int, lead_s: float, seed: int = 0
 ) -> Chase:
-    """Choose the road nearest to home that is long enough; the car reaches it `lead_s` after
-    epoch_ns. frame: the map's ENU. ValueError if there is none.
+    """Choose the road nearest to home that is long enough. frame: the map's ENU. The car reaches
+    its begin_m lead_s after epoch_ns. Raises `ValueError` if no road is long enough.
     """
     needed = _ROOFS_AFTER_S[-1] * SPEED_MPS + 0.5 * _roof_length() + _AHEAD_M
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
     best: tuple[float, Array, float] | None = None
     for lane in world.roads:
-        path = there_and_back(lane, 0.0, _OTHER_LANE_M)
+        path = round_trip(lane, 0.0, _OTHER_LANE_M)
         path[:, 2] = world.ground_height(path[:, 0], path[:, 1])
         path = frame_from_world.apply(path)
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
@@ -97,7 +97,7 @@ def pursuit(car: Mover, time_ns: int, height_m: float, behind_m: float) -> Array
 
 
 def _roof_length() -> float:
-    """So long that the whole car is below it for the wanted time."""
+    """Length (m) at which the whole car is below the roof for the wanted time."""
     return _HIDDEN_S * SPEED_MPS + CAR_LENGTH_M
 
 

@@ -1,4 +1,4 @@
-"""Flies and judges car-following flights one after the other; results are kept as JSON."""
+"""Flies car-following flights one after the other and evaluates them; results are kept as JSON."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _fix(table: dict[str, np.ndarray], k: int) -> FollowedFix:
 
 
 def line_of(row: FollowRow) -> str:
-    """One-line result of a flight, failures first."""
+    """One-line result of a flight."""
     head = f"{row.vehicle}, world {row.seed}, draw {row.draw}: "
     if row.verdict is None:
         return head + f"not flown: {row.error}"

@@ -1,4 +1,4 @@
-"""Judges a target track: kept to the end, on the right car, and reacquired after each roof."""
+"""Evaluates a target track: kept to the end, on the right car, and reacquired after each roof."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ class FollowedFix:
 
 @dataclass(frozen=True)
 class FollowVerdict:
-    """Result of a target track. Errors: horizontal, of detected positions after settling. back_s:
-    time to reacquire after each roof; foreign: positions farther than 4 m from the car.
+    """Result of a target track. Errors: horizontal, of detected positions after settling. seen:
+    detected positions among `reports`. back_s: time to reacquire after each roof. foreign:
+    positions farther than 4 m from the car. inside_percent: within their 95 % ellipse. why: reasons
+    for a failure.
     """
 
     is_followed: bool
@@ -86,7 +88,7 @@ def follow_verdict(fixes: Sequence[FollowedFix], chase: Chase, end_ns: int) -> F
 
 
 def _velocities(fixes: Sequence[FollowedFix], chase: Chase, chosen: NDArray[np.bool_]) -> Array:
-    """Errors of the horizontal velocity, m/s."""
+    """Errors of the horizontal velocity (m/s) of the chosen positions that have one."""
     off = [
         np.linalg.norm((fix.velocity - chase.car.velocity_at(fix.time_ns))[:2])
         for fix, is_chosen in zip(fixes, chosen, strict=True)
@@ -100,7 +102,9 @@ def _nees(error: Array, covariance: Array) -> float:
 
 
 def _back_s(times: Array, end_s: float) -> float:
-    """How long after a roof's end it was first seen as itself."""
+    """Seconds from a roof's end to the first correct detection after it; infinite if there is none.
+    times: of correct detections.
+    """
     after = times[times >= end_s]
     return float(after.min() - end_s) if len(after) else float("inf")
 

@@ -34,7 +34,7 @@ _CAR_TOP_M = 0.75
 
 
 class _FrameLog:
-    """The world camera's log as it grows: when each picture was truly taken, and from where."""
+    """Reads the world camera's growing log: true exposure time and camera pose of each frame."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open(newline="", encoding="utf-8")
@@ -45,7 +45,7 @@ class _FrameLog:
         self._file.close()
 
     def newest(self) -> tuple[int, Pose]:
-        """(true exposure, camera's true pose) of the newest one."""
+        """(true exposure time ns, true camera pose) of the newest frame."""
         lines = (self._rest + self._file.read()).split("\n")
         self._rest = lines.pop()
         self._rows = [*self._rows, *csv.DictReader(lines, FRAME_COLUMNS)][-1:]
@@ -58,7 +58,9 @@ class _FrameLog:
 
 
 class Pursuer:
-    """A `FlightParticipant` that follows a car. camera: the true one; seed: car and click."""
+    """A `FlightParticipant`: steers the aircraft above a car, and clicks the car once. camera: the
+    true one; seed: of car and click.
+    """
 
     def __init__(self, assets: FlightAssets, camera: Camera, height_m: float, seed: int) -> None:
         self._assets, self._camera, self._height_m = assets, camera, height_m
@@ -77,9 +79,9 @@ class Pursuer:
         return self.chase.movers
 
     @contextmanager
-    def ride(self, cabin: ParticipantContext) -> Iterator[None]:
+    def take_part(self, context: ParticipantContext) -> Iterator[None]:
         """Context manager: follow the car and click it during the flight."""
-        thread = threading.Thread(target=self._run, args=(cabin,), name="pursuer")
+        thread = threading.Thread(target=self._run, args=(context,), name="pursuer")
         thread.start()
         try:
             yield
@@ -87,8 +89,8 @@ class Pursuer:
             self._stop.set()
             thread.join()
 
-    def _run(self, cabin: ParticipantContext) -> None:
-        station = Station(cabin.vehicle.spare_endpoint, cabin.vehicle.check)
+    def _run(self, context: ParticipantContext) -> None:
+        station = Station(context.vehicle.spare_endpoint, context.vehicle.check)
         chase = self.chase
         assert chase is not None
         begin_ns = chase.begins_ns()
@@ -96,30 +98,30 @@ class Pursuer:
         try:
             if time.monotonic_ns() > begin_ns:
                 raise RuntimeError("the car had gone by before the aircraft was ready")
-            with closing(_FrameLog(cabin.frames)) as pictures:
-                if self._fly_along(cabin, station, chase, begin_ns - _STEER_NS):
+            with closing(_FrameLog(context.frames)) as pictures:
+                if self._fly_along(context, station, chase, begin_ns - _STEER_NS):
                     return
                 pictures.newest()  # what there is so far is read before it counts
                 if station.run_until(self._stop.is_set, begin_ns):
                     return
                 self._click(station, chase, *pictures.newest())
-            self._fly_along(cabin, station, chase, self.end_ns)
+            self._fly_along(context, station, chase, self.end_ns)
         except Exception as error:  # told by the verdict: a dead pursuer is no passed flight
             self.failure = f"{type(error).__name__}: {error}"
         finally:
             station.close()
 
     def _fly_along(
-        self, cabin: ParticipantContext, station: Station, chase: Chase, until_ns: int
+        self, context: ParticipantContext, station: Station, chase: Chase, until_ns: int
     ) -> bool:
-        """Steer above the car until a time; True when the flight ended before it."""
+        """Steer above the car until until_ns; True if the flight ended before that time."""
         home_m = self._home_up_m()
         while time.monotonic_ns() < until_ns:
             ahead_ns = time.monotonic_ns() + _AHEAD_NS
             # Until the car comes, the aircraft waits where it will be met.
             place = pursuit(chase.car, max(ahead_ns, chase.begins_ns()), self._height_m, _BEHIND_M)
             latitude, longitude, _ = self._frame.geodetic_from_enu(place)
-            cabin.pilot.go_to(float(latitude), float(longitude), float(place[2]) - home_m)
+            context.pilot.go_to(float(latitude), float(longitude), float(place[2]) - home_m)
             if station.run_until(self._stop.is_set, min(time.monotonic_ns() + _STEER_NS, until_ns)):
                 return True
         return False
@@ -131,7 +133,7 @@ class Pursuer:
         return float(frame_from_world.apply(np.array([0.0, 0.0, ground]))[2])
 
     def _click(self, station: Station, chase: Chase, frame_ns: int, pose: Pose) -> None:
-        """A point on the car in the newest picture, once the operator has seen it."""
+        """Click on the car in the newest frame, after the operator's reaction time."""
         top: Array = chase.car.position_at(frame_ns) + np.array([0.0, 0.0, _CAR_TOP_M])
         pixel, inside = self._camera.project(pose.inverse.apply(top))
         size = np.array([self._camera.width, self._camera.height])

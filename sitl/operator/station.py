@@ -21,7 +21,7 @@ _TRIES = 4
 
 
 class Station:
-    """Sends and receives in the caller's thread."""
+    """A MAVLink client in the caller's thread. alive: as of `GroundLink`."""
 
     def __init__(self, endpoint: str, alive: Callable[[], None] = lambda: None) -> None:
         self._link = Connection(endpoint)
@@ -41,7 +41,7 @@ class Station:
                 return False
             if now_ns - self._beat_ns >= _HEARTBEAT_NS:
                 self._beat_ns = now_ns
-                self._link.beat()
+                self._link.send_heartbeat()
             for message in self._link.receive():
                 if message.get_srcComponent() == _CAMERA and message.get_type() == "COMMAND_ACK":
                     self._ack = message

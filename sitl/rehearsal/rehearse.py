@@ -37,11 +37,11 @@ class Rehearsal:
 
 
 def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Scenario) -> Rehearsal:
-    """Prepare a flight over the tile cache `cache`. live: the cache that the camera sees, by
-    default the same.
+    """Prepare a flight over the tile cache `cache`. live: the cache that the camera sees; None: the
+    same.
 
-    The scenario's weather, camera and errors are kept; its legs are replaced by the mission's, or
-    by a triangle about the map's middle.
+    The scenario's weather, camera and errors are kept. Its legs are replaced by the mission's, or
+    without a mission by a triangle about the map's centre.
     """
     opened = TileCache.open(cache)
     if live is not None:
@@ -92,7 +92,7 @@ def _require_covered(cache: TileCache, home: LocalFrame, scenario: Scenario) -> 
 
 
 def _home(cache: TileCache, planned: PlannedMission | None) -> Geodetic:
-    """On the map's surface: the mission's home, its first waypoint, or the map's middle."""
+    """Home on the surface: the mission's home, its first waypoint, or the map's centre."""
     if planned is not None:
         first = planned.path[0]
         latitude, longitude = planned.home or (first.latitude_deg, first.longitude_deg)
@@ -109,7 +109,7 @@ def _bounds(cache: TileCache) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _surface_m(cache: TileCache, east: float, north: float) -> float:
-    """Height (ENU) of the highest surface at a place; ScenarioError where the map has none."""
+    """ENU height of the highest surface at a position; `ScenarioError` where the map has none."""
     top = float(_bounds(cache)[1][2]) + 1.0
     down = np.array([[0.0, 0.0, -1.0]])
     distance = float(MapSurface(cache).cast(np.array([east, north, top]), down).distances[0])
@@ -123,7 +123,7 @@ def _surface_m(cache: TileCache, east: float, north: float) -> float:
 
 
 def _world(cache: TileCache, home: Geodetic) -> WorldInfo:
-    """The map as far as a flight needs a world: a flat place about home, without known roads."""
+    """World data for a flight over the map: flat ground at home's height, without roads."""
     low, high = _bounds(cache)
     size = float(2 * np.abs([low[:2], high[:2]]).max())
     none = River(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
@@ -152,7 +152,7 @@ def _triangle(cache: TileCache) -> dict[str, object]:
 
 
 def _glides(place: MissionPlace, legs: Sequence[dict[str, float]]) -> bool:
-    """An aeroplane's way down to its landing: the rehearsal's vehicle flies there level."""
+    """Whether a place is on a descent to land; the simulated vehicle flies it level."""
     return bool(legs) and 0.0 <= place.height_m < _LOWEST_M
 
 

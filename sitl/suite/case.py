@@ -48,11 +48,13 @@ class VehicleSpec(StrictModel):
 
     @property
     def px4(self) -> bool:
-        """Whether the vehicle speaks PX4's dialect."""
+        """Whether the vehicle behaves as PX4 (modes, parameters, messages), not as ArduPilot."""
         return self.sources.startswith("px4")
 
     def all_parameters(self) -> dict[str, float]:
-        """Everything that is set over the firmware's defaults."""
+        """Values of all parameters that differ from the firmware's defaults: the named set, the
+        speeds, and `parameters`, which win.
+        """
         named = {
             "vision": vision_only_parameters,
             "gnss_then_vision": vision_parameters,
@@ -84,8 +86,9 @@ class Flight(StrictModel):
 class CaseEvent(Ramp):
     """A fault or command, at_s seconds after the take-off height is reached.
 
-    fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
-    vehicle: parameters set by the ground station. source_set: ordered by the ground station.
+    fixes: fields of `Case.fixes` that change. reset: the next fix increments the reset counter, as
+    after an announced jump. vehicle: parameters that the ground station sets. source_set: EKF
+    source set that the ground station orders; None: no order. reboot: the autopilot reboots.
     """
 
     at_s: float = Field(ge=0)
@@ -103,8 +106,8 @@ class CaseEvent(Ramp):
 
 
 class GroundSetup(StrictModel):
-    """Steps before take-off. doctor: `companion doctor --fix` corrects wrong parameters; reboot:
-    the autopilot reboots during injection.
+    """Steps before take-off. doctor: run `companion doctor --fix`, which corrects wrong parameters.
+    reboot: reboot the autopilot after injection has begun.
     """
 
     doctor: bool = False
@@ -112,10 +115,10 @@ class GroundSetup(StrictModel):
 
 
 class Case(StrictModel):
-    """One scenario. bridge: its configuration without the connection; integrity_monitor: checks the
-    fixes.
+    """One scenario. bridge: the bridge's configuration without `connection`. integrity_monitor: the
+    monitor that checks the fixes before the bridge gets them.
 
-    ci: among the few that every test run flies on the embedded vehicle.
+    ci: whether every test run flies it on the embedded vehicle.
     """
 
     name: str
@@ -132,7 +135,7 @@ class Case(StrictModel):
 
     @property
     def is_honest(self) -> bool:
-        """Whether the monitor runs and no fault is injected, so that each alert is a false one."""
+        """Whether the monitor runs without an injected fault: each of its alerts is false."""
         f = self.fixes
         wrong = f.rotation_deg or f.yaw_error_deg or f.offset_north_m or f.silent or f.frozen
         watched = self.integrity_monitor.enabled and not self.flight.ground

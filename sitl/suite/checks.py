@@ -20,7 +20,7 @@ FOREVER = math.inf
 
 @dataclass(frozen=True)
 class ExpectationResult:
-    """Result of one expectation. better: the error is below the reference's range."""
+    """Result of an expectation. what: the measured value; better: below the reference range."""
 
     ok: bool
     what: str
@@ -31,8 +31,8 @@ class _Expectation(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @abstractmethod
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """Hold the record against the expectation."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """Compare the flight's record with the expectation."""
 
 
 class _Span(_Expectation):
@@ -41,9 +41,11 @@ class _Span(_Expectation):
 
 
 class AccuracyExpectation(_Span):
-    """The median of the horizontal EKF error is the reference's within per cent.
+    """The median of the horizontal EKF error exceeds the reference `median` (m) by at most
+    within_percent.
 
-    Below the band it counts as reproduced only in the sense of "no worse", and is marked.
+    An error that is smaller by more than within_percent passes and is marked `better`. p95 and max:
+    reference values (m), shown in the report only.
     """
 
     check: Literal["reference"]
@@ -52,8 +54,8 @@ class AccuracyExpectation(_Span):
     max: float | None = None
     within_percent: float = Field(25.0, gt=0)
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if len(errors) < 100:
             return ExpectationResult(False, f"only {len(errors)} EKF positions")
@@ -69,8 +71,8 @@ class MedianExpectation(_Span):
     check: Literal["median_below"]
     metres: float
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
             return ExpectationResult(False, "no EKF positions")
@@ -85,8 +87,8 @@ class MaxErrorExpectation(_Span):
     at_least: float = 0.0
     at_most: float = FOREVER
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
             return ExpectationResult(False, "no EKF positions")
@@ -107,8 +109,8 @@ class JumpExpectation(_Expectation):
     tolerance_m: float = 1.0
     overshoot_m: float = 2.0
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         begin = self.at_s + self.settled_s
         there = record.north(begin, begin + 2.0)
         whole = record.north(self.at_s, begin + 2.0)
@@ -132,8 +134,8 @@ class RefusedJumpExpectation(_Expectation):
     after_s: float
     before_s: float
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         taken = [
             t - self.at_s
             for t, north, _ in record.errors
@@ -149,14 +151,14 @@ class RefusedJumpExpectation(_Expectation):
 
 
 class TextExpectation(_Span):
-    """A status text of the vehicle came (or, with absent, did not) within the span."""
+    """The vehicle sent a STATUSTEXT with `contains` in the span (with `absent`: sent none)."""
 
     check: Literal["text"]
     contains: str
     absent: bool = False
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         times = [
             t.at_s
             for t in record.texts
@@ -169,8 +171,8 @@ class TextExpectation(_Span):
 
 
 class AlertExpectation(_Span):
-    """An alert of our bridge came (or, with absent, did not) within the span. values: it must show
-    these.
+    """The bridge raised this alert in the span (with `absent`: did not). values: the alert's text
+    must show these.
     """
 
     check: Literal["alert"] = "alert"
@@ -178,12 +180,12 @@ class AlertExpectation(_Span):
     values: dict[str, str] = {}
     absent: bool = False
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
-        return self.judge_texts(record.texts)
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
+        return self.evaluate_texts(record.texts)
 
-    def judge_texts(self, texts: Iterable[Text]) -> ExpectationResult:
-        """As `judge`, of a record's texts."""
+    def evaluate_texts(self, texts: Iterable[Text]) -> ExpectationResult:
+        """Compare the texts of a flight with the expectation."""
         times = [
             t.at_s for t in texts
             if t.alert is self.alert
@@ -195,14 +197,16 @@ class AlertExpectation(_Span):
 
 
 class ErrorAlertExpectation(_Span):
-    """The bridge holds output at most within_s after the EKF error exceeds a limit."""
+    """The bridge raises an alert that holds output at most within_s after the horizontal EKF error
+    first exceeds limit_m. A flight whose error stays below limit_m passes.
+    """
 
     check: Literal["alerted"]
     limit_m: float = Field(gt=0)
     within_s: float = Field(ge=0)
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         beyond = [
             t
             for t, north, east in record.errors
@@ -221,13 +225,13 @@ class ErrorAlertExpectation(_Span):
 
 
 class NoWarningExpectation(_Span):
-    """No status text of the vehicle contains any of the words."""
+    """No STATUSTEXT of the vehicle within the span contains any of the words."""
 
     check: Literal["no_warning"]
     words: tuple[str, ...] = ("EKF variance", "Failsafe", "rror", "ailed", "litch", "nhealthy")
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         heard = [
             t.text
             for t in record.texts
@@ -239,14 +243,14 @@ class NoWarningExpectation(_Span):
 
 
 class ModeExpectation(_Expectation):
-    """The flight mode at a time; at_s None: at the end."""
+    """The vehicle is in flight mode `mode` at at_s; None: at the end of the flight."""
 
     check: Literal["mode"]
     mode: str
     at_s: float | None = None
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         sample = record.at(FOREVER if self.at_s is None else self.at_s)
         mode = sample.mode if sample else "none"
         when = "at the end" if self.at_s is None else f"at {self.at_s:g} s"
@@ -254,13 +258,13 @@ class ModeExpectation(_Expectation):
 
 
 class MovementExpectation(_Span):
-    """The vehicle truly moved at most this far from where it was at from_s."""
+    """In the span, the true position stays within at_most (m) of its place at from_s."""
 
     check: Literal["moved"]
     at_most: float
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
             return ExpectationResult(False, "no samples")
@@ -272,16 +276,16 @@ class MovementExpectation(_Span):
 class InjectionExpectation(_Span):
     """Number of messages that the bridge injected within the span.
 
-    at_least is for a vehicle in real time: one whose clock ran slow gave fewer fixes, and owes as
-    many messages less.
+    at_least is reduced in proportion if the vehicle's clock ran slower than real time, because
+    fewer fixes were due.
     """
 
     check: Literal["injected"]
     at_least: int = 0
     at_most: float = FOREVER
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
             return ExpectationResult(False, "no samples")
@@ -298,15 +302,15 @@ class InjectionExpectation(_Span):
 
 
 class SourceSetExpectation(_Expectation):
-    """The EKF source set that the bridge considers active, from from_s, reached at by_s."""
+    """The bridge first considers EKF source set `number` active between from_s and by_s."""
 
     check: Literal["source_set"]
     number: int
     from_s: float
     by_s: float
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         reached = [
             s.at_s for s in record.samples if s.at_s >= self.from_s and s.source_set == self.number
         ]
@@ -317,13 +321,13 @@ class SourceSetExpectation(_Expectation):
 
 
 class ArmingRefusedExpectation(_Expectation):
-    """On the ground: arming is refused, with one of these texts."""
+    """On the ground: the vehicle refuses to arm, and its texts contain one of any_of."""
 
     check: Literal["arming_refused"]
     any_of: tuple[str, ...]
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         if record.refusals is None:
             return ExpectationResult(False, "arming was accepted")
         told = "; ".join(record.refusals) or "without a text"
@@ -336,8 +340,8 @@ class DoctorExpectation(_Expectation):
     check: Literal["doctor"]
     finds: tuple[str, ...]
 
-    def judge(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.judge`."""
+    def evaluate(self, record: CaseRecord) -> ExpectationResult:
+        """See `_Expectation.evaluate`."""
         d = record.doctor
         if d is None:
             return ExpectationResult(False, "the doctor was not asked")

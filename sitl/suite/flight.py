@@ -36,7 +36,9 @@ _ARMING_TRIES = 3
 
 
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
-    """Fly a scenario on a vehicle. `SimulationError` if it could not be flown."""
+    """Fly a scenario on a vehicle and return its record. seed: of the simulated errors. Raises
+    `SimulationError` if the scenario could not be flown.
+    """
     with ExitStack() as stack:
         setup = VehicleSetup(
             parameters=case.vehicle.all_parameters(), seed=seed, px4=case.vehicle.px4
@@ -136,7 +138,9 @@ class _CaseFlight:
         self._stack.callback(self._feed.close)
 
     def _guarded(self, bridge: Bridge, config: BridgeConfig) -> FixSink:
-        """The bridge behind the monitor, as in the companion; there are no pictures here."""
+        """Where fixes go: the bridge, or the integrity monitor before the bridge if the scenario
+        enables the monitor. The monitor gets no video frames here.
+        """
         if not self._case.integrity_monitor.enabled:
             return bridge
         injection = config.injection
@@ -235,7 +239,7 @@ class _CaseFlight:
             self._pilot.go_to(where.latitude_deg, where.longitude_deg, height)
 
     def _refusals(self) -> list[str] | None:
-        """Try to arm on the ground; the texts of the refusal, None where it is accepted."""
+        """Try to arm on the ground. Returns the texts of the refusal; None if the vehicle armed."""
         pilot = self._pilot
         pilot.set_mode("GUIDED")
         since = time.monotonic_ns()
@@ -249,7 +253,7 @@ class _CaseFlight:
     # --- after -----------------------------------------------------------------------------------
 
     def _collect(self, pilot: Pilot) -> None:
-        """Errors and texts of a pilot: there is a new one after every reboot."""
+        """Add a pilot's EKF errors and texts to the record; each reboot makes a new pilot."""
         record = self._record
         record.texts += [
             Text(
@@ -267,9 +271,10 @@ class _CaseFlight:
 
 
 def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:
-    """Lowest ratio of simulated to real time over any span_s; ticks: (due, vehicle's) s.
+    """Lowest ratio of simulated to real time over any span_s seconds.
 
-    A vehicle's clock that runs back was rebooted, and is left out.
+    ticks: (real time s, vehicle's time s) in order. Spans over a reboot, where the vehicle's time
+    runs back, are skipped.
     """
     paces, first = [1.0], 0
     for due, own in ticks:
@@ -282,7 +287,9 @@ def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> 
 
 
 def longest_stall(ticks: Sequence[tuple[float, float]], span_s: float = 1.0) -> float:
-    """The largest delay (s) of simulated time within any span_s; ticks as for `slowest_pace`."""
+    """Largest time (s) that the simulated vehicle lost against real time within any span_s seconds.
+    ticks: as for `slowest_pace`.
+    """
     worst, first = 0.0, 0
     for due, own in ticks:
         while due - ticks[first][0] > span_s:

@@ -13,8 +13,9 @@ _STEP_S = 0.4
 
 
 class Ramp(StrictModel):
-    """Base of a scenario's events. ramp: parameters that go from one value to another in over_s;
-    scattered: drawn at each step, up to the value that is due, of either sign.
+    """Base of a scenario's events. ramp: parameters that go linearly from one value to another in
+    over_s. scattered: parameters of the ramp that are drawn at each step, uniform within plus or
+    minus the value that is due.
     """
 
     ramp: dict[str, tuple[float, float]] = Field(default_factory=dict)
@@ -37,14 +38,14 @@ class Ramp(StrictModel):
 
 
 class RunningRamp:
-    """The ramp that runs, one at a time. seed: of scattered values."""
+    """The running ramp; a new one replaces it. seed: of the scattered values."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         self._ramp, self._begun_s, self._due_s = Ramp(), 0.0, math.inf
 
     def begin(self, event: Ramp, now_s: float) -> None:
-        """Begin the event's ramp, if it has one."""
+        """Begin the event's ramp; an event without a ramp changes nothing."""
         if event.ramp:
             self._ramp, self._begun_s, self._due_s = event, now_s, now_s
 

@@ -57,7 +57,7 @@ class VehicleSample:
 
 @dataclass(frozen=True)
 class Doctor:
-    """What `companion doctor` found wrong before and after `--fix`, and its exit codes."""
+    """Wrong parameters before (`found`) and after (`left`) ``doctor --fix``, and exit codes."""
 
     found: tuple[str, ...]
     left: tuple[str, ...]
@@ -71,9 +71,9 @@ class CaseRecord:
     the truth of its time.
 
     refusals: texts of the last refused arming; None if arming was not tried or accepted. pace:
-    lowest ratio of simulated to intended seconds over ten seconds; below 1 the machine was too
-    slow, and the autopilot's clock ran slow against the bridge's. stall_s: largest delay of the
-    vehicle within one second.
+    lowest ratio of simulated to real time over ten seconds. Below 1 the computer was too slow, and
+    the autopilot's clock ran slow against the bridge's. stall_s: largest delay of the vehicle
+    within one second.
     """
 
     errors: list[tuple[float, float, float]] = field(default_factory=list)
@@ -87,7 +87,7 @@ class CaseRecord:
     stall_s: float = 0.0
 
     @property
-    def starved(self) -> str:
+    def pace_text(self) -> str:
         """How far simulated time fell behind real time, as text."""
         return f"{self.pace:.2f} of real time over 10 s, {self.stall_s:.2f} s lost within a second"
 
@@ -100,6 +100,6 @@ class CaseRecord:
         return np.array([n for t, n, _ in self.errors if from_s <= t <= to_s])
 
     def at(self, seconds: float) -> VehicleSample | None:
-        """The first sample at or after a time, otherwise the last one."""
+        """The first sample at or after a time, otherwise the last one; None without samples."""
         later = [s for s in self.samples if s.at_s >= seconds]
         return later[0] if later else (self.samples[-1] if self.samples else None)

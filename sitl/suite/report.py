@@ -38,7 +38,7 @@ def summary(rows: Iterable[ReportRow]) -> str:
     verdicts = [row.verdict for row in rows]
     counts = (f"{verdicts.count(v)} {v}" for v in _COLOURS if v in verdicts)
     honest = [row for row in rows if row.case.is_honest and row.record is not None]
-    spoke = sum(bool(row.guardian_lines) for row in honest)
+    spoke = sum(bool(row.monitor_alerts) for row in honest)
     return (
         f"{len(verdicts)} flights: {', '.join(counts)}; the monitor raised alerts in {spoke} of "
         f"{len(honest)} with honest fixes"
@@ -97,7 +97,7 @@ def _broken(row: ReportRow) -> list[str]:
 def _pace(row: ReportRow) -> list[str]:
     if row.record is None or not row.slow:
         return []
-    return [f"machine too slow: {row.record.starved}"]
+    return [f"machine too slow: {row.record.pace_text}"]
 
 
 def _as_data(row: ReportRow) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def _as_data(row: ReportRow) -> dict[str, Any]:
         "vehicle": row.vehicle,
         "verdict": row.verdict,
         "honest": row.case.is_honest,
-        "guardian": row.guardian_lines,
+        "guardian": row.monitor_alerts,
         "error": row.error,
         "measured": row.measured,
         "findings": [asdict(f) for f in row.findings],

@@ -62,7 +62,7 @@ class ReportRow:
         return r is not None and (r.pace < PACE_LIMIT or r.stall_s > STALL_LIMIT_S)
 
     @property
-    def guardian_lines(self) -> tuple[str, ...]:
+    def monitor_alerts(self) -> tuple[str, ...]:
         """Alerts of the integrity monitor with their times, without the bridge's own."""
         texts = self.record.texts if self.record is not None else []
         its = [t for t in texts if t.alert in _MONITORED]
@@ -70,12 +70,12 @@ class ReportRow:
 
     @property
     def reference(self) -> AccuracyExpectation | None:
-        """The measured ArduPilot figures to compare with, if any."""
+        """The expectation with ArduPilot's measured figures; None if the scenario has none."""
         return next((e for e in self.case.expect if isinstance(e, AccuracyExpectation)), None)
 
     @property
     def measured(self) -> Figures | None:
-        """Median, p95 and maximum of the horizontal EKF error over the reference's span."""
+        """Median, p95 and maximum of the EKF error over the reference's span; None: not flown."""
         if self.record is None:
             return None
         span = self.reference or AccuracyExpectation(check="reference", median=1.0)
@@ -90,20 +90,20 @@ def figures(errors: Array) -> Figures | None:
     return median, p95, largest
 
 
-def judge(case: Case, record: CaseRecord) -> tuple[ExpectationResult, ...]:
+def evaluate(case: Case, record: CaseRecord) -> tuple[ExpectationResult, ...]:
     """Check every expectation of the scenario against the record."""
-    return tuple(expectation.judge(record) for expectation in case.expect)
+    return tuple(expectation.evaluate(record) for expectation in case.expect)
 
 
 def run_case(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
-    """Fly and judge one scenario; an error becomes the row's error."""
+    """Fly and evaluate one scenario; an error becomes the row's error."""
     start = time.monotonic()
     try:
         record = fly(case, kind, seed)
     except (SimulationError, OSError) as error:
         text = f"{type(error).__name__}: {error}"
         return ReportRow(case, kind, None, (), text, time.monotonic() - start)
-    return ReportRow(case, kind, record, judge(case, record), "", time.monotonic() - start)
+    return ReportRow(case, kind, record, evaluate(case, record), "", time.monotonic() - start)
 
 
 def run_suite(
@@ -113,9 +113,10 @@ def run_suite(
     seed: int = 1,
     landed: Callable[[ReportRow], None] = lambda _row: None,
 ) -> list[ReportRow]:
-    """Fly all scenarios on all vehicles, `jobs` at a time; rows in the order of the cases.
+    """Fly all scenarios on all vehicles, `jobs` at a time (None: `default_jobs`); rows in the order
+    of the cases.
 
-    landed: called with every row as it comes.
+    landed: called with each row when its flight has ended.
     """
     kinds = list(kinds)
     wanted = [(case, kind) for kind in kinds for case in cases]
@@ -151,7 +152,7 @@ def _end_on_sigterm() -> None:
 
 
 def _fly_in_worker(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
-    """`run_case`; one that is interrupted ends its process, which would else take the next case."""
+    """`run_case`. An interruption ends the worker, which would else get the next case."""
     try:
         return run_case(case, kind, seed)
     except (KeyboardInterrupt, SystemExit):

@@ -30,11 +30,12 @@ Vector = tuple[float, float, float]
 class FixModel(BaseModel):
     """Rate, noise, latency and faults of simulated fixes.
 
-    velocity_sigma_mps: None if no velocity is measured. rotation_deg rotates the whole vision frame
-    (positions and yaw) about turns_about_m (north, east of home); yaw_error_deg rotates the yaw
-    alone. frozen: the true position at its start is sent again with new timestamps, as of a frozen
-    frame, with a fifth of `sigma_m`, because the error of such a frame is constant. odometry_scale:
-    odometry continues the position with this relative scale error.
+    velocity_sigma_mps: None: fixes have no velocity. rotation_deg rotates the whole vision frame
+    (positions and yaw) about turns_about_m (north, east of home). yaw_error_deg rotates the yaw
+    alone. silent: no fix is sent. frozen: the true position at its start is sent again and again
+    with new timestamps, as from a frozen frame; its noise is a fifth of `sigma_m`, because the
+    error of one frame is constant. odometry_scale: relative scale error of the way since odometry
+    began; None: no odometry.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -77,7 +78,7 @@ class Observer:
         return (model.latency_ms + drawn) * 1e-3
 
     def observe(self, truth: Truth, origin: Location, model: FixModel) -> Observation:
-        """A noisy pose of `truth` about `origin`, with the errors of `model`."""
+        """A noisy pose of `truth` with the errors of `model`, NED metres from `origin`."""
         draw = self._rng.standard_normal(9)
         position = np.array(origin.ned_of(truth.location)) + model.sigma_m * draw[0:3]
         position[0] += model.offset_north_m
@@ -95,10 +96,10 @@ class Observer:
 
 
 class FixSink(Protocol):
-    """Receives fixes: the bridge, or the monitor in front of it."""
+    """Receives fixes: the bridge, or the integrity monitor before the bridge."""
 
     def submit(self, fix: VisionFix) -> None:
-        """One fix; never blocks."""
+        """Take one fix for injection. Never blocks."""
         ...
 
 

@@ -50,7 +50,7 @@ _CHECK_ALL_BUT_VISION = ((1 << 20) - 2) & ~(1 << 18)
 
 
 def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
-    """Parameters: start on GNSS (source set 1), switch to vision messages (set 2)."""
+    """Parameters: start on GNSS (source set 1); source set 2 uses vision messages."""
     return {
         "VISO_TYPE": 1,
         "VISO_POS_M_NSE": sigma_m,
@@ -63,7 +63,7 @@ def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[
 
 
 def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
-    """Parameters without a GNSS receiver; the EKF origin must be sent."""
+    """Parameters of a vehicle without a GNSS receiver; its EKF origin must be sent."""
     return {
         "GPS1_TYPE": 0,
         "VISO_TYPE": 1,
@@ -74,7 +74,7 @@ def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> 
 
 
 def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
-    """Parameters: simulated receiver first; GPS_INPUT with gps_id 1 takes over when it fails."""
+    """Parameters: a simulated receiver, which GPS_INPUT (gps_id 1) replaces if it fails."""
     return {
         "GPS2_TYPE": 14,
         "GPS2_DELAY_MS": delay_ms,
@@ -89,7 +89,7 @@ def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
 
 
 def gps_input_only_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
-    """Parameters: GPS_INPUT with gps_id 0 is the only receiver, without velocity."""
+    """Parameters of a vehicle whose only receiver is GPS_INPUT (gps_id 0), without velocity."""
     return {
         "GPS1_TYPE": 14,
         "GPS1_DELAY_MS": delay_ms,
@@ -166,7 +166,7 @@ def open_vehicle(
 ) -> VehicleProcess:
     """Create a vehicle that is not started yet; "auto" is ArduPilot if its binary is found.
 
-    home: altitude AMSL.
+    home: altitude AMSL. setup: None: the defaults.
     """
     s = setup or VehicleSetup()
     if s.px4 and kind == "ardupilot":

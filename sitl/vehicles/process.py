@@ -66,7 +66,7 @@ class VehicleProcess(ABC):
 
     @abstractmethod
     def command(self, instance: int) -> list[str]:
-        """Command line of an instance; its folder contains the file `PARAMETERS`."""
+        """Command line that starts an instance in its folder, which holds `PARAMETERS`."""
 
     # --- where it listens --------------------------------------------------------------------
 
@@ -99,7 +99,7 @@ class VehicleProcess(ABC):
 
     @property
     def processes(self) -> tuple[subprocess.Popen[bytes], ...]:
-        """The vehicle's process, and the one that ends it if this process dies."""
+        """The vehicle's process, and the shell that ends the vehicle if this process dies."""
         return tuple(p for p in (self._process, self._lifeline) if p is not None)
 
     @property
@@ -110,7 +110,7 @@ class VehicleProcess(ABC):
         return self.log_tail(_WHOLE_LOG).count(marker)
 
     def start(self) -> None:
-        """Start on free ports and wait until it listens; VehicleProcessError when it does not."""
+        """Start on free ports and wait until it listens; `VehicleProcessError` if it does not."""
         try:
             with _signals_wait():
                 self._folder = Path(tempfile.mkdtemp(prefix=f"{self.kind}-"))
@@ -124,7 +124,7 @@ class VehicleProcess(ABC):
             raise
 
     def _start_on_free_ports(self) -> str:
-        """Why it does not listen, "" when it does."""
+        """Start it; returns why it does not listen, "" if it listens."""
         # Instances are tried from a place of this process's own, so that vehicles that start at
         # the same time do not reach for the same ports.
         first, fault = os.getpid() * 7 % len(_INSTANCES), "no ports are free"
@@ -168,7 +168,7 @@ class VehicleProcess(ABC):
             self._lifeline = _end_with_us(self._process.pid)
 
     def _wait_listening(self) -> str:
-        """Why it does not listen, "" when it does."""
+        """Wait until it listens; returns why it does not, "" if it listens."""
         deadline = time.monotonic() + self.start_timeout_s
         while time.monotonic() < deadline and self.alive:
             if self.boots > 0:

@@ -23,7 +23,7 @@ from companion.writing import refuse_input
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
     from localizer.map.fetch.catalogue import CatalogueSource
-    from localizer.map.fetch.polite import HttpClient
+    from localizer.map.fetch.http_client import HttpClient
     from localizer.map.fetch.raster import FetchPlan
     from localizer.map.footprints.footprint import Footprints
 
@@ -183,7 +183,7 @@ def _print_source(console: Console, source: CatalogueSource) -> None:
 
 def _area(rectangle: str | None, circle: str | None, mission: Path | None, margin: float) -> Area:
     from companion.planning.mission import read_mission
-    from localizer.map.fetch.area import Area, around
+    from localizer.map.fetch.area import Area, area_around
 
     if sum(given is not None for given in (rectangle, circle, mission)) != 1:
         raise ConfigError("give one of --rectangle, --circle and --mission")
@@ -191,7 +191,7 @@ def _area(rectangle: str | None, circle: str | None, mission: Path | None, margi
         return Area(*_numbers("--rectangle", rectangle, 4))
     if circle is not None:
         latitude, longitude, radius = _numbers("--circle", circle, 3)
-        return around(np.array([[latitude, longitude]]), radius)
+        return area_around(np.array([[latitude, longitude]]), radius)
     assert mission is not None
     planned = read_mission(mission)
     places = [(p.latitude_deg, p.longitude_deg) for p in planned.path]
@@ -203,7 +203,7 @@ def _area(rectangle: str | None, circle: str | None, mission: Path | None, margi
                 soft_wrap=True,
             )
     circles = [abs(p.circle.radius_m) for p in planned.path if p.circle is not None]
-    return around(np.array(places), margin + max(circles, default=0.0))
+    return area_around(np.array(places), margin + max(circles, default=0.0))
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -220,7 +220,7 @@ def _planned(
     source: CatalogueSource, area: Area, resolution: float, most_mb: float, work: Path, role: str
 ) -> _Part:
     from localizer.map.fetch.fetch import make_plan
-    from localizer.map.fetch.polite import HttpClient, RequestLimits
+    from localizer.map.fetch.http_client import HttpClient, RequestLimits
 
     client = HttpClient(RequestLimits(source.rate_per_s, round(most_mb * _MB)))
     wanted = source.resolution_m if source.has_heights else max(source.resolution_m, resolution)

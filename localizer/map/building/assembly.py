@@ -19,7 +19,7 @@ from localizer.map.source import SourceNode, SourceTree
 
 @dataclass(eq=False)
 class _Node:
-    """A node with its stored tiles, on the way to the index."""
+    """A node of the tree with the records of its tiles."""
 
     source: SourceNode
     keys: list[int]
@@ -61,7 +61,7 @@ def _graft(root: SourceNode, records: dict[int, TileRecord]) -> _Node:
 
 
 def _covers(node: _Node) -> bool:
-    """Whether the node, or what is below it, shows everything it should."""
+    """Whether the node, or its children instead of it, were imported completely."""
     if node.failed:
         return bool(node.children) and all(_covers(c) for c in node.children)
     return True
@@ -69,8 +69,8 @@ def _covers(node: _Node) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """A cache before publishing. manifest: as far as the tiles determine it; leaves: the finest
-    tiles; volumes: ECEF corners (8, 3) that the source states for nodes, with their tiles.
+    """A cache before publishing. manifest: with the fields that the tiles determine; leaves: the
+    finest tiles; volumes: ECEF corners (8, 3) that the source states for nodes, with their tiles.
     """
 
     index: TileIndex

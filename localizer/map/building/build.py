@@ -15,10 +15,10 @@ from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.assembly import assemble
 from localizer.map.building.content import require_in_volumes, require_upright
 from localizer.map.building.heights import extent_warnings, heights_of
-from localizer.map.building.isolation import call_apart
+from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
 from localizer.map.building.sources import SourceOptions, find_source, read_source
-from localizer.map.building.staging import TileRecord, complete, publish, staging
+from localizer.map.building.staging import TileRecord, publish, staging, write_index
 from localizer.map.building.workers import ImportJob, ImportWorkers, Progress, import_all, tiles_of
 from localizer.map.cache.cache import Manifest
 from localizer.map.importers.georeference import Georeference
@@ -52,7 +52,7 @@ def build_cache(
     named = name or " ".join(map(str, sources))
     if options.is_apart:
         what = f"{named}: its reading"
-        flat = call_apart(
+        flat = call_in_process(
             _read_flat, sources, georeference, reading, rules=options.rules, what=what
         )
         tree = flat.tree()
@@ -125,7 +125,7 @@ def build_tree(
                 "warnings": (*tree.warnings, *doubts),
             }
         )
-        cache = complete(staged, built.index, manifest)
+        cache = write_index(staged, built.index, manifest)
         kind = measure_kind(
             cache,
             heights=options.heights,

@@ -14,7 +14,7 @@ from localizer.map.source import SourceMesh
 _PADDING = 2  # texels around a packed chart
 
 
-def cropped(mesh: SourceMesh, left: float, top: float, size: float) -> SourceMesh | None:
+def crop_square(mesh: SourceMesh, left: float, top: float, size: float) -> SourceMesh | None:
     """The triangles with centroids in a square (x, y; metres) and their part of the texture; None
     without any. left, top: western and northern edge, m; size: side, m.
     """

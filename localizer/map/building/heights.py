@@ -55,7 +55,7 @@ def _datum(
         )
     if tree.vertical_crs and given is not None and given != stated:
         text = f"{source}: its heights are {stated} by its CRS ({tree.vertical_crs}), not {given}"
-        warnings.append(rules.doubt("datum", text))
+        warnings.append(rules.accept("datum", text))
     datum = given or stated
     assert datum is not None
     return datum
@@ -77,7 +77,7 @@ def _separation(
         raise GeoreferenceError(f"a geoid separation of {told} m does not occur on Earth")
     if not abs(told - computed) <= GEOID_TOLERANCE_M:
         warnings.append(
-            rules.doubt(
+            rules.accept(
                 "geoid",
                 f"{source}: the {whose} geoid separation is {told:.2f} m, EGM96's at {lat:.4f}, "
                 f"{lon:.4f} is {computed:.2f} m",
@@ -93,12 +93,15 @@ def extent_warnings(
     source: str,
     rules: ImportRules,
 ) -> list[str]:
-    """Warnings about a map's extent (latitude, longitude) and ellipsoidal heights."""
+    """Warnings about a map's extent, (latitude, longitude) in degrees, and its lowest and highest
+    ellipsoidal height. separation_m: geoid above the ellipsoid at the map. source: begins the text.
+    Impossible heights raise `MapSourceError` unless `rules` accept them.
+    """
     warnings = []
     low, high = (height - separation_m for height in height_range_m)
     if low < LOWEST_M or high > HIGHEST_M:
         text = f"{source}: heights from {low:.0f} to {high:.0f} m AMSL occur nowhere on Earth"
-        warnings.append(rules.doubt("heights", text))
+        warnings.append(rules.accept("heights", text))
     geoid = [geoid_separation(lat, lon) for lat, lon in extent]
     if max(geoid) - min(geoid) > _GEOID_SLOPE_M:
         warnings.append(

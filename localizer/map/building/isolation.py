@@ -22,7 +22,7 @@ _PAGE = resource.getpagesize()
 _NO_DRIVERS = "HTTP,WMS,WCS,WMTS,WFS,OAPIF,OGCAPI,DAAS,EEDAI,PLMOSAIC,STACTA,STACIT,NGW,PLSCENES"
 
 
-def call_apart(
+def call_in_process(
     function: Callable[..., _Result], *args: object, rules: ImportRules, what: str
 ) -> _Result:
     """Call a function in its own process; returns its result or raises its exception.
@@ -97,7 +97,7 @@ def out_of_memory(rules: ImportRules) -> str:
 
 
 def _end_with_parent() -> None:
-    """End a worker whose parent was killed; otherwise it would wait for tasks forever."""
+    """End this worker when its parent is killed; otherwise it would wait for tasks forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         multiprocessing.connection.wait([parent.sentinel])

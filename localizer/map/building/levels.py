@@ -11,7 +11,7 @@ from localizer.errors import MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.geometry.pose import Array
 from localizer.map.building.quadtree import mips_of, quadtree
-from localizer.map.building.topdown import Textured, seen_from_above, tile_error_m
+from localizer.map.building.topdown import Textured, render_height_field, tile_error_m
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import ContentFile
 from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource
@@ -69,7 +69,7 @@ class TopViewTile:
     def load(self) -> Sequence[SourceMesh]:
         """See `TileSource.load`."""
         frame = LocalFrame(self.origin)
-        made = seen_from_above(self._drawn_parts(frame), self.left, self.top, self.size)
+        made = render_height_field(self._drawn_parts(frame), self.left, self.top, self.size)
         return [replace(m, positions=frame.ecef_from_enu.apply(m.positions)) for m in made]
 
     def _drawn_parts(self, frame: LocalFrame) -> Iterator[list[Textured]]:
@@ -82,7 +82,7 @@ class TopViewTile:
 
 
 def with_levels(tree: SourceTree) -> SourceTree:
-    """The tree with huge leaves cut, and with coarser levels if it has none."""
+    """The tree with huge leaves cut into smaller tiles, and with coarser levels if it has none."""
     lat, lon, h = (float(x) for x in geodetic_from_ecef(tree.centre))
     origin = Geodetic(lat, lon, h)
     nodes = [node for node in tree.root.walk() if node.tiles and not node.children]
@@ -118,7 +118,7 @@ def _is_huge(node: SourceNode) -> bool:
 
 
 def _cut(node: SourceNode, origin: Geodetic) -> SourceNode:
-    """A leaf as a tree of smaller tiles; of several contents each by itself."""
+    """A leaf as a tree of smaller tiles; each of its contents is cut separately."""
     roots = []
     for tile in node.tiles:
         assert isinstance(tile, ContentFile)
@@ -135,7 +135,7 @@ def _replaced(node: SourceNode, cut: dict[int, SourceNode]) -> SourceNode:
 
 @dataclass(frozen=True, eq=False)
 class _Leaf:
-    """A leaf of a flat tileset. node: what stands for it; low, high: (2,) of its box, ENU."""
+    """A leaf of a flat tileset. node: itself, or its cut tree; low, high: (2,) of its box, ENU."""
 
     node: SourceNode
     parts: tuple[ContentFile, ...]
@@ -152,7 +152,7 @@ class _Leaf:
 
 
 def _grouped(leaves: list[_Leaf], origin: Geodetic) -> SourceNode:
-    """A made tile over groups of leaves, quarter by quarter; it shows just what they show."""
+    """Coarser tiles over groups of leaves, by quarters; each tile shows exactly its leaves."""
     low = np.min([leaf.low for leaf in leaves], axis=0)
     high = np.max([leaf.high for leaf in leaves], axis=0)
     size = 1.0001 * float((high - low).max())

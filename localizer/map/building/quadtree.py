@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 
 from localizer.geometry.pose import Array
-from localizer.map.building.cutting import cropped
+from localizer.map.building.cutting import crop_square
 from localizer.map.building.staging import texel_size
-from localizer.map.building.topdown import TEXELS, seen_from_above, tile_error_m
+from localizer.map.building.topdown import TEXELS, render_height_field, tile_error_m
 from localizer.map.cache.tile import build_mips
 from localizer.map.importers.rules import ImportRules
 from localizer.map.source import SourceMesh, SourceNode
@@ -24,7 +24,7 @@ LEAF_TRIANGLES = 30_000
 class Model(Protocol):
     """A mesh in its own axes (metres, z up).
 
-    Equal models are the same mesh: what was loaded for a tile is kept for the next one.
+    Equal models are the same mesh: a loaded mesh is cached for the next tile.
     """
 
     @property
@@ -84,11 +84,11 @@ class MeshTile:
         meshes = _loaded(self.model)
         left, top = self.grid.left + self.column * self.size, self.grid.top - self.row * self.size
         if self.level == self.grid.levels - 1:
-            parts = [cropped(m, left, top, self.size) for m in meshes]
+            parts = [crop_square(m, left, top, self.size) for m in meshes]
             local = [p for p in parts if p is not None]
         else:
             textured = list(zip(meshes, _mips(self.model), strict=True))
-            local = seen_from_above([textured], left, top, self.size)
+            local = render_height_field([textured], left, top, self.size)
         return [replace(m, positions=self.model.ecef(m.positions)) for m in local]
 
 
@@ -132,7 +132,7 @@ def _node(tile: MeshTile) -> SourceNode:
 
 @lru_cache(maxsize=1)
 def _loaded(model: Model) -> list[SourceMesh]:
-    """Kept for the next tile of the same process."""
+    """The model's meshes, cached for the next tile of the same process."""
     return model.load()
 
 

@@ -41,8 +41,8 @@ class SourceOptions:
 def find_source(
     sources: Sequence[Path], georeference: Georeference | Path | None
 ) -> tuple[tuple[Path, ...], Georeference | Path | None]:
-    """The sources to import: as given, or the content of a folder, with its georeference.
-    `MapSourceError` if a path does not exist.
+    """The sources to import, as given or as found in a folder, with their georeference (None: none
+    needed or found). `MapSourceError` if a path does not exist.
     """
     for path in sources:
         if not path.exists():
@@ -60,7 +60,9 @@ def read_source(
     georeference: Georeference | Path | None = None,
     options: SourceOptions | None = None,
 ) -> SourceTree:
-    """The tile tree of what `find_source` found. `MapSourceError` if it cannot be imported."""
+    """The tile tree of what `find_source` found. georeference: of a mesh. `MapSourceError` if it
+    cannot be imported.
+    """
     options = options or SourceOptions()
     rules = options.rules
     if all(path.suffix.lower() in RASTERS for path in sources):
@@ -101,7 +103,7 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
     warnings = [f"{path.name}: {text}" for text in doubts]
     text = georeference.far_outside(np.array([low, high]))
     if text is not None:
-        warnings.append(options.rules.doubt("area", f"{path}: {text}"))
+        warnings.append(options.rules.accept("area", f"{path}: {text}"))
     elif (unsure := georeference.datum_doubt(np.array([low, high]))) is not None:
         warnings.append(f"{path.name}: {unsure}")
     if georeference.unread:

@@ -59,13 +59,15 @@ class TileRecord:
 
 
 class Staging:
-    """The folder `<out>.building`: tile files and one record per finished source tile."""
+    """The folder `<out>.building`: tile files and one record per finished source tile. key: number
+    of a source tile in the tree's order.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def record(self, key: int) -> TileRecord | None:
-        """The record of a finished source tile whose files exist."""
+        """The record of a finished source tile; None if it or a file of it is missing."""
         try:
             data = json.loads(self._record_path(key).read_bytes())
             tiles = tuple(_stored_from_json(t) for t in data["tiles"])
@@ -146,7 +148,7 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
         yield Staging(folder)
 
 
-def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache:
+def write_index(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache:
     """Write index and manifest, and open the staging folder as a cache, before publishing."""
     digest = index.save(staged.folder / INDEX_NAME)
     final = manifest.model_copy(update={"index_sha256": digest})
@@ -155,7 +157,7 @@ def complete(staged: Staging, index: TileIndex, manifest: Manifest) -> TileCache
 
 
 def publish(staged: Staging, out: Path, manifest: Manifest) -> Manifest:
-    """Publish a `complete` cache atomically by a rename to `out`. `MapCacheError` while a reader
+    """Publish a `write_index` cache atomically by a rename to `out`. `MapCacheError` while a reader
     uses the old cache.
     """
     folder = staged.folder

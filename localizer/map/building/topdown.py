@@ -29,15 +29,15 @@ Textured = tuple[SourceMesh, tuple[Image, ...]]  # a mesh and its mips
 
 
 def tile_error_m(size: float) -> float:
-    """Geometric error (m) of a tile of `size` metres made by `seen_from_above`."""
+    """Geometric error (m) of a tile of `size` metres made by `render_height_field`."""
     return ERROR_PER_STEP * size / CELLS
 
 
-def seen_from_above(
+def render_height_field(
     groups: Iterable[Sequence[Textured]], left: float, top: float, size: float
 ) -> list[SourceMesh]:
-    """Render the meshes of a square (metres, z up) as one textured height field. groups: rendered
-    one after the other to save memory. left, top: western and northern edge; size: side.
+    """Render the meshes of a square (metres, z up) from above as one textured height field. groups:
+    rendered one after the other to save memory. left, top: western and northern edge; size: side.
     """
     step = size / CELLS
     heights = np.full((CELLS + 1, CELLS + 1), -np.inf)
@@ -75,7 +75,7 @@ def seen_from_above(
 
 
 def _grown(heights: Array) -> Array:
-    """With the vertices around the known ones, at the mean of those."""
+    """The heights with unknown vertices beside known ones set to the mean of these."""
     known = np.isfinite(heights)
     share = cv2.blur(known.astype(np.float64), (3, 3), borderType=cv2.BORDER_CONSTANT)
     total = cv2.blur(np.where(known, heights, 0.0), (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -84,7 +84,7 @@ def _grown(heights: Array) -> Array:
 
 
 def _grown_picture(image: Image, shown: NDArray[np.bool_]) -> tuple[Image, NDArray[np.bool_]]:
-    """A picture whose border texels go on for some more than `_GROWN` cells, and where it shows."""
+    """The image with its border colours extended by `_GROWN` cells and a half, and the new mask."""
     if shown.all():
         return image, shown
     away, label = cv2.distanceTransformWithLabels(
@@ -97,14 +97,14 @@ def _grown_picture(image: Image, shown: NDArray[np.bool_]) -> tuple[Image, NDArr
 
 
 def _height(depth: Float32, base: float) -> Array:
-    """Heights of what was drawn, -inf where nothing was."""
+    """Heights (m) of the drawn pixels, -inf where nothing was drawn."""
     return np.where(depth > 0, base + _EYE_M - depth.astype(np.float64), -np.inf)
 
 
 def _placed(
     mesh: SourceMesh, mips: tuple[Image, ...], centre: Array, size: float
 ) -> TileMesh | None:
-    """The triangles that may meet a square, relative to its centre."""
+    """The triangles that may overlap a square, relative to its centre; None without any."""
     corners = mesh.positions[mesh.faces, :2] - centre[:2]
     low, high = corners.min(axis=1), corners.max(axis=1)
     near = mesh.faces[((low <= 0.51 * size) & (high >= -0.51 * size)).all(axis=1)]

@@ -15,7 +15,7 @@ import numpy as np
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
-from localizer.map.building.isolation import call_apart, confine, out_of_memory
+from localizer.map.building.isolation import call_in_process, confine, out_of_memory
 from localizer.map.building.staging import Staging, TileRecord
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
@@ -26,7 +26,9 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ImportJob:
-    """Data of a worker besides the tile. frame: the cache's world; lift_m: added to heights."""
+    """Data of a worker besides the tile. frame: the cache's world; lift_m: added to heights. key:
+    number of a source tile in the tree's order.
+    """
 
     staged: Staging
     frame: LocalFrame
@@ -179,9 +181,9 @@ def _run_pool(
 
 
 def _run_alone(job: ImportJob, key: int, tile: TileSource) -> TileRecord:
-    """Import again a tile that was in flight when a worker died, to see whether it is the cause."""
+    """Import again, alone, a tile that was in work when a worker died, to find the cause."""
     try:
-        return call_apart(job.run, key, tile, rules=job.rules, what="its decoder")
+        return call_in_process(job.run, key, tile, rules=job.rules, what="its decoder")
     except MapSourceError as error:
         return job.staged.reject(key, str(error))
 

@@ -71,7 +71,7 @@ class Manifest(BaseModel):
 
     @property
     def imagery_date(self) -> str | None:
-        """Date of the imagery; older builds kept it among other options."""
+        """Date of the imagery, None if unknown; older builds kept it among other options."""
         stated = self.build.get("imagery_date") if self.kind is None else self.kind.imagery_date
         return str(stated) if re.fullmatch(IMAGERY_DATE, str(stated)) else None
 
@@ -164,7 +164,7 @@ class TileCache:
             index = TileIndex(**safetensors.numpy.load(data))
         except (safetensors.SafetensorError, TypeError, ValueError) as error:
             raise MapCacheError(f"{path / INDEX_NAME}: not a tile index: {error}") from error
-        _check_together(path / MANIFEST_NAME, manifest, index)
+        _require_matching_index(path / MANIFEST_NAME, manifest, index)
         return cls(path, manifest, index)
 
     @cached_property
@@ -192,7 +192,7 @@ class TileCache:
         return self._load(tile_id, textured=True)
 
     def load_geometry(self, tile_id: int) -> TileMesh:
-        """The same without its texture, in a fraction of the time: for casting rays."""
+        """As `load_tile`, without the texture and much faster: for casting rays."""
         return self._load(tile_id, textured=False)
 
     def _load(self, tile_id: int, *, textured: bool) -> TileMesh:
@@ -228,7 +228,9 @@ def encode_tile(
     repeat: bool = False,
     finest_jpeg: bytes | None = None,
 ) -> bytes:
-    """Encode a tile file. finest_jpeg: the source's JPEG of mips[0], stored unchanged."""
+    """Encode a tile file. positions, uvs, faces, mips, repeat: as in `TileMesh`. finest_jpeg: the
+    source's JPEG of mips[0], stored unchanged; None: mips[0] is encoded.
+    """
     arrays: dict[str, NDArray[Any]] = {
         "positions": np.ascontiguousarray(positions, np.float32),
         "uvs": np.ascontiguousarray(uvs, np.float32),
@@ -312,9 +314,9 @@ def read_manifest(path: Path) -> Manifest:
         raise MapCacheError(f"{where}: not a manifest: {error}") from error
 
 
-def _check_together(where: Path, manifest: Manifest, index: TileIndex) -> None:
-    """Whether the manifest is the index's own: nothing else guards it against an edit, and boxes
-    about another origin would let the view lose its tiles.
+def _require_matching_index(where: Path, manifest: Manifest, index: TileIndex) -> None:
+    """`MapCacheError` if the manifest does not fit the index: no hash protects it from an edit, and
+    boxes about another origin would make the view lose its tiles.
     """
     if manifest.tiles != len(index.size):
         raise MapCacheError(

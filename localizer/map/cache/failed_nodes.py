@@ -23,8 +23,8 @@ class _Failure:
 
 
 class FailedNodes:
-    """Nodes that could not be read. Callers hold the streamer's lock. clock: seconds. attempts:
-    number of failures.
+    """Nodes that could not be read. Callers hold the streamer's lock. clock: returns seconds.
+    attempts: number of failures so far.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -35,8 +35,8 @@ class FailedNodes:
     def __len__(self) -> int:
         return len(self._failures)
 
-    def note(self, node: int, error: MapCacheError) -> None:
-        """Record a failure; retries are delayed longer each time."""
+    def add(self, node: int, error: MapCacheError) -> None:
+        """Record a failed read of a node; each further failure delays its retry longer."""
         before = self._failures.get(node)
         if before is None:
             _log.error("%s", error)
@@ -45,8 +45,8 @@ class FailedNodes:
         self._failures[node] = _Failure(error, count, self._clock() + wait_s)
         self.attempts += 1
 
-    def forget(self, node: int) -> None:
-        """The node was read."""
+    def remove(self, node: int) -> None:
+        """Forget a node's failures, because it was read."""
         self._failures.pop(node, None)
 
     def is_waiting(self, node: int) -> bool:

@@ -16,8 +16,8 @@ from localizer.errors import MapCacheError
 
 
 class CacheLock:
-    """Lock that prevents a replacement of the cache at `path` until `close`; any number of readers
-    may hold it.
+    """Lock that prevents a replacement of the cache at `path` until `close`. Any number of readers
+    may have it at once.
     """
 
     def __init__(self, path: Path) -> None:
@@ -37,7 +37,7 @@ class CacheLock:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[None]:
-    """Lock for replacing the cache at `path`; `MapCacheError` while it is being read."""
+    """Context manager: lock the cache at `path` for a replacement; `MapCacheError` if in use."""
     if not path.exists():
         yield
         return
@@ -63,7 +63,7 @@ def _opened(path: Path) -> int:
 
 
 def _lock(folder: int, kind: int) -> None:
-    """BlockingIOError where another one keeps it from us; other errors mean no locks here."""
+    """BlockingIOError if another process has the lock; other errors mean that no locks exist."""
     try:
         flock(folder, kind | LOCK_NB)
     except BlockingIOError:

@@ -129,7 +129,7 @@ def warm_up() -> None:
 
 
 def _normals(mesh: TileMesh, faces: NDArray[np.int32], directions: Array) -> Array:
-    """Unit normals (N, 3) of faces in the tile's axes, against the directions (N, 3)."""
+    """Unit normals (N, 3) of faces in the tile's axes, turned against the directions (N, 3)."""
     p, q, s = np.moveaxis(mesh.positions[mesh.faces[faces]].astype(np.float64), 1, 0)
     n = np.cross(q - p, s - p)
     n /= np.linalg.norm(n, axis=1)[:, None]
@@ -138,7 +138,7 @@ def _normals(mesh: TileMesh, faces: NDArray[np.int32], directions: Array) -> Arr
 
 @njit(cache=True, nogil=True)
 def _cast(positions, faces, box, origin, directions, seam, nearest):  # type: ignore[no-untyped-def]
-    """The intersection of every ray that meets the box with every triangle."""
+    """Intersect every ray that meets the box with every triangle; updates `nearest`."""
     low, high = box
     for r in range(directions.shape[0]):
         d = directions[r]
@@ -163,7 +163,7 @@ def _cast(positions, faces, box, origin, directions, seam, nearest):  # type: ig
 def _cast_bundle(  # type: ignore[no-untyped-def]
     positions, faces, beyond, origin, directions, seam, nearest, hit
 ):
-    """The same for all rays of a bundle, with the face that each hits; `beyond` of the vertices."""
+    """As `_cast` for a bundle, with the face that each ray hits; `beyond`: of the vertices."""
     for f in range(faces.shape[0]):
         if beyond[faces[f, 0]] & beyond[faces[f, 1]] & beyond[faces[f, 2]]:
             continue

@@ -26,14 +26,14 @@ class ResidentNodes:
         self.evicted: list[list[TileMesh]] = []
         self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
 
-    def touched(self, node: int) -> Sequence[TileMesh]:
-        """A resident node's meshes; marks it as used."""
+    def use(self, node: int) -> Sequence[TileMesh]:
+        """A resident node's meshes; marks the node as the most recently used."""
         self._meshes.move_to_end(node)
         return self._meshes[node]
 
     def add(self, node: int, meshes: list[TileMesh], *, keep: Collection[int], beside: int) -> None:
-        """Add a node and evict others if necessary, but not those to `keep`, so that a view can
-        complete. beside: further bytes in memory.
+        """Add a node and evict others if necessary, but not those in `keep`, so that a view can
+        complete. beside: further bytes in memory that count against the budget.
         """
         size = int(self.sizes[node])
         self._make_room(beside + size, keep)

@@ -37,8 +37,8 @@ class DetailLimits:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Nodes of a view. wanted: at the asked level of detail; shown: resident nodes to draw now;
-    requests: nodes to load, most urgent first; hole: part of the view has nothing to show.
+    """Nodes of a view. wanted: at the required level of detail; shown: resident nodes to draw now;
+    requests: nodes to load, most urgent first; hole: whether part of the view has nothing to show.
     """
 
     wanted: NDArray[np.int32]

@@ -113,7 +113,7 @@ class TileStreamer:
                 self._take_in(None)
                 choice = self._choose(world_from_camera, camera, limits)
             self._count(choice)
-            shown = (self._nodes.touched(node) for node in choice.shown.tolist())
+            shown = (self._nodes.use(node) for node in choice.shown.tolist())
             self._current = [mesh for meshes in shown for mesh in meshes]
             return list(self._current)
 
@@ -141,13 +141,13 @@ class TileStreamer:
                     if room < 0:
                         break
                     if self._nodes.resident[node]:
-                        self._nodes.touched(node)
+                        self._nodes.use(node)
                     elif not self._failed.is_waiting(node):
                         self._ahead.append(node)
             self._lock.notify_all()
 
     def counters(self) -> StreamCounters:
-        """Counters so far."""
+        """Counters since the streamer was made."""
         with self._lock:
             now = {
                 "resident_bytes": self._nodes.bytes + self._arrived_bytes,
@@ -187,7 +187,7 @@ class TileStreamer:
         )
 
     def _choose(self, world_from_camera: Pose, camera: Camera, limits: DetailLimits) -> Selection:
-        """Select, and hand the loader its list. The lock is held."""
+        """Select nodes and give the loader its list. Needs the lock."""
         if self._closed:
             raise RuntimeError("the tile streamer is closed")
         choice = self._selector.select(world_from_camera, camera, self._nodes.resident, limits)
@@ -229,22 +229,22 @@ class TileStreamer:
             loaded = _load(self.cache, node)
             with self._lock:
                 if isinstance(loaded, MapCacheError):
-                    self._failed.note(node, loaded)
+                    self._failed.add(node, loaded)
                 else:
                     self._arrived.append((node, loaded))
                     self._arrived_bytes += int(self._nodes.sizes[node])
                     self._counts["loaded"] += 1
-                    self._failed.forget(node)
+                    self._failed.remove(node)
                 self._lock.notify_all()
 
     def _to_load(self) -> list[int]:
-        """The nodes to load, in order; empty while there is no room to put them down."""
+        """Nodes to load, in order; empty while there is no room for them."""
         if self._arrived_bytes >= self._bytes_per_select:
             return []
         return self._queue or self._ahead
 
     def _take_in(self, limit: int | None) -> None:
-        """Bring loaded nodes into use, at most `limit` bytes but at least one. The lock is held."""
+        """Make loaded nodes resident, at most `limit` bytes but at least one. Needs the lock."""
         taken = 0
         while self._arrived and (limit is None or taken < limit):
             node, meshes = self._arrived.pop(0)
@@ -278,7 +278,7 @@ def _load(cache: TileCache, node: int) -> list[TileMesh] | MapCacheError:
 
 
 def _ready(mesh: TileMesh) -> TileMesh:
-    """With what drawing asks for computed here, not on the render thread."""
+    """The mesh with the values for drawing computed here, not on the render thread."""
     _ = mesh.bounds, mesh.texture
     return mesh
 

@@ -59,7 +59,7 @@ class MapSurface:
             return sum(mesh.nbytes for mesh in self._meshes.values())
 
     def _nodes(self, origin: Array, directions: Array) -> Iterator[tuple[int, float]]:
-        """Nodes that the bundle may meet and how far off (m) their boxes are, the nearest first."""
+        """Nodes that the bundle may meet, with the distance (m) of their boxes, nearest first."""
         index = self._cache.index
         pyramid = Pyramid.about(directions)
         found: list[NDArray[np.int64]] = []
@@ -95,7 +95,7 @@ class MapSurface:
             return [self._tile(t) for t in tiles]
 
     def _tile(self, tile: int) -> TileMesh:
-        """From memory or the disk. The lock is held."""
+        """A tile's mesh from memory or disk. The caller holds the lock."""
         mesh = self._meshes.pop(tile, None)
         if mesh is None:
             mesh = self._cache.load_geometry(tile)

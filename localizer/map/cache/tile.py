@@ -170,9 +170,9 @@ def mip_sizes(width: int, height: int) -> list[tuple[int, int]]:
 def build_mips(image: Image, used: NDArray[np.bool_] | None = None) -> tuple[Image, ...]:
     """Mip chain of an RGB image (h, w, 3).
 
-    used: (h, w), the texels that some triangle shows. Coarser mips average only those. Unused
-    texels take their colour from the next coarser mip, so that the background of a texture atlas
-    does not bleed into the chart borders.
+    used: (h, w), the texels that some triangle shows; None: all. Coarser mips average only those.
+    Unused texels take their colour from the next coarser mip, so that the background of a texture
+    atlas does not bleed into the chart borders.
     """
     h, w = image.shape[:2]
     mask = np.ones((h, w), np.uint8) if used is None else used.astype(np.uint8)

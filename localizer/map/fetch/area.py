@@ -50,7 +50,7 @@ class Area:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """East to west at the centre, south to north."""
+        """Width at the centre (east to west) and height (south to north), metres."""
         latitude, longitude = self.centre
         width = _WGS84.inv(self.west, latitude, self.east, latitude)[2]
         return float(width), float(_WGS84.inv(longitude, self.south, longitude, self.north)[2])
@@ -84,7 +84,7 @@ class Area:
         )
 
 
-def around(points: Array, margin_m: float) -> Area:
+def area_around(points: Array, margin_m: float) -> Area:
     """The rectangle within `margin_m` of positions (n, 2), latitude and longitude in degrees.
     `MapFetchError` without a position, or if the margin is not above 0 and at most 100 km.
     """

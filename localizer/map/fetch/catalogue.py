@@ -96,7 +96,7 @@ class CatalogueSource(BaseModel):
 
     @property
     def area_deg2(self) -> float:
-        """Size of its area, by which national services precede worldwide ones."""
+        """Area of its bounds; `choose` prefers small ones (national services) by it."""
         west, south, east, north = self.bounds
         return (east - west) * (north - south)
 
@@ -140,9 +140,8 @@ def _entries(path: Path) -> list[Any]:
 def choose(
     sources: tuple[CatalogueSource, ...], area: Area, role: str, name: str | None = None
 ) -> CatalogueSource:
-    """The source of that name, otherwise the finest that covers the area. role: imagery or heights;
-    surface models precede terrain models, and worldwide ones come last. `MapFetchError` if there is
-    none.
+    """The source `name`; None: the finest that covers the area. role: imagery or heights; surface
+    models precede terrain models, and worldwide ones come last. `MapFetchError` if there is none.
     """
     fitting = [s for s in sources if s.has_heights == (role == "heights")]
     if name is not None:

@@ -27,8 +27,8 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, utm_zone
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.heights import UNITS, metres_of
-from localizer.map.fetch.polite import HttpClient, shown
-from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, cut, grid_over
+from localizer.map.fetch.http_client import HttpClient, safe_url
+from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, grid_over, split_grid
 from localizer.map.importers.raster_file import offline
 
 NODATA = -32768.0
@@ -57,25 +57,25 @@ class RangeFile(io.RawIOBase):
         self._block(0)
 
     def readable(self) -> bool:
-        """It is."""
+        """Always True."""
         return True
 
     def seekable(self) -> bool:
-        """It is."""
+        """Always True."""
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Where the next read begins."""
+        """Set the position of the next read; returns it."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
         self._at = max(base + offset, 0)
         return self._at
 
     def tell(self) -> int:
-        """Where that is."""
+        """Position of the next read."""
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        """As much as is asked for, or is left."""
+        """Read as many bytes as `buffer` holds, or as are left; returns their number."""
         wanted = memoryview(buffer).cast("B")
         end = min(self._at + len(wanted), self._size)
         done = 0
@@ -109,16 +109,16 @@ class RangeFile(io.RawIOBase):
         # Only at its begin: one that goes away in between is a fault of the server.
         answer = self._client.get(self._url, asked, () if self._size else (_NOT_THERE,))
         if answer.status == _NOT_THERE:
-            raise NoFileError(f"{shown(self._url)}: status {_NOT_THERE}: there is no such file")
+            raise NoFileError(f"{safe_url(self._url)}: status {_NOT_THERE}: there is no such file")
         if answer.status != 206:
             raise MapFetchError(
-                f"{shown(self._url)}: the server gives whole files only (no HTTP ranges): download "
-                "it once and use `companion map build`"
+                f"{safe_url(self._url)}: the server gives whole files only (no HTTP ranges): "
+                "download it once and use `companion map build`"
             )
         if not self._size:
             total = answer.headers.get("content-range", "").rpartition("/")[2]
             if not total.isdigit():
-                raise MapFetchError(f"{shown(self._url)}: does not say how long the file is")
+                raise MapFetchError(f"{safe_url(self._url)}: does not say how long the file is")
             self._size = int(total)
         return answer.data
 
@@ -149,13 +149,13 @@ def plan_files(
     there = [f for f in wanted if not f.may_lack or _exists(f, client)]
     if not there:
         raise NoFileError(
-            f"{shown(wanted[0].url)}: there is no such file, nor of any other degree of the area: "
-            "is it all sea? are latitude and longitude swapped?"
+            f"{safe_url(wanted[0].url)}: there is no such file, nor of any other degree of the "
+            "area: is it all sea? are latitude and longitude swapped?"
         )
     lacking = tuple(_name(f.url) for f in wanted if f not in there)
     grid = _grid_of(there, area, resolution_m, client)
     pieces = []
-    for column, row, width, height in cut(grid, source.piece_px):
+    for column, row, width, height in split_grid(grid, source.piece_px):
         window = grid.window(column, row, width, height)
         meeting = [f for f in there if _meets(window, f)]
         if meeting:
@@ -186,7 +186,7 @@ def degree_files(source: CatalogueSource, area: Area) -> list[CloudFile]:
 def _grid_of(
     files: Sequence[CloudFile], area: Area, resolution_m: float, client: HttpClient
 ) -> FetchGrid:
-    """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
+    """The grid: the first file's CRS if in metres; its pixels if of the wished size."""
     crs, transform = _lie_of(files[0], client)
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     if flat.is_geographic:
@@ -203,7 +203,7 @@ def _lie_of(file: CloudFile, client: HttpClient) -> tuple[CRS, Any]:
     """A file's CRS and transform."""
     with _opened(file.url, client, []) as data:
         if data.crs is None:
-            raise MapFetchError(f"{shown(file.url)}: has no CRS")
+            raise MapFetchError(f"{safe_url(file.url)}: has no CRS")
         return CRS(data.crs), data.transform
 
 
@@ -212,7 +212,7 @@ def _exists(file: CloudFile, client: HttpClient) -> bool:
 
 
 def _name(url: str) -> str:
-    """A file's own name; what follows it may be a key."""
+    """A file's name without the query of its URL, which may contain a key."""
     return url.rpartition("/")[2].partition("?")[0]
 
 
@@ -225,7 +225,7 @@ def _meets(window: FetchGrid, file: CloudFile) -> bool:
 
 
 def _opened(url: str, client: HttpClient, failed: list[MapFetchError]) -> Any:
-    """A dataset that reads through the client; GDAL itself stays off the network."""
+    """A dataset that reads through the client; GDAL itself gets no network access."""
 
     def opener(path: str, mode: str = "rb", **_: object) -> RangeFile:
         if mode not in ("r", "rb") or path != url:
@@ -238,7 +238,7 @@ def _opened(url: str, client: HttpClient, failed: list[MapFetchError]) -> Any:
     except RasterioError as error:
         if failed:
             raise failed[0] from error
-        raise MapFetchError(f"{shown(url)}: no GeoTIFF that can be read: {error}") from error
+        raise MapFetchError(f"{safe_url(url)}: no GeoTIFF that can be read: {error}") from error
 
 
 def check_depth(name: str, dtype: str) -> None:
@@ -256,7 +256,7 @@ def _window(
     files: Sequence[CloudFile],
     client: HttpClient,
 ) -> bytes | None:
-    """The first file that knows a pixel gives it."""
+    """GeoTIFF of a window: each pixel is from the first file that has it. None without any."""
     bands = 1 if source.has_heights else 3
     dtype = np.float32 if source.has_heights else np.uint8
     whole = np.zeros((bands, window.height, window.width), dtype)
@@ -274,7 +274,7 @@ def _window(
 def _of_file(
     source: CatalogueSource, window: FetchGrid, url: str, client: HttpClient
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """A window's bands (n, height, width) of one file, and where it knows them."""
+    """A window's bands (n, height, width) from one file, and the mask of known pixels."""
     bands = 1 if source.has_heights else 3
     how = Resampling.bilinear if source.has_heights else Resampling.average
     failed: list[MapFetchError] = []
@@ -285,7 +285,7 @@ def _of_file(
             _warped(data, window, how, source) as vrt,
         ):
             if not source.has_heights:
-                check_depth(shown(url), data.dtypes[0])
+                check_depth(safe_url(url), data.dtypes[0])
             read = vrt.read(list(range(1, min(bands, data.count) + 1)))
             if source.has_heights:
                 read = metres_of(source, _name(url), data, window.crs).metres(read)
@@ -293,7 +293,7 @@ def _of_file(
                 vrt.dataset_mask() > 0
             )
     except RasterioError as error:
-        raise MapFetchError(f"{shown(url)}: cannot be read: {error}") from error
+        raise MapFetchError(f"{safe_url(url)}: cannot be read: {error}") from error
     finally:
         if failed:
             raise failed[0]

@@ -14,8 +14,8 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import degree_files, plan_files
+from localizer.map.fetch.http_client import HttpClient
 from localizer.map.fetch.mosaic import assemble, check_piece
-from localizer.map.fetch.polite import HttpClient
 from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.fetch.stac import stac_files
 from localizer.map.fetch.tiles import plan_tiles
@@ -102,7 +102,7 @@ def fetch(
 
 
 def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: HttpClient) -> None:
-    """A piece becomes a file when it is whole; an empty one says that there is nothing."""
+    """Download a piece and write its file when it is complete; an empty file means "no data"."""
     data = piece.get(client)
     if data is not None:
         check_piece(source, piece, data)
@@ -113,7 +113,7 @@ def _keep(source: CatalogueSource, piece: Piece, folder: Path, client: HttpClien
 
 
 def _claim(source: CatalogueSource, plan: FetchPlan, folder: Path) -> None:
-    """The folder belongs to this plan: another's pieces are not mixed in."""
+    """Mark the folder as this plan's; pieces of another plan are removed."""
     told = {
         "source": source.model_dump(mode="json"), "crs": plan.grid.crs.to_wkt(),
         "left": plan.grid.left, "top": plan.grid.top, "pixel": plan.grid.pixel,

@@ -19,7 +19,7 @@ UNITS = ("m",)
 
 def metres_of(source: CatalogueSource, name: str, data: Any, crs: CRS) -> HeightBand:
     """Conversion of a file's numbers to metres, by its unit, scale and offset. data: opened by
-    rasterio; crs: if the file has none. `MapFetchError` if the unit is unknown or the datum
+    rasterio; crs: used if the file has none. `MapFetchError` if the unit is unknown or the datum
     contradicts the source.
     """
     try:

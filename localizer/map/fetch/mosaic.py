@@ -97,7 +97,7 @@ def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
 
 
 def _require_size(source: CatalogueSource, piece: Piece, size: tuple[int, int], bands: int) -> None:
-    """Before it is unpacked: of a few bytes some formats make gigabytes."""
+    """Check a piece's size before decoding: some formats expand a few bytes to gigabytes."""
     wanted = piece.width, piece.height
     large = piece.placed and max(size) > _LARGER * max(wanted)
     if large or bands > _MOST_BANDS or (size != wanted and not piece.placed):
@@ -108,12 +108,12 @@ def _require_size(source: CatalogueSource, piece: Piece, size: tuple[int, int], 
 
 
 def _picture(data: bytes) -> Image.Image:
-    """A picture without a place. Nothing else is opened, whatever a server sends."""
+    """Open an image without a georeference; only formats of images are tried."""
     return Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP"))
 
 
 def _place(source: CatalogueSource, plan: FetchPlan, piece: Piece, data: bytes, file: Any) -> int:
-    """Write a piece where it belongs; returns how many pixels it knows."""
+    """Write a piece at its position; returns its number of known pixels."""
     grid = plan.grid
     if data[:4] in _TIFF:
         with MemoryFile(data) as memory, memory.open(driver="GTiff") as image:
@@ -142,7 +142,7 @@ def _place(source: CatalogueSource, plan: FetchPlan, piece: Piece, data: bytes, 
 def _values(
     source: CatalogueSource, plan: FetchPlan, piece: Piece, image: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(bands, height, width), and where they are known."""
+    """A piece's bands (bands, height, width), and the mask of known pixels."""
     wanted = 1 if source.has_heights else 3
     if piece.placed and image.crs is not None and not image.transform.is_identity:
         window = plan.grid.window(piece.column, piece.row, piece.width, piece.height)

@@ -10,7 +10,7 @@ from affine import Affine
 from pyproj import CRS
 
 from localizer.errors import MapFetchError
-from localizer.map.fetch.polite import HttpClient
+from localizer.map.fetch.http_client import HttpClient
 
 _MOST_PIXELS = 1e9
 _MOST_PIECES = 200_000
@@ -99,7 +99,7 @@ def grid_over(
     )  # fmt: skip
 
 
-def cut(grid: FetchGrid, side: int) -> list[tuple[int, int, int, int]]:
+def split_grid(grid: FetchGrid, side: int) -> list[tuple[int, int, int, int]]:
     """Column, row, width and height of pieces with at most `side` pixels a side. `MapFetchError` if
     there are too many.
     """

@@ -13,7 +13,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile
-from localizer.map.fetch.polite import HttpClient, shown
+from localizer.map.fetch.http_client import HttpClient, safe_url
 from localizer.map.fetch.terms import require_allowed
 
 _MOST_ITEMS, _MOST_PAGES = 2000, 50
@@ -39,7 +39,7 @@ def stac_files(source: CatalogueSource, area: Area, client: HttpClient) -> list[
             if len(items) > _MOST_ITEMS:
                 raise MapFetchError(f"{source.name}: over {_MOST_ITEMS} items: a smaller area")
     except (pystac.STACError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise MapFetchError(f"{shown(source.url)}: no STAC that can be read: {error}") from error
+        raise MapFetchError(f"{safe_url(source.url)}: no STAC that can be read: {error}") from error
     items.sort(key=lambda item: str(item.datetime or item.properties.get("datetime") or ""),
                reverse=True)  # fmt: skip
     files = []
@@ -89,21 +89,21 @@ def _searched(source: CatalogueSource, area: Area, client: HttpClient) -> Iterat
 
 @dataclass(frozen=True)
 class _Page:
-    """An answer to a search. asked: the document that was posted; None: it was a GET."""
+    """An answer to a search. asked: the document that was posted; None: the request was a GET."""
 
     url: str
     document: dict[str, Any]
     asked: dict[str, Any] | None
 
     @classmethod
-    def got(cls, url: str, asked: dict[str, Any] | None, client: HttpClient) -> _Page:
-        """Ask for it."""
+    def request(cls, url: str, asked: dict[str, Any] | None, client: HttpClient) -> _Page:
+        """Request a page."""
         answer = client.get(url) if asked is None else client.post(url, asked)
         return cls(url, json.loads(answer.data), asked)
 
     def next(self, client: HttpClient) -> _Page | None:
-        """The page after it. A link may say POST, with a body that replaces or is merged into what
-        was posted before (STAC API 1.0, Item Search, paging).
+        """The following page; None after the last. A link may demand a POST, with a body that
+        replaces the posted one or is merged into it (STAC API 1.0, Item Search, paging).
         """
         for link in self.document.get("links", ()):
             if link.get("rel") == "next":
@@ -111,7 +111,7 @@ class _Page:
                 if str(link.get("method", "GET")).upper() == "POST":
                     earlier = (self.asked or {}) if link.get("merge") else {}
                     asked = {**earlier, **(link.get("body") or {})}
-                return _Page.got(urljoin(self.url, link["href"]), asked, client)
+                return _Page.request(urljoin(self.url, link["href"]), asked, client)
         return None
 
 
@@ -125,16 +125,16 @@ def _first_page(source: CatalogueSource, area: Area, client: HttpClient) -> _Pag
         asked: dict[str, Any] = {"bbox": box, "limit": _PAGE}
         if source.layer:
             asked["collections"] = [source.layer]
-        return _Page.got(urljoin(f"{home}/", methods["POST"]), asked, client)
+        return _Page.request(urljoin(f"{home}/", methods["POST"]), asked, client)
     parameters = {"bbox": ",".join(f"{v:.7f}" for v in box), "limit": str(_PAGE)}
     if source.layer:
         parameters["collections"] = source.layer
     there = urljoin(f"{home}/", methods.get("GET", f"{home}/search"))
-    return _Page.got(f"{there}?{urlencode(parameters)}", None, client)
+    return _Page.request(f"{there}?{urlencode(parameters)}", None, client)
 
 
 def _walked(source: CatalogueSource, area: Area, client: HttpClient) -> Iterator[Any]:
-    """A static catalogue, but not what lies elsewhere or in another collection."""
+    """Items of a static catalogue, without those on other hosts or in other collections."""
     import pystac
     from pystac.stac_io import DefaultStacIO
 

@@ -15,17 +15,17 @@ from pyproj.exceptions import CRSError
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.polite import HttpClient, shown
+from localizer.map.fetch.http_client import HttpClient, safe_url
 from localizer.map.fetch.raster import (
     FetchPlan,
     Piece,
-    cut,
     grid_over,
     metres_per_unit,
     north_first,
+    split_grid,
 )
 from localizer.map.fetch.terms import require_allowed
-from localizer.map.fetch.xml import parsed, texts
+from localizer.map.fetch.xml import message_text, parse_xml
 
 _BYTES = 0.4  # a pixel, of a photograph as JPEG
 _HALF_M = 20_037_508.342789244  # of the square of Web Mercator
@@ -73,7 +73,7 @@ def plan_tiles(
     )
     if last[0] < first[0] or last[1] < first[1]:
         raise MapFetchError(f"{source.name}: has no tiles at {area}")
-    cut(grid, min(width, height))  # within the limits
+    split_grid(grid, min(width, height))  # within the limits
     pieces = []
     for tile_row in range(first[1], last[1] + 1):
         for tile in range(first[0], last[0] + 1):
@@ -138,10 +138,12 @@ def _capabilities(source: CatalogueSource, client: HttpClient) -> Any:
         url += ("&" if "?" in url else "?") + urlencode(parameters)
     data = client.get(url).data
     try:
-        parsed(data)  # refused before another parser sees it, if it brings entities
+        parse_xml(data)  # refused before another parser sees it, if it brings entities
         return WebMapTileService(url, xml=data)
     except (ParseError, AttributeError, KeyError, ValueError, TypeError) as error:
-        raise MapFetchError(f"{shown(url)}: no capabilities of a WMTS: {texts(data)}") from error
+        raise MapFetchError(
+            f"{safe_url(url)}: no capabilities of a WMTS: {message_text(data)}"
+        ) from error
 
 
 def _matrix_set(source: CatalogueSource, service: Any, layer: Any) -> tuple[str, CRS]:
@@ -216,5 +218,5 @@ def _tile(url: str, client: HttpClient) -> bytes | None:
     if answer.status in _GAP or not answer.data:
         return None
     if "xml" in answer.kind or "html" in answer.kind:
-        raise MapFetchError(f"{shown(url)}: refused: {texts(answer.data)}")
+        raise MapFetchError(f"{safe_url(url)}: refused: {message_text(answer.data)}")
     return answer.data

@@ -11,17 +11,17 @@ from pyproj import CRS
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.polite import HttpClient, shown
+from localizer.map.fetch.http_client import HttpClient, safe_url
 from localizer.map.fetch.raster import (
     FetchGrid,
     FetchPlan,
     Piece,
-    cut,
     grid_over,
     metres_per_unit,
     north_first,
+    split_grid,
 )
-from localizer.map.fetch.xml import parsed, texts
+from localizer.map.fetch.xml import message_text, parse_xml
 
 _JPEG_BYTES, _HEIGHT_BYTES = 0.4, 4.0
 _MARGIN = 2  # pixels of a coverage that is cut by its own grid, so that no seam stays
@@ -37,7 +37,7 @@ def plan_blocks(
     grid = grid_over(area.bounds_in(crs), pixel, crs)
     axes = _axes(source, client) if source.kind == "wcs" else ("", "")
     pieces = []
-    for column, row, width, height in cut(grid, source.piece_px):
+    for column, row, width, height in split_grid(grid, source.piece_px):
         window = grid.window(column, row, width, height)
         if source.kind == "wms":
             url = wms_url(source, window)
@@ -105,7 +105,7 @@ def wcs_2_url(source: CatalogueSource, window: FetchGrid, axes: tuple[str, str])
 
 
 def _axes(source: CatalogueSource, client: HttpClient) -> tuple[str, str]:
-    """Names of easting and northing: as the file says, or as the coverage does."""
+    """Names of the coverage's easting and northing axes, from the catalogue or the service."""
     if source.axes is not None or source.version.startswith("1."):
         return source.axes or ("", "")
     url = _with(
@@ -122,25 +122,25 @@ def _axes(source: CatalogueSource, client: HttpClient) -> tuple[str, str]:
             lowered = [label.lower() for label in labels[:2]]
             swapped = lowered[0] in ("lat", "latitude", "n", "y", "northing")
             return (labels[1], labels[0]) if swapped else (labels[0], labels[1])
-    raise MapFetchError(f"{shown(url)}: does not name the axes of {source.layer}; set `axes`")
+    raise MapFetchError(f"{safe_url(url)}: does not name the axes of {source.layer}; set `axes`")
 
 
 def _document(client: HttpClient, url: str) -> Element:
     try:
-        return parsed(client.get(url).data)
+        return parse_xml(client.get(url).data)
     except ParseError as error:
-        raise MapFetchError(f"{shown(url)}: no XML: {error}") from error
+        raise MapFetchError(f"{safe_url(url)}: no XML: {error}") from error
 
 
 def _image(url: str, client: HttpClient) -> bytes:
     answer = client.get(url)
     if "xml" in answer.kind or "html" in answer.kind or answer.kind == "text/plain":
-        raise MapFetchError(f"{shown(url)}: refused: {texts(answer.data)}")
+        raise MapFetchError(f"{safe_url(url)}: refused: {message_text(answer.data)}")
     return answer.data
 
 
 def _with(url: str, parameters: dict[str, str]) -> str:
-    """Parameters added to those that the address has."""
+    """The URL with further query parameters."""
     parts = urlsplit(url)
     query = "&".join(p for p in (parts.query.strip("&"), urlencode(parameters)) if p)
     return urlunsplit((parts.scheme, parts.netloc, parts.path, query, ""))

@@ -9,7 +9,7 @@ from localizer.errors import MapFetchError
 _MOST_BYTES = 32 << 20
 
 
-def parsed(data: bytes) -> ElementTree.Element:
+def parse_xml(data: bytes) -> ElementTree.Element:
     """Parse XML; returns the root. Document types are rejected, because entities can expand without
     limit. ParseError for invalid XML.
     """
@@ -18,10 +18,10 @@ def parsed(data: bytes) -> ElementTree.Element:
     return ElementTree.fromstring(data)
 
 
-def texts(data: bytes) -> str:
-    """The text of a server's message, for an error; for XML without tags."""
+def message_text(data: bytes) -> str:
+    """Text of a server's message, for an error; tags of XML are removed."""
     try:
-        words = " ".join(t.strip() for t in parsed(data[:65536]).itertext() if t.strip())
+        words = " ".join(t.strip() for t in parse_xml(data[:65536]).itertext() if t.strip())
     except (ElementTree.ParseError, MapFetchError):
         words = data[:300].decode("utf-8", "replace")
     return " ".join(words.split())[:300]

@@ -76,7 +76,7 @@ def _crs(path: Path, root: ElementTree.Element) -> str:
 
 
 def _own(element: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """What is in a building, but not what is in its parts."""
+    """The elements of a building without those of its parts."""
     for child in element:
         if _name(child) not in _BUILDINGS:
             yield child
@@ -84,7 +84,7 @@ def _own(element: ElementTree.Element) -> Iterator[ElementTree.Element]:
 
 
 def _measured(element: ElementTree.Element, path: Path) -> float | None:
-    """Metres of a measuredHeight, whose unit is a name, or the end of an address of one."""
+    """measuredHeight in metres; None without one. Its unit is a name, or the end of a URL."""
     uom = element.attrib.get("uom", "m")
     name = re.split(r"[:#/]", uom)[-1].strip("[]").lower()
     unit_m = UNITS.get(name, _UNITS.get(name))
@@ -95,7 +95,7 @@ def _measured(element: ElementTree.Element, path: Path) -> float | None:
 
 
 def _footprint(building: ElementTree.Element, path: Path, unit_m: float) -> Footprint | None:
-    """unit_m: of the file's coordinates, heights too."""
+    """A building's footprint; None without height or area. unit_m: metres per unit of the file."""
     told: float | None = None
     for element in _own(building):
         if _name(element) == "measuredHeight":

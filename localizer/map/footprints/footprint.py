@@ -29,7 +29,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Footprints:
-    """Buildings of a file. crs: as pyproj takes it; either_order: its CRS may be written north
+    """Buildings of a file. crs: as pyproj takes it; either_order: coordinates may be written north
     first; by_storeys: number with heights from storeys; left_out: number without height or area;
     attribution: as the file states.
     """
@@ -43,7 +43,7 @@ class Footprints:
     attribution: str = ""
 
     def require(self) -> Footprints:
-        """Itself; `MapSourceError` if it has no building, or too many."""
+        """Returns itself; `MapSourceError` if it has no building, or too many."""
         if not self.buildings:
             raise MapSourceError(
                 f"{self.path}: no building with a height ({self.left_out} without one): GeoJSON "

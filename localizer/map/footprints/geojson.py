@@ -27,7 +27,9 @@ _WHOSE = ("copyright", "attribution", "licence", "license")
 
 
 def read_geojson(path: Path, height_property: str | None = None) -> Footprints:
-    """Polygons with a height, otherwise with storeys of 3 m. `MapSourceError` for another file."""
+    """Polygons with a height, otherwise with storeys of 3 m. height_property: name of the height's
+    property; None: the usual ones. `MapSourceError` for another file.
+    """
     try:
         document = json.loads(plain_text(path, MOST_BYTES))
         features = document["features"]

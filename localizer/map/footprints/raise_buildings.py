@@ -26,7 +26,7 @@ from localizer.map.footprints.citygml import read_citygml
 from localizer.map.footprints.footprint import Footprint, Footprints
 from localizer.map.footprints.geojson import read_geojson
 from localizer.map.importers.height_crs import horizontal_unit_m, stated_heights
-from localizer.map.importers.raster_file import applied, offline, open_raster
+from localizer.map.importers.raster_file import apply_affine, offline, open_raster
 
 _WALL_M = 0.5  # a cell, over which a wall may lean
 _DEGREE_M = 111_000.0
@@ -37,7 +37,9 @@ _GML = (".gml", ".xml", ".citygml")
 
 @dataclass(frozen=True)
 class RaiseResult:
-    """Numbers of buildings. missed: outside the terrain; small: smaller than a cell."""
+    """Numbers of buildings. missed: outside the terrain; small: smaller than a cell; by_storeys,
+    left_out: of `Footprints`. cell_m: side of the surface's cells.
+    """
 
     raised: int
     missed: int
@@ -61,7 +63,9 @@ class RaiseResult:
 
 
 def read_footprints(path: Path, height_property: str | None = None) -> Footprints:
-    """Read footprints of a GeoJSON or CityGML file, by its suffix."""
+    """Read footprints of a GeoJSON or CityGML file, by its suffix. height_property: of GeoJSON, see
+    `read_geojson`.
+    """
     if path.suffix.lower() in _GML:
         return read_citygml(path)
     return read_geojson(path, height_property)
@@ -105,7 +109,7 @@ def _require_metres(path: Path, data: DatasetReader) -> None:
 
 
 def _division(data: DatasetReader) -> tuple[int, float]:
-    """Into how many parts a cell's side is divided, and what they measure, m."""
+    """Number of parts into which a cell's side is divided, and the length of a part, m."""
     step: float = max(abs(data.transform.a), abs(data.transform.e))
     if data.crs.is_geographic:
         step *= _DEGREE_M
@@ -127,8 +131,8 @@ def _divided(data: DatasetReader, parts: int) -> tuple[Array, Affine]:
 
 
 def _placed(footprints: Footprints, data: DatasetReader) -> list[Footprint]:
-    """In the terrain's CRS. GML's files do not agree in which order a CRS's axes are written: that
-    counts by which more of them meet the terrain.
+    """The buildings in the terrain's CRS. Files of GML differ in the order of a CRS's axes, so the
+    order in which more buildings are on the terrain is used.
     """
     whole = Transformer.from_crs(CRS(footprints.crs), CRS(data.crs).to_2d(), always_xy=True)
     corners = np.array([b.polygons[0][0].mean(axis=0) for b in footprints.buildings])
@@ -153,11 +157,11 @@ def _met(whole: Transformer, places: Array, data: DatasetReader) -> int:
 
 
 def _burn(heights: Array, bare: Array, transform: Affine, building: Footprint) -> str:
-    """Raise one; where buildings overlap, the higher one stands."""
+    """Raise a building; returns "raised", or why not. Where two overlap, the higher counts."""
     ring = np.concatenate([ring for rings in building.polygons for ring in rings])
     if not np.isfinite(ring).all():
         return "missed"
-    columns, rows = applied(~transform, ring[:, 0], ring[:, 1])
+    columns, rows = apply_affine(~transform, ring[:, 0], ring[:, 1])
     height, width = heights.shape
     first = max(int(np.floor(rows.min())), 0), max(int(np.floor(columns.min())), 0)
     last = (

@@ -93,7 +93,7 @@ def _ways(folder: Path, georeference_given: bool) -> Iterator[FoundSource]:
 
 
 def _found(folder: Path) -> str:
-    """What is in a folder, two levels deep, that an importer might take."""
+    """Names of the files in a folder, two levels deep, that an importer may read."""
     deep = [folder, *visible(p for p in folder.iterdir() if p.is_dir())]
     files = [p for place in deep for p in files_of(place, (*MESHES, *RASTERS))]
     files += [p.parent / p.name for p in sorted(folder.glob(f"*/{TILESET}"))]

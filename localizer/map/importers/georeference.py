@@ -87,7 +87,7 @@ def read_georeference(path: Path) -> Georeference:
 
 
 def _told_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object whose keys stand once: of two origins the last won, silently."""
+    """JSON object; an error for a repeated key, of which the last would win silently."""
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError("a key stands twice")
@@ -95,7 +95,7 @@ def _told_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _unread(data: dict[str, Any], known: set[str]) -> tuple[str, ...]:
-    """What stands in a file beside what is read: a remark, or a scale that is not applied."""
+    """Keys of a file that are not read, for example a remark, or a scale that is not applied."""
     return tuple(sorted(set(data) - known))
 
 

@@ -31,12 +31,12 @@ from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.textures import (
     decode_alpha,
     decode_image,
-    merged_by_picture,
+    merge_by_image,
     palette_mesh,
     picture_size,
-    placed,
     srgb,
     tinted,
+    transform_mesh,
 )
 from localizer.map.source import SourceMesh
 from localizer.types import Image
@@ -98,8 +98,8 @@ def gltf_weight(data: bytes, read_uri: Reader, rules: ImportRules | None = None)
 def gltf_bounds(
     data: bytes, read_uri: Reader, rules: ImportRules | None = None
 ) -> tuple[Array, Array]:
-    """Corners (N, 3) of boxes that hold the document's surfaces, by its headers where they say it,
-    and its CESIUM_RTC centre (3,); see `read_gltf`. `MapSourceError` if it is malformed.
+    """Corners (N, 3) of boxes that hold the document's surfaces, from its headers where they state
+    them, and its CESIUM_RTC centre (3,); see `read_gltf`. `MapSourceError` if it is malformed.
     """
     try:
         document = _Document(data, read_uri, rules or ImportRules())
@@ -110,7 +110,9 @@ def gltf_bounds(
 
 @dataclass(frozen=True, eq=False)
 class _GltfImage:
-    """A texture. alpha: (h, w) uint8, None where all is opaque; wraps: beyond its edges."""
+    """A texture. jpeg: its encoded bytes if it is a JPEG; alpha: (h, w) uint8, None if all is
+    opaque; wraps: whether it repeats beyond its edges.
+    """
 
     image: Image
     jpeg: bytes | None
@@ -126,7 +128,7 @@ class _GltfImages:
         self._images: dict[int, tuple[Image, bytes | None, NDArray[np.uint8] | None]] = {}
 
     def of(self, index: int) -> _GltfImage:
-        """The texture of a number; `MapSourceError` for one that cannot be read."""
+        """The texture with this index; `MapSourceError` if it cannot be read."""
         texture = item(self._json.get("textures", []), index, "texture")
         extensions = texture.get("extensions", {})
         if "source" in texture or "EXT_texture_webp" in extensions:
@@ -174,11 +176,11 @@ class _Document:
             for part in self._primitive(primitive):
                 self._vertices += len(part.positions)
                 self._rules.require("vertices", self._vertices, "the glTF")
-                parts.append(placed(part, T))
-        return merged_by_picture(parts)
+                parts.append(transform_mesh(part, T))
+        return merge_by_image(parts)
 
     def corners(self) -> Array:
-        """(N, 3) of the boxes of all primitives; every vertex where an accessor tells no box."""
+        """(N, 3) of the boxes of all primitives; all vertices where an accessor states no box."""
         found = [np.empty((0, 3))]
         for primitive, T in self._placed():
             index = primitive["attributes"]["POSITION"]
@@ -204,7 +206,7 @@ class _Document:
             yield from self._walk(root, np.eye(4), 0)
 
     def weight(self) -> tuple[int, int]:
-        """Triangles (as if each mesh were used once) and texels."""
+        """Number of triangles (each mesh counted once) and of texels."""
         accessors = self._json.get("accessors", [])
         corners = 0
         for mesh in self._json.get("meshes", []):
@@ -228,7 +230,7 @@ class _Document:
         node = item(self._json.get("nodes", []), index, "node")
         T = parent @ _node_matrix(node)
         if "mesh" in node and np.linalg.det(T[:3, :3]) < 0:
-            self._rules.doubt("mirrored", f"node {index} mirrors its mesh: left becomes right")
+            self._rules.accept("mirrored", f"node {index} mirrors its mesh: left becomes right")
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             raise MapSourceError("uses EXT_mesh_gpu_instancing, not supported")
         if "mesh" in node:

@@ -58,8 +58,9 @@ class StatedHeights:
 
 
 def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeights:
-    """Unit and datum by a source's CRS and its band's unit tag; `GeoreferenceError` if they
-    contradict. where: the source; a GeoTIFF's keys are used if the CRS has no vertical part.
+    """Unit and datum by a source's CRS and its band's unit tag (None: no tag); `GeoreferenceError`
+    if they contradict. where: the source; a GeoTIFF's keys are used if the CRS has no vertical
+    part.
     """
     keys = geo_keys(where) if isinstance(where, Path) else {}
     unit, datum, name = _keyed_heights(keys, where)
@@ -100,8 +101,8 @@ def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeig
 def _keyed_heights(
     keys: Mapping[int, int], where: object
 ) -> tuple[float | None, VerticalDatum | None, str]:
-    """Unit, datum and name by a GeoTIFF's vertical keys: of GeoTIFF 1.0's own numbers PROJ knows
-    nothing, so that GDAL leaves them out.
+    """Unit, datum and name from a GeoTIFF's vertical keys. PROJ does not know GeoTIFF 1.0's own
+    numbers, so GDAL omits them.
     """
     kind = keys.get(_VERTICAL_TYPE_KEY, keys.get(_VERTICAL_DATUM_KEY, 0))
     unit_key = keys.get(_VERTICAL_UNIT_KEY)

@@ -76,7 +76,7 @@ def _simplified(
 def _with_corners(
     points: Array, faces: NDArray[np.integer], corners: Array, reach: float
 ) -> tuple[Array, NDArray[np.integer]]:
-    """The mesh with the tile's corners (K, 3) where simplification cut them off.
+    """The mesh with the tile's corners (K, 3) restored that simplification cut off.
 
     Simplification moves a corner's vertex along the border, in the neighbouring tiles, too. Without
     this repair the ground has a hole of one to two steps where four tiles meet. The border edges
@@ -109,7 +109,7 @@ def _covered(points: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
 def _skirted(
     points: Array, faces: NDArray[np.int32], extent: tuple[float, float], depth: float
 ) -> tuple[Array, NDArray[np.int32]]:
-    """With vertical strips hung from the edges that lie on the tile's border."""
+    """The mesh with vertical strips, `depth` metres deep, below its edges on the tile's border."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     slack = 1e-3 * max(extent)
     x, y = points[edges, 0], points[edges, 1]

@@ -81,8 +81,8 @@ def cut_out(
     *,
     repeat: bool,
 ) -> tuple[Array, Float32, NDArray[np.int32]]:
-    """A mesh without its transparent parts. opaque: (h, w) of texels; repeat: whether the texture
-    wraps. Triangles across a border are cut, to within some texels.
+    """A mesh without its transparent parts. opaque: (h, w) mask of texels; repeat: whether the
+    texture wraps. Triangles across a border are cut, accurate to some texels.
     """
     h, w = opaque.shape
     table = np.zeros((h + 1, w + 1), np.int64)
@@ -114,7 +114,7 @@ def cut_out(
 
 
 def _mostly(corners: Array, opaque: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which triangles (F, 3, 2), texels, are opaque at half of their samples or more."""
+    """Mask (F,) of the triangles (F, 3, 2), in texels, of which at least half is opaque."""
     h, w = opaque.shape
     x, y = np.moveaxis(np.einsum("sk,fkc->fsc", _CENTRE, corners), -1, 0).astype(np.int64)
     return np.asarray(opaque[y % h, x % w].mean(axis=1) >= 0.5)
@@ -123,7 +123,7 @@ def _mostly(corners: Array, opaque: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _halved(
     positions: Array, uvs: Float32, faces: NDArray[np.int32]
 ) -> tuple[Array, Float32, NDArray[np.int32]]:
-    """Each triangle as four, with vertices of their own."""
+    """The mesh with each triangle divided into four, which share no vertices."""
     count = len(faces)
     pairs = ((0, 1), (1, 2), (2, 0))
     middles = [0.5 * (positions[faces[:, a]] + positions[faces[:, b]]) for a, b in pairs]
@@ -194,8 +194,8 @@ def _with_picture(material: MtlMaterial, text: str, library: Path, obj_folder: P
 
 
 def _picture(text: str, library: Path, obj_folder: Path) -> tuple[Path | None, str]:
-    """The file of a texture statement, and its name: the whole text, or what follows its options,
-    or its last word.
+    """File and name of a texture statement. The name is the whole text, the text after its options,
+    or its last word; the file is None if none of them exists.
     """
     _, name = _options(text)
     for candidate in (text, name, text.rsplit(maxsplit=1)[-1]):
@@ -207,7 +207,7 @@ def _picture(text: str, library: Path, obj_folder: Path) -> tuple[Path | None, s
 
 
 def _options(text: str) -> tuple[dict[str, list[str]], str]:
-    """Options of a texture statement, and what follows them."""
+    """Options of a texture statement, and the text after them."""
     words, found = text.split(), dict[str, list[str]]()
     while words and words[0].lower() in _OPTIONS:
         name, most = words[0].lower(), _OPTIONS[words[0].lower()]
@@ -220,13 +220,13 @@ def _options(text: str) -> tuple[dict[str, list[str]], str]:
 
 
 def _pair(words: list[str], default: float) -> tuple[float, float]:
-    """The first two numbers of an option, which may leave the later ones out."""
+    """The first two numbers of an option; omitted ones are `default`."""
     u, v, *_ = [*_floats(words), default, default]
     return u, v
 
 
 def _floats(words: list[str]) -> list[float]:
-    """Of words; empty where one of them is no number."""
+    """The words as numbers; empty if one of them is no number."""
     try:
         return [float(word) for word in words]
     except ValueError:

@@ -23,7 +23,7 @@ from localizer.map.importers.materials import MtlMaterial, cut_out, read_mtl
 from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.importers.textures import palette_mesh, require_readable
-from localizer.map.importers.tiles3d import inside, read_file
+from localizer.map.importers.tiles3d import read_file, resolve_inside
 from localizer.map.source import SourceMesh
 from localizer.plain_files import decode_lenient
 
@@ -59,7 +59,7 @@ class MeshFile:
             rules = self.rules
             data = read_file(self.path, rules)
             meshes, rtc = read_gltf(
-                data, lambda uri: read_file(inside(folder, folder, uri), rules), rules
+                data, lambda uri: read_file(resolve_inside(folder, folder, uri), rules), rules
             )
             meshes = [replace(m, positions=m.positions + rtc) for m in meshes]
         meshes = [m for m in meshes if len(m.faces)]
@@ -86,7 +86,9 @@ def _has_area(mesh: SourceMesh) -> bool:
 
 
 def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
-    """The materials of an OBJ's libraries by name, and its missing textures as sentences."""
+    """The materials of an OBJ's libraries by name, and its flaws as sentences: missing textures,
+    libraries or materials, faces without a picture.
+    """
     libraries = [p for p in files_beside(path) if p.suffix.lower() == ".mtl" and p.is_file()]
     found = [m for library in libraries for m in read_mtl(library, path.parent)]
     doubts = [f"its texture {name!r} is not there" for m in found for name in m.missing]
@@ -144,7 +146,7 @@ def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:
 
 
 def _with_materials(text: bytes, materials: Mapping[str, MtlMaterial]) -> bytes:
-    """An OBJ that names its own library first; faces before any usemtl get the only material."""
+    """An OBJ with its own library named first; faces before any usemtl get the only material."""
     text = _USE.sub(rb"usemtl \1", text.removeprefix(b"\xef\xbb\xbf"))
     if len(materials) == 1 and not _names_first_face(text) and (face := _FACE.search(text)):
         (name,) = materials
@@ -159,7 +161,7 @@ def _names_first_face(text: bytes | mmap.mmap) -> bool:
 
 
 def _require_short_lines(path: Path) -> None:
-    """One face of 900,000 corners took more than 90 s to be made triangles of."""
+    """`MapSourceError` for a face with very many corners, which takes minutes to triangulate."""
     with path.open("rb") as file:
         while line := file.readline(_LINE_BYTES + 1):
             if len(line) > _LINE_BYTES:

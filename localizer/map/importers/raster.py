@@ -45,10 +45,10 @@ from localizer.map.importers.raster_file import (
     has_own_mask,
     has_separate_mask,
     height_band,
-    inside,
+    is_on_raster,
     offline,
+    open_cached,
     open_raster,
-    opened,
     require_sane,
     stated_imagery,
 )
@@ -140,7 +140,7 @@ class RasterTile:
         n = self.grid.cells + 1
         with _warped(self.dsm, self.grid.crs, transform, n, how, self.band.missing) as vrt:
             raw = vrt.read(1, masked=True).astype(np.float64)
-            bad = ~np.isfinite(raw.filled(np.nan)) | ~_shown(vrt, opened(self.dsm))
+            bad = ~np.isfinite(raw.filled(np.nan)) | ~_shown(vrt, open_cached(self.dsm))
         if self.band.missing is None:
             bad |= ~self._on(self.dsm, left + east * np.arange(n), top - south * np.arange(n))
         heights = self.band.metres(raw.data)
@@ -148,24 +148,24 @@ class RasterTile:
         return np.ma.masked_array(heights, bad)
 
     def _require_ground(self, heights: Array) -> None:
-        """What the samples of the whole surface missed."""
+        """Check this tile's heights, which the samples of the whole DSM may have missed."""
         odd = heights[(heights < LOWEST_M) | (heights > HIGHEST_M)]
         if len(odd):
-            self.rules.doubt("heights", f"a height of {odd[0]:g} m, which no ground on Earth has")
+            self.rules.accept("heights", f"a height of {odd[0]:g} m, which no ground on Earth has")
 
     def _on(
         self, path: Path, x: NDArray[np.floating], y: NDArray[np.floating]
     ) -> NDArray[np.bool_]:
-        """Which points of a grid, (len(y), len(x)), lie on a raster that does not say so itself."""
-        data = opened(path)
+        """Mask (len(y), len(x)) of grid points on a raster without its own mask."""
+        data = open_cached(path)
         if has_own_mask(data):
             return np.ones((len(y), len(x)), bool)
         grid_x, grid_y = np.meshgrid(x, y)
         rim = np.ones(grid_x.shape, bool)
         rim[1:-1, 1:-1] = False
-        if inside(data, self.grid.crs, grid_x[rim], grid_y[rim]).all():
+        if is_on_raster(data, self.grid.crs, grid_x[rim], grid_y[rim]).all():
             return np.ones(grid_x.shape, bool)
-        return inside(data, self.grid.crs, grid_x, grid_y)
+        return is_on_raster(data, self.grid.crs, grid_x, grid_y)
 
     def _image(self) -> tuple[Image, NDArray[np.bool_]]:
         """Texture (TEXELS, TEXELS, 3), and per texel whether the orthophoto shows something."""
@@ -174,7 +174,7 @@ class RasterTile:
         transform = Affine(east * size, 0, left, 0, -south * size, top)
         with _warped(self.ortho, self.grid.crs, transform, TEXELS, Resampling.average) as vrt:
             image = np.moveaxis(vrt.read(self.colours), 0, -1)
-            shown = _shown(vrt, opened(self.ortho))
+            shown = _shown(vrt, open_cached(self.ortho))
         middles = size * (np.arange(TEXELS) + 0.5)
         shown &= self._on(self.ortho, left + east * middles, top - south * middles)
         return np.ascontiguousarray(image, np.uint8), shown
@@ -290,7 +290,7 @@ def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path, 
 
 
 def _kind(data: DatasetReader) -> str:
-    """By the bands: heights are one band wider than a byte, colours are bytes."""
+    """DSM or orthophoto, by the bands: one band wider than a byte, or bands of bytes."""
     bands = zip(data.dtypes, data.colorinterp, strict=True)
     colours = [dtype for dtype, meaning in bands if meaning != ColorInterp.alpha]
     if len(colours) == 1 and colours[0] != "uint8" and not colours[0].startswith("complex"):
@@ -326,14 +326,14 @@ def _grid(dsm: DatasetReader, ortho: DatasetReader) -> HeightGrid:
 
 
 def _flat_crs(data: DatasetReader) -> CRS:
-    """A raster's horizontal CRS: the heights are ours, not GDAL's, to convert."""
+    """A raster's horizontal CRS. The importer converts heights itself, so GDAL must not."""
     own = CRS(data.crs)
     flat = own.sub_crs_list[0] if own.is_compound else own
     return flat.to_2d() if len(flat.axis_info) == 3 else flat
 
 
 def _metric_crs(data: DatasetReader) -> CRS:
-    """The raster's own horizontal CRS where that is in metres, else the UTM zone of its centre."""
+    """The raster's horizontal CRS if it is in metres, otherwise the UTM zone of its centre."""
     flat = _flat_crs(data)
     metric = all(axis.unit_name in ("metre", "meter", "m") for axis in flat.axis_info[:2])
     if flat.is_projected and metric:
@@ -357,8 +357,8 @@ def _texel_size(ortho: DatasetReader, crs: CRS) -> float:
 
 
 def _shown(vrt: WarpedVRT, data: DatasetReader) -> NDArray[np.bool_]:
-    """Where a warped raster has something: by its own mask, and by the alpha that warping added,
-    which is no mask to GDAL where the heights are no bytes.
+    """Mask of a warped raster's valid pixels: by its own mask and by the alpha band of the warping,
+    which GDAL does not treat as a mask unless the heights are bytes.
     """
     shown: NDArray[np.bool_] = vrt.dataset_mask() > 0
     if vrt.count > data.count:
@@ -375,8 +375,8 @@ def _warped(
     how: Resampling,
     missing: float | None = None,
 ) -> Iterator[WarpedVRT]:
-    """A raster resampled to a square grid. missing: its number without a meaning, if it is told."""
-    data = opened(path)
+    """Context manager: a raster resampled to a square grid. missing: the user's nodata value."""
+    data = open_cached(path)
     flat = _flat_crs(data)
     same = flat == CRS(crs)
     own = data.crs if flat == CRS(data.crs) else flat.to_wkt()

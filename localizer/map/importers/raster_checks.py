@@ -12,7 +12,7 @@ from scipy.ndimage import find_objects, grey_opening, label
 
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
-from localizer.map.importers.raster_file import HeightBand, applied, has_own_mask, inside
+from localizer.map.importers.raster_file import HeightBand, apply_affine, has_own_mask, is_on_raster
 from localizer.map.importers.rules import HIGHEST_M, LOWEST_M, ImportRules
 
 _SAMPLES = 4000  # of a side
@@ -48,7 +48,7 @@ def check_heights(
         values, counts = np.unique(odd, return_counts=True)
         value = float(values[counts.argmax()])
         warnings.append(
-            rules.doubt(
+            rules.accept(
                 "heights",
                 f"{path}: {100 * len(odd) / len(known):.2g} % of its heights occur nowhere on "
                 f"Earth, most often {value:g}: missing heights that are not marked so (--nodata="
@@ -61,7 +61,7 @@ def check_heights(
 
 
 def _sampled(data: DatasetReader, band: HeightBand) -> np.ma.MaskedArray:
-    """The DSM's own numbers, (h, w) float64, thinned out where it is large."""
+    """The DSM's own numbers, (h, w) float64, subsampled if it is large."""
     shape = min(data.height, _SAMPLES), min(data.width, _SAMPLES)
     return _masked(data, band, out_shape=shape, resampling=rasterio.enums.Resampling.nearest)
 
@@ -75,7 +75,7 @@ def _masked(data: DatasetReader, band: HeightBand, **how: object) -> np.ma.Maske
 
 
 def _fill(path: Path, known: Array, band: HeightBand, rules: ImportRules) -> list[str]:
-    """One number at the end of the range, often, with nothing near it: no ground is like that."""
+    """Warning about unmarked nodata: a frequent number at the end of the range, near no other."""
     warnings = []
     for extreme in (known.min(), known.max()):
         rest = known[known != extreme]
@@ -85,7 +85,7 @@ def _fill(path: Path, known: Array, band: HeightBand, rules: ImportRules) -> lis
         gap = abs(band.gain) * float(np.abs(rest - extreme).min())
         if gap > _FILL_GAP_M:
             warnings.append(
-                rules.doubt(
+                rules.accept(
                     "nodata",
                     f"{path}: {100 * share:.2g} % of its heights are {extreme:g}, with nothing "
                     f"within {gap:.0f} m of it: missing heights that are not marked so? (--nodata="
@@ -96,7 +96,7 @@ def _fill(path: Path, known: Array, band: HeightBand, rules: ImportRules) -> lis
 
 
 def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportRules) -> list[str]:
-    """Noise, or a unit that makes cliffs of slopes. At the DSM's own cells about its middle."""
+    """Warning about noise or a wrong unit, by the steepness of cells near the DSM's centre."""
     width, height = min(data.width, _WINDOW), min(data.height, _WINDOW)
     window = Window((data.width - width) // 2, (data.height - height) // 2, width, height)
     raw = _masked(data, band, window=window)
@@ -107,7 +107,7 @@ def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportR
     if share < _STEEP_SHARE:
         return []
     return [
-        rules.doubt(
+        rules.accept(
             "slope",
             f"{path}: {100 * share:.0f} % of its cells rise by more than 80 degrees: noise, "
             "another unit (--height-unit), or not heights",
@@ -116,7 +116,7 @@ def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportR
 
 
 def _spikes(path: Path, data: DatasetReader, band: HeightBand) -> list[str]:
-    """Few cells far above or below all that is about them: a bird, a cloud, a damaged number."""
+    """Warning about few cells far above or below all around: a bird, a cloud, an error."""
     step = _step_m(data)
     found: list[tuple[float, float, float, float]] = []
     rows = max(1, _STRIP_CELLS // data.width)
@@ -206,7 +206,7 @@ def check_overlap(
     if share == 0.0:
         raise MapSourceError(f"{text}: it lies beside it; check both places and CRS")
     if share < _LEAST_OVERLAP:
-        return [rules.doubt("overlap", f"{text}; check both places and CRS")]
+        return [rules.accept("overlap", f"{text}; check both places and CRS")]
     return [text]
 
 
@@ -218,10 +218,10 @@ def _covered_share(dsm: DatasetReader, band: HeightBand, ortho: DatasetReader) -
     rows, columns = np.nonzero(known)
     if not len(rows):
         return 0.0
-    x, y = applied(
+    x, y = apply_affine(
         dsm.transform,
         (columns + 0.5) * dsm.width / shape[1],
         (rows + 0.5) * dsm.height / shape[0],
     )
-    on = inside(ortho, dsm.crs.to_wkt(), x, y)
+    on = is_on_raster(ortho, dsm.crs.to_wkt(), x, y)
     return float(on.mean())

@@ -91,8 +91,8 @@ def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRul
     return path
 
 
-def opened(path: Path) -> DatasetReader:
-    """As `open_raster`, cached for the next tile of the same process."""
+def open_cached(path: Path) -> DatasetReader:
+    """As `open_raster`; the dataset is cached for the next tile of the same process."""
     stat = path.stat()
     return _kept(path, stat.st_mtime_ns, stat.st_size)
 
@@ -113,7 +113,7 @@ def _require_tiff(path: Path) -> None:
 
 
 def _require_plain_sidecar(path: Path) -> None:
-    """Statistics and georeferences are fine; another file to be opened instead is not."""
+    """`MapSourceError` if an .aux.xml makes GDAL open another file; statistics are allowed."""
     if not path.exists():
         return
     require_plain_file(path)
@@ -143,14 +143,14 @@ def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> list[st
 
 
 def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
-    """Doubts about where its corners lie; an error where that is nowhere on Earth."""
+    """Doubts about the position of its corners; an error if that is nowhere on Earth."""
     crs = CRS(data.crs)
     if not crs.is_geographic and not crs.is_projected:
         raise GeoreferenceError(
             f"{path}: its CRS, {crs.name}, is neither geographic nor projected: nothing says where "
             "on Earth it lies; assign it one that does"
         )
-    x, y = applied(
+    x, y = apply_affine(
         data.transform,
         np.array([0.0, data.width, 0.0, data.width]),
         np.array([0.0, 0.0, data.height, data.height]),
@@ -171,7 +171,7 @@ def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
         )
     text = far_outside(crs, lon, lat)
     if text is not None:
-        return [rules.doubt("area", f"{path}: {text}")]
+        return [rules.accept("area", f"{path}: {text}")]
     unsure = datum_doubt(crs, float(np.mean(lon)), float(np.mean(lat)))
     return [] if unsure is None else [f"{path.name}: {unsure}"]
 
@@ -217,17 +217,19 @@ def has_separate_mask(data: DatasetReader) -> bool:
     return MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags
 
 
-def applied(transform: Affine, x: Array, y: Array) -> tuple[Array, Array]:
-    """Apply an affine transform to points; independent of affine's version."""
+def apply_affine(transform: Affine, x: Array, y: Array) -> tuple[Array, Array]:
+    """Apply a transform to points: a raster's takes its columns and rows to its CRS, the inverse
+    back. Independent of affine's version.
+    """
     t = transform
     return t.a * x + t.b * y + t.c, t.d * x + t.e * y + t.f
 
 
-def inside(data: DatasetReader, crs: str, x: Array, y: Array) -> NDArray[np.bool_]:
-    """Whether points of a CRS are on the raster. x, y: of one shape."""
+def is_on_raster(data: DatasetReader, crs: str, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Mask of the points x, y (equal shapes) of a CRS that are on the raster."""
     transformer = _flat(crs, CRS(data.crs).to_wkt())
     source_x, source_y = transformer.transform(x, y)
-    column, row = applied(~data.transform, np.asarray(source_x), np.asarray(source_y))
+    column, row = apply_affine(~data.transform, np.asarray(source_x), np.asarray(source_y))
     slack = 1e-3  # of a pixel
     return np.asarray(
         (column >= -slack)
@@ -270,15 +272,16 @@ def height_band(
     nodata: float | None,
     rules: ImportRules,
 ) -> tuple[HeightBand, list[str]]:
-    """Conversion of the DSM's numbers to metres; an unknown unit is an error. `GeoreferenceError`
-    for the unit, `MapSourceError` if scale and offset give no heights.
+    """Conversion of the DSM's numbers to metres, and warnings. height_unit, nodata: given by the
+    user, or None. `GeoreferenceError` for an unknown unit, `MapSourceError` if scale and offset
+    give no heights.
     """
     unit, warnings = stated.unit_m, []
     if height_unit is not None:
         given = unit_of(height_unit)
         if unit is not None and abs(given / unit - 1) > 1e-4:
             warnings.append(
-                rules.doubt(
+                rules.accept(
                     "datum",
                     f"{path}: --height-unit {height_unit}, but the file says units of {unit:g} m",
                 )

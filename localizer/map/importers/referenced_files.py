@@ -47,7 +47,7 @@ def file_of(folder: Path, name: str) -> Path:
 
 
 def _entry(folder: Path, name: str) -> Path:
-    """An entry of a folder, in any letter case if there is none of that very name."""
+    """An entry of a folder: with exactly this name, otherwise in any letter case."""
     path = folder / name
     if name == ".." or _exists(path) or not folder.is_dir():
         return path
@@ -56,7 +56,7 @@ def _entry(folder: Path, name: str) -> Path:
 
 @lru_cache(maxsize=64)
 def _entries(folder: Path, _modified_ns: int) -> dict[str, str]:
-    """Names of a folder by how they read in any letter case; kept, as many files may be missing."""
+    """Names in a folder by their lower-case form; cached, because many files may be missing."""
     names = sorted((entry.name for entry in folder.iterdir()), reverse=True)
     return {name.casefold(): name for name in names}
 
@@ -80,7 +80,7 @@ def files_beside(path: Path) -> tuple[Path, ...]:
 
 
 def _of_obj(path: Path) -> Iterator[Path]:
-    """Its material libraries, and their pictures."""
+    """Material libraries of an OBJ, and their images."""
     if path.stat().st_size == 0:  # which cannot be mapped
         return
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
@@ -95,8 +95,8 @@ def _of_obj(path: Path) -> Iterator[Path]:
 
 
 def _named(folder: Path, text: str) -> Iterator[Path]:
-    """The file of the whole line, which may have blanks, and that of its last word: before it may
-    stand options.
+    """Files of a line: the whole line as a name with blanks, and its last word, before which
+    options may stand.
     """
     line = text.strip()
     for name in {line, line.split()[-1]} if line else ():
@@ -104,13 +104,13 @@ def _named(folder: Path, text: str) -> Iterator[Path]:
 
 
 def _each(folder: Path, text: str) -> Iterator[Path]:
-    """The files of the line's words: a line may name several libraries."""
+    """The files that the line's words name: a line may name several libraries."""
     for name in text.split():
         yield file_of(folder, name)
 
 
 def _of_gltf(path: Path) -> Iterator[Path]:
-    """Its buffers and pictures that are not inside it."""
+    """External buffers and images of a glTF."""
     document = _gltf_json(path)
     for kind in ("buffers", "images"):
         entries = document.get(kind)

@@ -74,7 +74,7 @@ class ImportRules:
         return replace(cls(), **given, trusted=frozenset(trusted))
 
     def limits(self) -> dict[str, int]:
-        """Name to number."""
+        """Value of each limit by its name."""
         return {name: getattr(self, name) for name in limit_names()}
 
     def require(self, name: str, amount: float, where: object) -> None:
@@ -87,8 +87,10 @@ class ImportRules:
                 f"the limit (--limit {name}={amount:.0f})"
             )
 
-    def doubt(self, name: str, text: str) -> str:
-        """The text as a warning if the user accepts the doubt, else `MapSourceError`."""
+    def accept(self, name: str, text: str) -> str:
+        """Return the text of a doubt as a warning if the user accepts doubts of this name;
+        otherwise raise it as a `MapSourceError`.
+        """
         if name not in self.trusted:
             raise MapSourceError(f"{text}; if that is meant: --trust {name}")
         return text

@@ -21,8 +21,8 @@ _BLOCK = 4  # texels per colour of a palette, so that bilinear look-up at its ce
 
 
 def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
-    """(width, height) and format of a picture, from its header. `MapSourceError` if it cannot be
-    read.
+    """(width, height) and format (None: unknown) of an image, from its header. `MapSourceError` if
+    it cannot be read.
     """
     try:
         with PillowImage.open(io.BytesIO(data)) as header:
@@ -43,8 +43,8 @@ def require_readable(path: Path, rules: ImportRules) -> None:
 
 
 def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
-    """RGB image (h, w, 3) of JPEG, PNG or WebP bytes, and the bytes again when they are JPEG.
-    `MapSourceError` if it cannot be decoded.
+    """RGB image (h, w, 3) of JPEG, PNG or WebP bytes, and the bytes again if they are JPEG, else
+    None. `MapSourceError` if it cannot be decoded.
     """
     (width, height), kind = picture_size(data)
     rules.require("texels", float(width) * height, f"a texture of {width}x{height}")
@@ -83,9 +83,9 @@ def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> 
     return SourceMesh(positions[faces.ravel()], uvs, apart, image, palette=True)
 
 
-def placed(mesh: SourceMesh, T: Array) -> SourceMesh:
-    """The mesh after a transform (4, 4). A mirroring transform also reverses the corner order, so
-    that the front side stays (glTF 2.0, 3.7.4).
+def transform_mesh(mesh: SourceMesh, T: Array) -> SourceMesh:
+    """The mesh after a transform (4, 4). A mirroring transform also reverses the corner order,
+    which keeps the front side (glTF 2.0, 3.7.4).
     """
     made = replace(mesh, positions=mesh.positions @ T[:3, :3].T + T[:3, 3])
     if np.linalg.det(T[:3, :3]) < 0:
@@ -93,7 +93,7 @@ def placed(mesh: SourceMesh, T: Array) -> SourceMesh:
     return made
 
 
-def merged_by_picture(parts: list[SourceMesh]) -> list[SourceMesh]:
+def merge_by_image(parts: list[SourceMesh]) -> list[SourceMesh]:
     """One mesh per image; all flat colours become one palette."""
     groups: dict[tuple[int, bool], list[SourceMesh]] = {}
     palettes = [p for p in parts if p.palette]

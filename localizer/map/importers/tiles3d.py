@@ -19,7 +19,7 @@ from localizer.map.importers.georeference import UpAxis
 from localizer.map.importers.gltf import gltf_bounds, gltf_weight, read_gltf
 from localizer.map.importers.referenced_files import file_of, files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
-from localizer.map.importers.textures import placed
+from localizer.map.importers.textures import transform_mesh
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 
 _MAX_USES = 64  # of one tileset: each of a few that name each other multiplies their tiles
@@ -68,7 +68,7 @@ class ContentFile:
         data, rtc = self._gltf()
         meshes, gltf_rtc = read_gltf(data, self._beside, self.rules)
         T = self._ecef_from_gltf(rtc + gltf_rtc)
-        return [placed(m, T) for m in meshes]
+        return [transform_mesh(m, T) for m in meshes]
 
     def corners(self) -> Array:
         """(N, 3) ECEF corners of boxes that hold the content, by the file's headers."""
@@ -97,14 +97,14 @@ class ContentFile:
         return data, np.zeros(3)
 
     def _beside(self, uri: str) -> bytes:
-        return read_file(inside(self.folder, self.path.parent, uri), self.rules)
+        return read_file(resolve_inside(self.folder, self.path.parent, uri), self.rules)
 
 
 def read_tileset(
     path: Path, rules: ImportRules | None = None, up_axis: UpAxis | None = None
 ) -> SourceTree:
     """Read `tileset.json` (or the folder that holds it) and every tileset it refers to. up_axis: of
-    its glTF, whatever it says itself. `MapSourceError` if one cannot be read or is malformed.
+    its glTF; None: as the tileset says. `MapSourceError` if one cannot be read or is malformed.
     """
     try:
         return _read_tileset(path, rules or ImportRules(), up_axis)
@@ -154,7 +154,7 @@ def read_file(path: Path, rules: ImportRules) -> bytes:
 
 
 def _gunzipped(data: bytes, path: Path, rules: ImportRules) -> bytes:
-    """Content that a web server would send compressed, as some exporters write it."""
+    """The decompressed content, if it is gzip, as some exporters write it."""
     unpacker = zlib.decompressobj(wbits=31)
     try:
         plain = unpacker.decompress(data, rules.file_bytes + 1)
@@ -166,7 +166,7 @@ def _gunzipped(data: bytes, path: Path, rules: ImportRules) -> bytes:
     return plain
 
 
-def inside(folder: Path, base: Path, uri: str) -> Path:
+def resolve_inside(folder: Path, base: Path, uri: str) -> Path:
     """The file of a `uri` relative to `base`; `MapSourceError` if it is outside `folder`."""
     parts = urlsplit(uri)
     if parts.scheme or parts.netloc:
@@ -200,7 +200,10 @@ class _Reader:
         return _object(document, f"{path}: the document")
 
     def tileset(self, path: Path, parent: Array, depth: int, *, replaces: bool) -> SourceNode:
-        """The root node of a tileset file, placed under `parent` (4, 4)."""
+        """The root node of a tileset file. parent: (4, 4) transform that ECEF has from the tileset.
+        depth: number of nodes above. replaces: the node above is replaced by its children
+        (REPLACE), not added to (ADD).
+        """
         if path in self._open:
             raise MapSourceError(f"{path}: external tilesets refer to each other in a cycle")
         self._uses[path] = self._uses.get(path, 0) + 1
@@ -224,7 +227,7 @@ class _Reader:
         return node
 
     def _require_version(self, version: Any, path: Path) -> None:
-        """1.0 and 1.1; several exporters write 0.0, 0, 1 or nothing for 1.0."""
+        """Accept 1.0 and 1.1; several exporters write 0.0, 0, 1 or nothing for 1.0."""
         text = "" if version is None else str(version).strip()
         if text in ("1.0", "1.1"):
             return
@@ -234,7 +237,7 @@ class _Reader:
         self.warnings.append(f"{path.name}: {said}, read as 1.0")
 
     def _corners(self, volume: Any, T: Array, path: Path) -> Array | None:
-        """See `_corners`; a region in degrees is reported, and read as meant."""
+        """As the function `_corners`; a region in degrees is converted, with a warning."""
         region: Any = volume.get("region") if isinstance(volume, dict) else None
         if _is_in_degrees(region):
             self.warnings.append(
@@ -259,7 +262,7 @@ class _Reader:
         tiles: list[ContentFile] = []
         children: list[SourceNode] = []
         for uri in _content_uris(data, path):
-            file = inside(self.folder, path.parent, uri)
+            file = resolve_inside(self.folder, path.parent, uri)
             if file.suffix.lower() == ".json":
                 children.append(self.tileset(file, T, depth + 1, replaces=refine == "REPLACE"))
             else:
@@ -274,11 +277,11 @@ class _Reader:
         return SourceNode(error * scale, refine == "REPLACE", tuple(tiles), children, corners)
 
     def _doubted(self, T: Array, path: Path) -> Array:
-        """A tile's transform, which should move and turn only."""
+        """A tile's transform (4, 4), with a warning if it does more than move and rotate."""
         text = transform_warning(T)
         if text is not None:
             name = "mirrored" if np.linalg.det(T[:3, :3]) < 0 else "scaled"
-            self.warnings.append(self.rules.doubt(name, f"{path}: a tile's transform {text}"))
+            self.warnings.append(self.rules.accept(name, f"{path}: a tile's transform {text}"))
         return T
 
 
@@ -390,7 +393,7 @@ def _centre_of_content(root: SourceNode, stated: Array) -> Array:
 
 
 def _stated_centre(root: dict[str, Any], where: str) -> Array:
-    """The root's transform if it leads to the Earth's surface, else the middle of its volume."""
+    """(3,) ECEF: the root transform's origin if near the Earth's surface, else its volume's."""
     T = _transform(root, where)
     if np.linalg.norm(T[:3, 3]) > 1e6:
         return np.asarray(T[:3, 3])

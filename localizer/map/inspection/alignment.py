@@ -43,7 +43,7 @@ class ImageryOffset:
         return float(np.hypot(self.east_m, self.north_m))
 
 
-def alignment_of(mosaic: Mosaic) -> ImageryOffset:
+def measure_alignment(mosaic: Mosaic) -> ImageryOffset:
     """The offset at which the imagery's edges match the surface's steps best.
 
     Accurate to about a metre: walls that lean in the image bias it. Unknown without colours.
@@ -78,8 +78,8 @@ def alignment_of(mosaic: Mosaic) -> ImageryOffset:
 
 
 def _colour_edges(rgb: Float32) -> Float32:
-    """Gradient (h, w) of the colour without its brightness: the edge of a shadow is none, and every
-    shadow lies to the same side.
+    """Gradient (h, w) of the colour without its brightness. Shadows change the brightness only, and
+    all fall to one side, so their edges would bias the offset.
     """
     smooth = cv2.GaussianBlur(rgb, (0, 0), _SMOOTH_M / _CELL_M)
     chroma = (smooth + _DARK) / (smooth.sum(axis=2, keepdims=True) + 3 * _DARK)

@@ -14,9 +14,9 @@ from localizer.errors import MapCacheError
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.tile import orientation_fault, vector_area
-from localizer.map.inspection.alignment import ImageryOffset, alignment_of
+from localizer.map.inspection.alignment import ImageryOffset, measure_alignment
 from localizer.map.inspection.kind import map_kind
-from localizer.map.inspection.mosaic import Mosaic, mosaic_of
+from localizer.map.inspection.mosaic import Mosaic, render_mosaic
 from localizer.map.inspection.usable import UsableArea, usable_part
 from localizer.map.kind import HEIGHTS_HOLD, MapKind
 from localizer.types import Image
@@ -59,8 +59,8 @@ class MapFinding:
 
 @dataclass(frozen=True)
 class MapUse:
-    """Use of the map. height_m: above the ground; pixel_rad: angle of a working pixel;
-    half_view_deg: half of the camera's field of view.
+    """Planned use of the map. height_m: of the flight above the ground; pixel_rad: angle of a
+    working pixel; half_view_deg: half of the camera's field of view.
     """
 
     height_m: float
@@ -73,16 +73,16 @@ class MapUse:
         return self.height_m * self.pixel_rad
 
     def width_px(self, pixel_m: float) -> int:
-        """The working width, a multiple of 16, at which a pixel is no smaller than that."""
+        """Working width (multiple of 16) at which a pixel covers at least pixel_m of ground."""
         ground_m = 2.0 * self.height_m * math.tan(math.radians(self.half_view_deg))
         return max(int(ground_m / pixel_m) // 16, _LEAST_WIDTH // 16) * 16
 
 
 @dataclass(frozen=True)
 class MapCheck:
-    """Result of `companion map check`. findings: the result of each question; pictures: RGB images
-    by name; size_m: east and north of the rectangle about the map; usable: the largest part of it
-    without gaps, blank areas and coarse texels.
+    """Result of `companion map check`. findings: one for each check; pictures: RGB images by name;
+    size_m: east and north extent of the map's bounding rectangle; usable: its largest part without
+    gaps, blank areas and coarse texels; None without any.
     """
 
     findings: tuple[MapFinding, ...]
@@ -114,11 +114,11 @@ class Seam:
 
 def check_map(cache: TileCache, use: MapUse) -> MapCheck:
     """Run all checks, with an image of each."""
-    mosaic = mosaic_of(cache)
+    mosaic = render_mosaic(cache)
     gaps, holes = _holes(mosaic)
     blank = _blank(mosaic) | _without_texels(cache, mosaic, use)
-    seams = seams_of(cache, mosaic)
-    shift = alignment_of(mosaic)
+    seams = find_seams(cache, mosaic)
+    shift = measure_alignment(mosaic)
     kind = map_kind(cache)
     findings = (
         *_intact(cache),
@@ -146,7 +146,7 @@ def check_map(cache: TileCache, use: MapUse) -> MapCheck:
     return MapCheck(findings, pictures, (columns * mosaic.gsd_m, rows * mosaic.gsd_m), usable)
 
 
-def seams_of(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
+def find_seams(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
     """Borders of the finest nodes inside the map."""
     index, rows, columns = cache.index, *mosaic.height.shape
     grey = mosaic.rgb.astype(np.float32).mean(axis=2)
@@ -168,7 +168,7 @@ def seams_of(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
 
 
 def _step(layer: NDArray[np.float32], at: int, ends: tuple[int, int], across: int) -> float:
-    """Median step over a line of a layer (rows, columns), less that beside it; 0 where unknown."""
+    """Median step across a line of a layer, minus the steps beside it; 0 where unknown."""
     lines = layer if across else layer.T
     near = lines[ends[0] : ends[1], at - 4 : at + 4]
     over = np.abs(near[:, 4] - near[:, 3])
@@ -180,7 +180,7 @@ def _step(layer: NDArray[np.float32], at: int, ends: tuple[int, int], across: in
 
 
 def _holes(mosaic: Mosaic) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Where there is no map, and of that what map surrounds, (h, w)."""
+    """Masks (h, w): where there is no map, and the part of that which map surrounds."""
     gaps = np.isnan(mosaic.height)
     framed = np.pad(gaps.astype(np.uint8), 1, constant_values=1)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(framed, connectivity=4)
@@ -190,7 +190,7 @@ def _holes(mosaic: Mosaic) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
 
 def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
-    """Surface under one flat white or black, (h, w)."""
+    """Mask (h, w) of the surface with uniformly white or black imagery."""
     low, high = mosaic.rgb.min(axis=2), mosaic.rgb.max(axis=2)
     flat = (high - low <= _FLAT) & ((low >= _WHITE) | (high <= _BLACK))
     flat &= ~np.isnan(mosaic.height)
@@ -201,12 +201,12 @@ def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
 
 
 def _without_texels(cache: TileCache, mosaic: Mosaic, use: MapUse) -> NDArray[np.bool_]:
-    """Surface of flat colours, which has no picture, (h, w)."""
+    """Mask (h, w) of the surface with flat colours instead of imagery."""
     return np.asarray(~np.isnan(mosaic.height) & (_texel_ratio(cache, mosaic, use) == 0.0))
 
 
 def _flat_share(mosaic: Mosaic) -> float:
-    """Of the surface: its largest part of one colour."""
+    """Share of the surface that its most frequent single colour covers."""
     around = np.ones((3, 3), np.uint8)
     spread = cv2.dilate(mosaic.rgb, around).astype(np.int16) - cv2.erode(mosaic.rgb, around)
     known = ~np.isnan(mosaic.height)
@@ -216,7 +216,7 @@ def _flat_share(mosaic: Mosaic) -> float:
 
 
 def _intact(cache: TileCache) -> list[MapFinding]:
-    """Whether all tiles can be read, of which the pictures need one level; and which way is up."""
+    """Findings: whether all tiles can be read (the images need one level), and which side is up."""
     damaged: list[str] = []
     area: Array = np.zeros(3)
     index = cache.index

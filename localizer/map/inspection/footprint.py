@@ -6,7 +6,7 @@ import json
 from typing import Any
 from xml.sax.saxutils import escape
 
-from localizer.geometry.antimeridian import Corner, cut
+from localizer.geometry.antimeridian import Corner, split_outline
 from localizer.map.cache.cache import Manifest
 
 
@@ -52,7 +52,7 @@ def as_kml(manifest: Manifest, name: str) -> str:
 
 def _rings(manifest: Manifest) -> list[list[Corner]]:
     """(longitude, latitude) corners, counter-clockwise, the first again at the end."""
-    return [_closed(ring) for ring in cut([(lon, lat) for lat, lon in manifest.extent])]
+    return [_closed(ring) for ring in split_outline([(lon, lat) for lat, lon in manifest.extent])]
 
 
 def _closed(corners: list[Corner]) -> list[Corner]:

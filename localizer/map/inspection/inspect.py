@@ -52,7 +52,9 @@ class Hole:
 
 @dataclass(frozen=True)
 class Verification:
-    """damaged: text for each damaged tile; holes: largest first; covered_m2: ground area."""
+    """Result of `verify`. damaged: a text for each damaged tile; holes: largest first; covered_m2:
+    ground area with map.
+    """
 
     tiles: int
     damaged: tuple[str, ...]
@@ -166,10 +168,11 @@ def write_picture(path: Path, rgb: Image) -> None:
 
 
 def export_glb(cache: TileCache, out: Path, level: int | None = None) -> int:
-    """Write the surface as one GLB, y up, metres about the cache's origin; returns triangles.
+    """Write the surface as one GLB, y up, metres from the cache's origin; returns the number of
+    triangles.
 
-    level: the depth of the tile tree to take (what ends above it is taken too), else the finest.
-    `OutsideMapError` for a level below the finest.
+    level: depth of the tile tree to export (with leaves above it); None: the finest.
+    `OutsideMapError` if the map has no such level.
     """
     finest = int(_depths(cache).max())
     if level is not None and level > finest:
@@ -215,7 +218,7 @@ def _leaf_tiles(cache: TileCache) -> Iterator[int]:
 
 
 def _cut(cache: TileCache, level: int | None) -> Iterator[int]:
-    """Tiles that together show the surface once, at a depth or at the finest."""
+    """Tiles that show the surface once: at a depth of the tree, or (None) the finest."""
     index = cache.index
     depth = _depths(cache)
     for node in range(len(depth)):

@@ -53,8 +53,8 @@ def measure_kind(
     imagery_date: str | None = None,
     sensor: str | None = None,
 ) -> MapKind:
-    """Measure the kind from vertical views of samples. heights: given by the user instead of
-    measured.
+    """Measure the kind from vertical views of samples. heights: given by the user; None: measured.
+    imagery_date, sensor: stored as given.
     """
     with TileStreamer(cache) as streamer:
         renderer = NumbaRenderer(streamer, 1)
@@ -69,13 +69,13 @@ def measure_kind(
 
 @dataclass(frozen=True)
 class _Sampler:
-    """Squares about the middles of leaves, spread over the map."""
+    """Makes vertical views of squares about the centres of leaves, spread over the map."""
 
     cache: TileCache
     renderer: NumbaRenderer
 
     def views(self, count: int, side_px: int, gsd_m: float) -> Iterator[tuple[Array, TopView]]:
-        """Each square's middle (2,) east and north, and its view."""
+        """The centre (2,), east and north m, of each square, and its view."""
         index = self.cache.index
         leaves = np.flatnonzero((index.child_count == 0) & (index.tile_count > 0))
         spread = np.linspace(0, len(leaves) - 1, min(count, len(leaves)))
@@ -90,7 +90,7 @@ def _heights(sampler: _Sampler) -> Heights:
     points, standing, known = [], 0, 0
     for centre, view in sampler.views(_SQUARES, _CELLS, _CELL_M):
         shown = np.isfinite(view.height)
-        standing += int(objects(view.height, _CELL_M).sum())
+        standing += int(object_mask(view.height, _CELL_M).sum())
         known += int(shown.sum())
         rows, columns = (cells[::37] for cells in np.nonzero(shown))
         east = centre[0] + (columns + 0.5 - _CELLS / 2) * _CELL_M
@@ -101,7 +101,7 @@ def _heights(sampler: _Sampler) -> Heights:
     return "flat" if not points or _from_plane_m(np.concatenate(points)) < _FLAT_M else "terrain"
 
 
-def objects(height: Float32, cell_m: float) -> NDArray[np.bool_]:
+def object_mask(height: Float32, cell_m: float) -> NDArray[np.bool_]:
     """Cells of a height grid (h, w), NaN where unknown, that belong to buildings or trees: narrower
     than 60 m, higher than 2 m, most of the border steep.
     """
@@ -132,7 +132,7 @@ def _from_plane_m(points: Array) -> float:
 
 
 def _resolution(sampler: _Sampler, texel_m: float) -> float:
-    """Metres that the imagery resolves; its texels' size where nothing can be measured."""
+    """Resolution of the imagery (m); the texel size if it cannot be measured."""
     texel_m = texel_m or _PALETTE_M
     low, high = sampler.cache.index.box_min[0], sampler.cache.index.box_max[0]
     room = float((high - low)[:2].min()) / texel_m
@@ -143,11 +143,11 @@ def _resolution(sampler: _Sampler, texel_m: float) -> float:
             grey = view.rgb.mean(axis=2, dtype=np.float32)
             if grey.std() > 2.0:
                 spectra.append(_spectrum(grey))
-    return texel_m / (2 * resolved(np.median(spectra, axis=0))) if spectra else texel_m
+    return texel_m / (2 * resolution_limit(np.median(spectra, axis=0))) if spectra else texel_m
 
 
 def _spectrum(grey: Float32) -> Array:
-    """Power (bands,) of an image (n, n) drawn at half a texel a pixel, by frequency."""
+    """Power (bands,) by frequency of an image (n, n) with half a texel per pixel."""
     n = len(grey)
     taper = np.hanning(n)[:, None] * np.hanning(n)
     power = np.abs(np.fft.fft2((grey - grey.mean()) * taper)) ** 2
@@ -163,7 +163,7 @@ def _frequencies() -> Array:
     return (np.arange(_BANDS) + 0.5) / (2 * _BANDS)
 
 
-def resolved(power: Array) -> float:
+def resolution_limit(power: Array) -> float:
     """Spatial frequency, cycles a texel up to 0.5, above which an image with this spectrum has no
     detail.
 

@@ -20,8 +20,8 @@ _FINEST_M = 0.25  # per pixel
 
 @dataclass(frozen=True)
 class Mosaic:
-    """North up. rgb: (h, w, 3), holes filled; height: (h, w) float32 world z, NaN without map;
-    west, north: of its corner, m; gsd_m: metres per pixel.
+    """The map from above, north up. rgb: (h, w, 3), holes filled; height: (h, w) float32 world z,
+    NaN without map; west, north: of its corner, m; gsd_m: metres per pixel.
     """
 
     rgb: Image
@@ -35,11 +35,11 @@ class Mosaic:
         return self.west + column * self.gsd_m, self.north - row * self.gsd_m
 
     def pixel(self, east: float, north: float) -> tuple[float, float]:
-        """(row, column) of a position."""
+        """(row, column) of a position (world metres)."""
         return (self.north - north) / self.gsd_m, (east - self.west) / self.gsd_m
 
 
-def mosaic_of(cache: TileCache, most_px: int = _MOST_PX) -> Mosaic:
+def render_mosaic(cache: TileCache, most_px: int = _MOST_PX) -> Mosaic:
     """Render the map's bounding rectangle at its resolution, at most `most_px`."""
     low, high = cache.index.box_min[0], cache.index.box_max[0]
     extent = (high - low)[:2]

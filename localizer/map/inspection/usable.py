@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.geometry.antimeridian import beside, wrapped
+from localizer.geometry.antimeridian import lon_near, wrapped
 from localizer.geometry.geo import LocalFrame
 from localizer.map.inspection.mosaic import Mosaic
 
@@ -45,8 +45,8 @@ def usable_part(
 ) -> UsableArea | None:
     """The largest rectangle of cells that are 90 % free of faults; None without any.
 
-    faulty: (h, w) of the mosaic, True where there is nothing to match. height_m: of the flight; it
-    sets the size of the cells. frame: of the mosaic's metres.
+    faulty: (h, w), True where the mosaic has nothing to match. height_m: of the flight; sets the
+    size of the cells. frame: of the mosaic's metres.
     """
     rows, columns = faulty.shape
     cell = max(round(height_m * _CELL_OF_HEIGHT / mosaic.gsd_m), 1)
@@ -62,7 +62,7 @@ def usable_part(
     places = [frame.position(np.array([*corner, 0.0])) for corner in corners]
     north_west, north_east, south_west, south_east = (p.latitude_deg for p in places)
     about = frame.origin.longitude_deg
-    beyond = [beside(p.longitude_deg, about) for p in places]  # in the same order
+    beyond = [lon_near(p.longitude_deg, about) for p in places]  # in the same order
     return UsableArea(
         max(south_west, south_east),
         wrapped(max(beyond[0], beyond[2])),
@@ -74,7 +74,9 @@ def usable_part(
 
 
 def largest_rectangle(good: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    """First and last (exclusive) row, likewise column, of the largest all-true rectangle."""
+    """First and last (exclusive) row, then column, of the largest all-true rectangle; None: no cell
+    is true.
+    """
     best, found = 0, None
     above = np.zeros(good.shape[1], np.int64)
     for row, line in enumerate(good):

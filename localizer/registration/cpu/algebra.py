@@ -27,7 +27,7 @@ JIT: dict[str, Any] = {
 
 @intrinsic
 def prefetch(_context, array, _index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of ``array[index]`` (1-d, contiguous), ahead of its use."""
+    """Prefetch the cache line of ``array[index]`` (1-d, contiguous) before its use."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -44,7 +44,7 @@ def prefetch(_context, array, _index):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def damp(sums, t, damping, M):  # type: ignore[no-untyped-def]
-    """The left side of equation 8 into the lower triangle of M; False where H's diagonal is not
+    """Write the left side of equation 8 to the lower triangle of M; False if H's diagonal is not
     positive.
     """
     k = 0
@@ -83,7 +83,7 @@ def damp(sums, t, damping, M):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def solve(sums, t, damping, M, scale, L, step):  # type: ignore[no-untyped-def]
-    """Equation 8 by Cholesky on the unit-diagonal system; False where it is singular."""
+    """Solve equation 8 by Cholesky on the unit-diagonal system, into step; False if singular."""
     if not damp(sums, t, damping, M):
         return False
     for i in range(6):

@@ -55,8 +55,8 @@ def _project(R, t, points, focal, centre, buf):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def _compact(count, h, w, buf, index):  # type: ignore[no-untyped-def]
-    """Of `count` anchors keep those in view: x, y, z, fractions into rows 5 to 9, and into index
-    the anchor and the cell; returns how many.
+    """Keep the anchors in view, of `count`: writes x, y, z and fractions to rows 5 to 9 of buf, and
+    anchor and feature cell to index; returns their number.
     """
     bx, by, bz, bu, bv = buf[0], buf[1], buf[2], buf[3], buf[4]
     kx, ky, kz, ka, kb = buf[5], buf[6], buf[7], buf[8], buf[9]
@@ -307,7 +307,7 @@ class NumbaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """See `Backend.refine`."""
         R = np.array(rotations, dtype=np.float64, order="C")
         t = np.array(translations, dtype=np.float64, order="C")
         M, N = len(R), problem.points.shape[1]

@@ -59,7 +59,7 @@ def in_view(problem: LevelProblem, x: Array, uv: Array) -> NDArray[np.bool_]:
 
 
 def count_in_view(problem: LevelProblem, rotation: Array, translation: Array) -> int:
-    """How many anchors are in view from the pose camera_from_local."""
+    """Number of anchors in view from the pose camera_from_local."""
     return int(in_view(problem, *project(problem, rotation, translation)).sum())
 
 
@@ -96,7 +96,7 @@ def projection_jacobian(problem: LevelProblem, x: Array, translation: Array) -> 
 def linearize(
     problem: LevelProblem, rotation: Array, translation: Array, settings: LMSettings
 ) -> Linearization:
-    """Score, gradient and Gauss-Newton Hessian at one pose."""
+    """Score, gradient and Gauss-Newton Hessian at one pose camera_from_local."""
     x, uv = project(problem, rotation, translation)
     u, v = uv.T
     visible = in_view(problem, x, uv)
@@ -136,7 +136,7 @@ def robust_loss(norm: Array, settings: LMSettings) -> tuple[Array, Array]:
 
 
 def minimum_visible(problem: LevelProblem, settings: LMSettings) -> int:
-    """The number of anchors below which a pose has no score."""
+    """Smallest number of anchors in view with which a pose gets a score."""
     return max(6, int(np.ceil(settings.min_overlap * problem.points.shape[1])))
 
 
@@ -167,7 +167,7 @@ def prior_terms(
 
 
 def retract(rotation: Array, translation: Array, step: Array) -> tuple[Array, Array]:
-    """Equation 5: rotate about the local origin, then translate; both in camera axes."""
+    """Equation 5: rotate about the local origin, then translate by step (rho, phi), camera axes."""
     return so3_exp(step[3:]) @ rotation, translation + step[:3]
 
 
@@ -210,7 +210,7 @@ class ReferenceBackend:
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """See `Backend.refine`."""
         R, t = rotations.copy(), translations.copy()
         scores, overlaps = np.empty(len(R)), np.empty(len(R))
         evaluations = 0

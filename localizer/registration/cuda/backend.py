@@ -20,7 +20,7 @@ Compile = Callable[[int, bool, tuple[int, int]], Image]
 
 
 class CudaBackend:
-    """Refines hypotheses on the GPU; buffers are kept between calls, and one call runs at a time.
+    """Refines hypotheses on the GPU. Buffers are kept between calls; calls run one at a time.
 
     half: features are stored as float16 on the device (arithmetic stays float32). compile: makes
     the kernels for (channels, half, architecture).
@@ -45,7 +45,7 @@ class CudaBackend:
 
     @property
     def memory(self) -> int:
-        """Bytes of device memory held."""
+        """Bytes of device memory in use."""
         return self.arena.size
 
     def refine(
@@ -56,7 +56,7 @@ class CudaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> Refinement:
-        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        """See `Backend.refine`."""
         M = len(rotations)
         with self.lock:
             self.device.activate()
@@ -92,14 +92,16 @@ class CudaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> NDArray[np.void]:
-        """Upload a problem; the structure for `refine_many` or `refine_few`. Not under the lock."""
+        """Upload a problem and return the argument structure of `refine_many` or `refine_few`.
+        Takes no lock; the caller holds it.
+        """
         put, M = self.arena.put, len(rotations)
         level = np.zeros((), dtype=layout.LEVEL)
-        level["features"] = put("features", stored(problem.features, self.half))
+        level["features"] = put("features", to_precision(problem.features, self.half))
         level["confidence"] = put("confidence", _floats(problem.confidence))
         level["points"] = put("points", _floats(problem.points))
         level["anchor_features"] = put(
-            "anchor_features", stored(problem.anchor_features, self.half)
+            "anchor_features", to_precision(problem.anchor_features, self.half)
         )
         level["anchor_confidence"] = put("anchor_confidence", _floats(problem.anchor_confidence))
         level["height"], level["width"] = problem.confidence.shape
@@ -145,8 +147,8 @@ def packed_prior(problem: LevelProblem) -> NDArray[np.void]:
     return packed
 
 
-def stored(features: NDArray[np.floating], half: bool) -> NDArray[np.floating]:
-    """Features in the device's precision."""
+def to_precision(features: NDArray[np.floating], half: bool) -> NDArray[np.floating]:
+    """Features as a contiguous array in the device's precision (half: float16)."""
     return np.ascontiguousarray(features, dtype=np.float16 if half else np.float32)
 
 

@@ -41,8 +41,8 @@ def cache_directory() -> Path:
 def compile_kernels(
     channels: int, half: bool, architecture: tuple[int, int], cache: Path | None = None
 ) -> Image:
-    """Compile the kernels for one channel count and compute capability, or load them from the
-    cache.
+    """Compile the kernels for one channel count and compute capability (half: float16 features), or
+    load them from the cache folder (None: `cache_directory`).
 
     If the cache cannot be written, the kernels are compiled at every start. Raises
     `CudaUnavailableError` without NVRTC, `CudaError` if it refuses the source.
@@ -58,7 +58,7 @@ def compile_sources(
     architecture: tuple[int, int],
     cache: Path | None = None,
 ) -> Image:
-    """As `compile_kernels` for any sources by name; `main` includes the others."""
+    """As `compile_kernels` for any sources by name; `main` includes the others; defined: macros."""
     nvrtc = load_nvrtc()
     options = [f"--gpu-architecture=sm_{architecture[0]}{architecture[1]}", *_OPTIONS]
     options += [f"-D{name}={value}" for name, value in defined.items()]
@@ -78,7 +78,7 @@ def _digest(sources: Mapping[str, str], options: list[str], version: tuple[int, 
 
 
 def _store(path: Path, code: bytes) -> None:
-    """Write by renaming, so that another process never reads half an image."""
+    """Write by renaming, so that no other process reads an incomplete image."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:

@@ -23,14 +23,14 @@ def geometry(
     centre: tuple[float, float],
     shape: tuple[int, ...],
 ) -> LevelProblem:
-    """A level of (h, w) and its points (3, N) in the local frame, without features."""
+    """A level with (h, w) and points (3, N) in the local frame, without features."""
     none = np.zeros((0, 0, 0), np.float32)
     blank = np.broadcast_to(np.float32(0), shape)
     return LevelProblem(none, blank, focal, centre, points, none, none)
 
 
 def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) -> Array:
-    """`CovarianceSums.motion` of a level's geometry at a pose."""
+    """`CovarianceSums.motion` of a level's geometry at a pose camera_from_local."""
     x, uv = project(problem, rotation, translation)
     visible = in_view(problem, x, uv)
     return mean_motion(projection_jacobian(problem, x[visible], translation))
@@ -39,15 +39,15 @@ def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) ->
 def winner_curvature(
     backend: CudaBackend,
     memory: FrameMemory,
-    refining: KernelLaunch,
+    scoring: KernelLaunch,
     channels: int,
     pose: tuple[Array, Array],
     motion: Array,
     hessian: Array,
     distance_px: float,
 ) -> float:
-    """Curvature ratio (equation 11a) at a pose camera_from_local (rotation, translation). refining:
-    the launch that scores `memory.probes`. Call it under the backend's lock.
+    """Curvature ratio (equation 11a) at a pose camera_from_local (rotation, translation). scoring:
+    the launch that scores `memory.probes`. The caller holds the backend's lock.
     """
     device, steps = backend.device, curvature_steps(motion, distance_px)
     rotations, translations = retractions(*pose, steps)
@@ -59,9 +59,9 @@ def winner_curvature(
         (memory.probe_state, state),
     ):
         device.upload(address, values)
-    arguments = refining.arguments.copy()
+    arguments = scoring.arguments.copy()
     arguments["state"] = memory.probe_state
-    backend.kernels(channels).launch(refining.kernel, PROBES, refining.threads, arguments)
+    backend.kernels(channels).launch(scoring.kernel, PROBES, scoring.threads, arguments)
     scores = np.empty(PROBES)
     device.download(scores, int(memory.probes["scores"]))
     device.synchronize()

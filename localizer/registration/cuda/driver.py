@@ -100,8 +100,8 @@ class Device:
             self._call(self._api.cuGraphDestroy, graph)
 
     def event(self) -> Any:
-        """A marker in the stream, recorded now, for `elapsed_ms`; it lives as long as the device:
-        for measurements.
+        """Record a marker in the stream now, for `elapsed_ms`. It is never freed, so use it for
+        measurements only.
         """
         event = self._call(self._api.cuEventCreate, 0)
         self._call(self._api.cuEventRecord, event, self.stream)
@@ -176,12 +176,14 @@ class Graph:
         self._device._call(self._device._api.cuGraphLaunch, self._handle, self._device.stream)
 
     def destroy(self) -> None:
-        """Give its memory back."""
+        """Free the graph's memory."""
         self._device._call(self._device._api.cuGraphExecDestroy, self._handle)
 
 
 class Arena:
-    """Named device buffers that are reused, so that a frame allocates nothing."""
+    """Named device buffers that are reused, so that a frame allocates no memory. generation: number
+    of allocations so far; graphs captured with an older one hold wrong addresses.
+    """
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -189,7 +191,7 @@ class Arena:
         self.generation = 0  # changes when any address has changed
 
     def buffer(self, name: str, size: int) -> int:
-        """Address of at least `size` bytes under that name; growing loses the content."""
+        """Device address of buffer `name`, at least `size` bytes; enlarging loses its content."""
         address, have = self._buffers.get(name, (0, 0))
         if address and have >= size:
             return address
@@ -201,18 +203,18 @@ class Arena:
         return self._buffers[name][0]
 
     def put(self, name: str, array: NDArray[Any]) -> int:
-        """Address of a device copy of a C-contiguous array."""
+        """Copy a C-contiguous array to the buffer `name`; returns its device address."""
         address = self.buffer(name, array.nbytes)
         self._device.upload(address, array)
         return address
 
     @property
     def size(self) -> int:
-        """Bytes held."""
+        """Bytes of device memory in all buffers."""
         return sum(size for _, size in self._buffers.values())
 
     def close(self) -> None:
-        """Free everything."""
+        """Free all buffers."""
         self._device.synchronize()
         for address, _ in self._buffers.values():
             self._device.free(address)

@@ -87,7 +87,7 @@ class FrameMemory:
         )  # fmt: skip
 
     def level(self, k: int) -> int:
-        """Address of the k-th level's description."""
+        """Device address of the description of pyramid level k."""
         return self.levels + k * layout.LEVEL.itemsize
 
     def write(self, frame: NDArray[np.uint8], address: int, value: NDArray[Any]) -> None:
@@ -96,7 +96,7 @@ class FrameMemory:
         frame[start : start + value.nbytes] = value.reshape(-1).view(np.uint8)
 
     def winner(self, swarm: NDArray[np.void]) -> NDArray[np.void]:
-        """The swarm with its own score address: sharpening must not change the ranking."""
+        """The swarm with separate score addresses: sharpening must not change the ranking."""
         out: NDArray[np.void] = swarm.copy()
         out["scores"], out["visible"] = self.trial
         return out

@@ -25,7 +25,7 @@ from localizer.registration.backend import (
 from localizer.registration.config import JNGOConfig
 from localizer.registration.cpu.reference import count_in_view
 from localizer.registration.cuda import layout
-from localizer.registration.cuda.backend import CudaBackend, stored
+from localizer.registration.cuda.backend import CudaBackend, to_precision
 from localizer.registration.cuda.curvature import (
     geometry,
     last_settings,
@@ -39,7 +39,7 @@ from localizer.registration.cuda.steps import (
     KERNELS,
     GraphShape,
     launches,
-    refining,
+    refine_launch,
 )
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
@@ -145,7 +145,7 @@ class CudaSchedule:
         pose = found.rotations[0], found.translations[0]
         motion = winner_motion(few, *pose)
         settings = last_settings(c.settings, scale)
-        step = refining(
+        step = refine_launch(
             shape, memory, level, memory.probes, PROBES, 0 if c.sharpen else wanted, settings, 0,
             free=True,
         )  # fmt: skip
@@ -221,7 +221,7 @@ class CudaSchedule:
     def _collect(
         self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
     ) -> tuple[DeviceSearchResult, float]:
-        """What came back, without motion, counts and curvature; the scale of the last loss."""
+        """The download without motion, counts and curvature, and the last loss's scale."""
         block = np.empty(memory.result_size, np.uint8)
         self._device.download(block, memory.prior)
         self._device.synchronize()
@@ -263,12 +263,12 @@ class CudaSchedule:
 
 
 def _survivors(config: JNGOConfig, count: int) -> int:
-    """Hypotheses at most after the last level."""
+    """Largest number of hypotheses after the last level."""
     return min([count, *config.survivors[: len(config.iterations) - 1]])
 
 
 def _taking_part(total: int, wanted: int) -> int:
-    """Anchors that `subsample_anchors` leaves."""
+    """Number of anchors that `subsample_anchors` keeps."""
     step = max(1, total // wanted)
     return -(-total // step)
 
@@ -276,14 +276,14 @@ def _taking_part(total: int, wanted: int) -> int:
 def _packed_level(
     backend: CudaBackend, k: int, level: FeatureLevel, camera: Camera, anchors: Anchors
 ) -> NDArray[np.void]:
-    """A level's description but for its points; its features are copied to the device."""
+    """A level's description without its points; its features are copied to the device."""
     put, half = backend.arena.put, backend.half
     packed = np.zeros((), dtype=layout.LEVEL)
     packed["features"] = _query_address(backend, f"features {k}", level.features, half)
     packed["confidence"] = _query_address(backend, f"confidence {k}", level.confidence, False)
-    packed["anchor_features"] = put(f"anchor features {k}", stored(anchors.features[k], half))
+    packed["anchor_features"] = put(f"anchor features {k}", to_precision(anchors.features[k], half))
     packed["anchor_confidence"] = put(
-        f"anchor confidence {k}", stored(anchors.confidence[k], False)
+        f"anchor confidence {k}", to_precision(anchors.confidence[k], False)
     )
     packed["height"], packed["width"] = level.confidence.shape
     packed["focal"], packed["centre"] = level_intrinsics(camera, level)
@@ -291,10 +291,10 @@ def _packed_level(
 
 
 def _query_address(backend: CudaBackend, name: str, values: object, half: bool) -> int:
-    """Where the device finds them: in place if they are there already, else a copy."""
+    """Device address of query values: their own if they are on the device, else that of a copy."""
     if isinstance(values, DeviceArray):
         return values.checked_address(np.float16 if half else np.float32)
-    return backend.arena.put(name, stored(np.asarray(values), half))
+    return backend.arena.put(name, to_precision(np.asarray(values), half))
 
 
 def _packed_prior(constraint: QuadraticPrior) -> NDArray[np.void]:

@@ -41,7 +41,7 @@ KERNELS = (
 
 @dataclass(frozen=True)
 class KernelLaunch:
-    """One launch of the graph; level: whose channels it is compiled for."""
+    """One launch of the graph. level: its channel count is what the kernel is compiled for."""
 
     kernel: str
     level: int
@@ -68,7 +68,7 @@ def launches(
         target = 2 if k == searched - 1 else 1 - source
         if shape.constrained:
             yield from _weighing(shape, memory, k, swarm, alive, wanted)
-        yield refining(shape, memory, k, swarm, alive, wanted, c.settings, c.iterations[k])
+        yield refine_launch(shape, memory, k, swarm, alive, wanted, c.settings, c.iterations[k])
         yield _selecting(shape, memory, k, source, target, keep[k])
         alive, source = min(alive, keep[k]), target
     yield from _sharpening(shape, memory)
@@ -95,7 +95,9 @@ def _sharpening(shape: GraphShape, memory: FrameMemory) -> Iterator[KernelLaunch
             settings = replace(
                 c.settings, scale=LEAST_SCALE, redescending=True, damping=c.sharpen_damping
             )
-            yield refining(shape, memory, k, winner, 1, anchors, settings, c.sharpen, factor=factor)
+            yield refine_launch(
+                shape, memory, k, winner, 1, anchors, settings, c.sharpen, factor=factor
+            )
             redescending = True
     last = levels - 1 if c.sharpen else searched - 1
     sums, quality = finish.copy(), finish
@@ -107,7 +109,7 @@ def _sharpening(shape: GraphShape, memory: FrameMemory) -> Iterator[KernelLaunch
     yield KernelLaunch("quality", searched - 1, 1, _FEW_THREADS, quality)
 
 
-def refining(
+def refine_launch(
     shape: GraphShape,
     memory: FrameMemory,
     level: int,
@@ -120,7 +122,9 @@ def refining(
     factor: float = 0.0,
     free: bool = False,
 ) -> KernelLaunch:
-    """Launch of the LM kernel; free: without the prior and not counted."""
+    """Launch of the LM kernel. alive: largest number of hypotheses; wanted: number of anchors;
+    factor: of the loss scale; free: without the prior, and its evaluations are not counted.
+    """
     arguments = np.zeros((), dtype=layout.REFINE)
     arguments["level"], arguments["state"] = memory.level(level), memory.state
     arguments["prior"] = memory.prior if shape.constrained and not free else 0
@@ -139,9 +143,9 @@ def _weighing(
     alive: int,
     wanted: int,
 ) -> Iterator[KernelLaunch]:
-    """Score without the prior, then weigh it by the best score."""
+    """Score the swarm without the prior, then set the prior's weight by the best score."""
     c = shape.config
-    yield refining(shape, memory, level, swarm, alive, wanted, c.settings, 0, free=True)
+    yield refine_launch(shape, memory, level, swarm, alive, wanted, c.settings, 0, free=True)
     arguments = np.zeros((), dtype=layout.PRIOR_WEIGHT)
     arguments["prior"], arguments["state"] = memory.prior, memory.state
     arguments["scores"] = swarm["scores"]
@@ -158,7 +162,7 @@ def _selecting(
     target: int,
     keep: int,
 ) -> KernelLaunch:
-    """Order and prune; the prediction has a say in the last order only."""
+    """Rank and prune the swarm; the motion term counts in the last ranking only."""
     last = level == len(shape.config.iterations) - 1
     arguments = np.zeros((), dtype=layout.SELECT)
     arguments["level"], arguments["state"] = memory.level(level), memory.state

@@ -49,8 +49,8 @@ class Appearance:
 
 
 def sample_appearance(rng: np.random.Generator, condition: str | None = None) -> Appearance:
-    """Draw random parameters; `condition` is one of `CONDITIONS`, None draws it too. ValueError for
-    another condition.
+    """Draw random parameters. condition: one of `CONDITIONS`; None: drawn, too. `ValueError` for
+    another.
     """
     if condition is None:
         condition = str(rng.choice(CONDITIONS, p=(0.4, 0.15, 0.15, 0.12, 0.1, 0.08)))
@@ -150,7 +150,7 @@ def apply_appearance(
 
 
 def _tone(image: Float32, a: Appearance) -> Float32:
-    """Colour response and exposure; contrast turns about the image's own mean."""
+    """Colour response and exposure. Contrast scales differences from the image's mean."""
     if a.saturation != 1.0:
         gray = image @ np.array([0.299, 0.587, 0.114], np.float32)
         image = gray[..., None] + np.float32(a.saturation) * (image - gray[..., None])
@@ -219,7 +219,9 @@ def _streaks(
 def streak_cover(
     size: tuple[int, ...], count: int, alpha: float, length: float, rng: np.random.Generator
 ) -> Float32:
-    """Opacity (H, W) of falling drops or flakes: short segments of one direction."""
+    """Opacity (H, W) of falling drops or flakes: short lines of one direction. alpha: opacity of
+    one line; length: mean, px of an image 256 px wide.
+    """
     h, w = size
     layer: NDArray[np.uint8] = np.zeros((h, w), np.uint8)
     tilt = rng.normal(0.0, 0.3)

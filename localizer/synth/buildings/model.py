@@ -88,7 +88,9 @@ class Surface:
 def rectangle(
     centre: ArrayLike, angle: float, length: float, width: float, margin: float = 0.0
 ) -> Array:
-    """Corners (4, 2) of a turned rectangle, counter-clockwise."""
+    """Corners (4, 2) of a rectangle, counter-clockwise; angle of its length from east (rad);
+    metres.
+    """
     c, s = np.cos(angle), np.sin(angle)
     a, b = length / 2 + margin, width / 2 + margin
     local = np.array([[-a, -b], [a, -b], [a, b], [-a, b]])

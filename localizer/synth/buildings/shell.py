@@ -25,7 +25,11 @@ NO_PARAMS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass
 class Shell:
-    """Collects the surfaces of one building in its own frame: x along, y across, z up from base."""
+    """Collects the surfaces of one building in its own frame: x along, y across, z up from base.
+
+    Lengths in metres; x, y, z: lowest and highest coordinate; eaves, top: z; pitch: of roofs, rad;
+    levels: bits of the levels of detail that show a surface.
+    """
 
     building: Building
     surfaces: list[Surface] = field(default_factory=list)
@@ -46,7 +50,9 @@ class Shell:
         levels: int = ALL_LEVELS,
         eaves: float | None = None,
     ) -> None:
-        """Add a polygon (K, 3) in the building's frame."""
+        """Add a polygon (K, 3) in the building's frame. levels: bits of the levels of detail that
+        show it; eaves: z of the eaves, None: the building's.
+        """
         b = self.building
         local = np.asarray(points, float)
         c, s = np.cos(b.angle), np.sin(b.angle)

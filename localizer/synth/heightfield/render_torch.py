@@ -160,7 +160,7 @@ def _rays(
 
 
 def _march(pool: ScenePool, rays: _Rays, top: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of the rays that meet the ground, and where, in metres along the axis.
+    """Indices of the rays that meet the ground, and their distances along the axis, metres.
 
     A ray either skips a block that is wholly below it or walks through one; see `heightfield`.
     """

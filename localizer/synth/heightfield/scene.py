@@ -108,7 +108,7 @@ def light_scene(
         cosine = cosine * cv2.GaussianBlur(sunny, (0, 0), 0.6)
     shade = light.ambient * openness(height) + light.direct * cosine
     texture = scene.albedo * shade[..., None].astype(np.float32)
-    return textured(scene, texture, light, sky, texel_cells)
+    return bake_texture(scene, texture, light, sky, texel_cells)
 
 
 def openness(height: Float32) -> Float32:
@@ -119,14 +119,16 @@ def openness(height: Float32) -> Float32:
     return seen
 
 
-def textured(
+def bake_texture(
     scene: Scene,
     texture: Float32,
     light: SkyLight,
     sky: tuple[float, float, float],
     texel_cells: float = 1.0,
 ) -> LitScene:
-    """The scene with a given texture (n, n, 3), prepared for ray marching."""
+    """The scene with a given texture (n, n, 3), prepared for ray marching. texel_cells: as of
+    `light_scene`.
+    """
     height, cell = scene.height, scene.cell_m
     block_max = cv2.dilate(height, np.ones((3, 3), np.uint8))
     n = height.shape[0]
@@ -143,7 +145,7 @@ def textured(
     return LitScene(height, block_max, flat, scene.prism, scene.facades, light, sky, cell)
 
 
-def without(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
+def omit_randomly(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
     """The objects; each one is left out with the probability `share`."""
     return [p for p in prisms if rng.random() >= share]
 
@@ -200,7 +202,9 @@ def _draw_prism(
 def cast_shadows(
     height: Float32, cell: float, sx: float, sy: float, sz: float, relief: float
 ) -> Float32:
-    """(n, n) float32: 1 where the sun is seen, 0 in cast shadow."""
+    """(n, n) float32: 1 where the sun (unit vector sx, sy, sz) is visible, 0 in cast shadow. cell:
+    side of a cell, m; relief: largest height difference, m.
+    """
     n = height.shape[0]
     out = np.ones((n, n), np.float32)
     flat = max(np.sqrt(sx * sx + sy * sy), 1e-4)

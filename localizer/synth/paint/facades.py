@@ -142,9 +142,11 @@ def _facade_albedo(s, height, width, eaves, base, accent, p, seed, rgb):  # type
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _fittings(s, t, width, length, p, seed, rgb):  # type: ignore[no-untyped-def]
-    """Skylights and solar panels of a tiled roof; whether one is here, and in rgb then.
+    """Paint a skylight or solar panel of a tiled roof into rgb, if one is at this point; returns
+    whether.
 
-    p: rows of skylights, then the panels' left and right end as shares of the width.
+    s, t: metres along the eaves and down the slope; width, length: the roof's, in metres. p: rows
+    of skylights, then the panels' left and right end as shares of the width.
     """
     frame = False
     if p[0] > 0 and 0.9 < t < 0.9 + 1.4 * p[0]:

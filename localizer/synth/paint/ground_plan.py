@@ -72,7 +72,9 @@ class GroundPlan:
     def region(
         self, material: Material, *, angle: float = 0.0, spacing: float = 1.0, vary: float = 0.06
     ) -> int:
-        """A new region with its own tint (deviation `vary`) and seed; returns its id."""
+        """Add a region with its own tint (standard deviation `vary`) and seed; returns its id.
+        angle (rad) and spacing (m): of rows.
+        """
         grey = self.rng.normal(0, vary)
         tint = np.clip(1 + grey + self.rng.normal(0, vary / 3, 3), 0.55, 1.5)
         self._material.append(int(material))

@@ -61,7 +61,9 @@ def _reachable(dsm: NDArray[np.float32]) -> NDArray[np.float32]:
 def _shadow_ceiling(  # type: ignore[no-untyped-def]
     dsm, reachable, top, left, step_u, step_v, drop, steps, out
 ):
-    """out[i, j] = highest shadow ray over the pixel: max over t of dsm(p + t sun) - t tan."""
+    """Write to out[i, j] the height below which it is in shadow: max over t of dsm(p + t sun) - t
+    tan.
+    """
     rows, columns = dsm.shape
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):

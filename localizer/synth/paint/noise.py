@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, inline="always")
 def hash01(ix, iy, seed):  # type: ignore[no-untyped-def]
-    """A lattice point's random number in [0, 1)."""
+    """Random number in [0, 1) of a lattice point; equal arguments give equal numbers."""
     h = (ix * 374761393 + iy * 668265263 + seed * 974634421) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFFFF) * (1.0 / 16777216.0)

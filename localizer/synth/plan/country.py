@@ -1,4 +1,8 @@
-"""Cells outside the town: fields, woods, meadows, orchards, farms, the riverside."""
+"""Cells outside the town: fields, woods, meadows, orchards, farms, the riverside.
+
+Each ``plan_`` function fills one cell (i, j) of the street lattice and adds to `planner`.
+outline: (N, 2) of the cell, ENU metres, counter-clockwise.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ def plan_field(
     planner: Planner, rng: np.random.Generator, i: int, j: int,
     fields: dict[tuple[int, int, int], int],
 ) -> None:  # fmt: skip
-    """Strips of crops that run on over neighbouring cells of the same group."""
+    """Strips of crops that continue in neighbouring cells. fields: their regions, updated."""
     lattice = planner.net.lattice
     group = planner.config.rng(30, i // 2 + 500, j // 2 + 500)
     strips = int(group.integers(1, 4))
@@ -60,14 +64,16 @@ def hedgerow(planner: Planner, rng: np.random.Generator, i: int, j: int) -> None
     for p in line:
         draw = rng.random()
         if draw < 0.75:
-            planner.tree(rng, p + rng.normal(0, 0.7, 2), rng.uniform(0.6, 1.5), 2)
+            planner.plant_tree(rng, p + rng.normal(0, 0.7, 2), rng.uniform(0.6, 1.5), 2)
         elif draw < 0.87:
-            planner.tree(rng, p, 1.0)
+            planner.plant_tree(rng, p, 1.0)
 
 
 def plan_forest(planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
-    """A wood."""
-    planner.wood(rng, outline, float(rng.uniform(5.6, 6.6)), float(rng.choice([0.15, 0.4, 0.75])))
+    """Fill the cell with a wood."""
+    planner.plant_wood(
+        rng, outline, float(rng.uniform(5.6, 6.6)), float(rng.choice([0.15, 0.4, 0.75]))
+    )
 
 
 def plan_meadow(planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
@@ -91,7 +97,7 @@ def plan_orchard(
             p = middle + np.array([c * u - s * v, s * u + c * v]) + rng.normal(0, 0.3, 2)
             inside = cv2.pointPolygonTest(contour, (float(p[0]), float(p[1])), True) > 3
             if inside and rng.random() < 0.93:
-                planner.tree(rng, p, rng.uniform(1.1, 1.5), 2)
+                planner.plant_tree(rng, p, rng.uniform(1.1, 1.5), 2)
 
 
 def plan_farm(planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
@@ -128,4 +134,4 @@ def plan_riverside(
     scatter_trees(planner, rng, outline, 16, 0.8)
     for _ in range(30):
         p = outline.mean(0) + rng.uniform(-50, 50, 2)
-        planner.tree(rng, p, rng.uniform(0.7, 1.6), 2)
+        planner.plant_tree(rng, p, rng.uniform(0.7, 1.6), 2)

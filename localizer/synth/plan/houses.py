@@ -1,4 +1,4 @@
-"""Cells of detached houses: plots, gardens, fences, allotments."""
+"""Cells of detached houses: plots, gardens, fences, allotments; functions as in `country`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _plan_interior(planner: Planner, rng: np.random.Generator, outline: Array) -
         _plan_second_row(planner, rng, outline)
     else:
         for local in pair_grid(np.arange(-14, 15, 6.0), np.arange(-12, 13, 5.5)):
-            planner.tree(
+            planner.plant_tree(
                 rng, outline.mean(0) + local @ axis_rows(outline), rng.uniform(0.9, 1.5), 2
             )
 
@@ -72,7 +72,7 @@ def _plan_allotments(planner: Planner, rng: np.random.Generator, outline: Array)
             corner = at + rng.uniform(-1, 1, 2)
             planner.place(rng, Kind.SHED, corner, angle, 3.0, 2.5, 2.1, 0.2)
         elif rng.random() < 0.5:
-            planner.tree(rng, at, 1.0, 2)
+            planner.plant_tree(rng, at, 1.0, 2)
 
 
 def _plan_second_row(planner: Planner, rng: np.random.Generator, outline: Array) -> None:
@@ -177,7 +177,7 @@ def _plan_garden(
         planner.place(rng, Kind.SHED, at, angle, 3.0, 2.4, 2.1, 0.3)
     for _ in range(int(rng.integers(1, 6))):
         at = far - normal * rng.uniform(0, 11) + tangent * rng.uniform(-0.5, 0.5) * lot
-        planner.tree(rng, at, rng.uniform(0.5, 1.1), 2 if rng.random() < 0.4 else None)
+        planner.plant_tree(rng, at, rng.uniform(0.5, 1.1), 2 if rng.random() < 0.4 else None)
 
 
 def _fence_plot(
@@ -191,7 +191,7 @@ def _fence_plot(
         (front - half, front - gap, 0.4), (front + gap * 0.2, front + half * 0.45, 0.3),
     ):  # fmt: skip
         points = a + np.linspace(0, 1, 7)[:, None] * (b - a)
-        if rng.random() < chance and planner.taken.free(points, 0.5).all():
+        if rng.random() < chance and planner.taken.is_free(points, 0.5).all():
             planner.hedges.append(
                 Hedge(a, b, rng.uniform(0.6, 1.1), rng.uniform(1.0, 2.1), int(rng.integers(10**9)))
             )

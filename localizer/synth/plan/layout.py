@@ -66,7 +66,7 @@ _SITE_TRIES = 40  # most ground is taken
 
 def assign_zones(config: WorldConfig, lattice: Lattice, terrain: Terrain
            ) -> dict[tuple[int, int], Zone]:  # fmt: skip
-    """Use of every cell that touches the world."""
+    """Use of every cell that overlaps the world."""
     rng = config.rng(12)
     small = config.size_m < 1000
     radius = config.town_radius_m
@@ -118,7 +118,7 @@ def assign_zones(config: WorldConfig, lattice: Lattice, terrain: Terrain
 def _of_one_character(
     config: WorldConfig, zones: dict[tuple[int, int], Zone]
 ) -> dict[tuple[int, int], Zone]:
-    """Every cell but those at the river in the uses of the world's character."""
+    """The zones with all cells but those at the river set to the world's character."""
     rng = config.rng(65)
     uses, shares = zip(*_USES[config.character], strict=True)
     draws = rng.choice(len(uses), len(zones), p=shares)
@@ -131,7 +131,7 @@ def _of_one_character(
 def _give_landmarks(
     zones: dict[tuple[int, int], Zone], distance: dict[tuple[int, int], float]
 ) -> None:
-    """A church, a car park, a sports ground and a park near the middle of the town."""
+    """Add a church, a car park, a sports ground and a park near the centre of the town."""
     order = sorted((c for c in zones if zones[c] is not Zone.RIVERSIDE), key=distance.__getitem__)
     for rank, zone in ((1, Zone.CHURCH), (2, Zone.CARPARK), (5, Zone.SPORTS), (7, Zone.PARK),
                        (9, Zone.BLOCKS), (14, Zone.SPORTS)):  # fmt: skip
@@ -140,7 +140,7 @@ def _give_landmarks(
 
 
 def _raise_bridges(terrain: Terrain, net: StreetNet) -> Terrain:
-    """Carry streets over the river on causeways: water is not on the way of any wheel."""
+    """The terrain with causeways where streets cross the river."""
     heights = terrain.heights.copy()
     n, step, half = heights.shape[0], terrain.spacing_m, terrain.half_m
     axis = np.linspace(-half, half, n)
@@ -165,7 +165,7 @@ def _raise_bridges(terrain: Terrain, net: StreetNet) -> Terrain:
 
 
 def plan_world(config: WorldConfig) -> WorldPlan:
-    """Everything that stands in the world of this seed and size."""
+    """Plan all static objects of the world of this seed and size."""
     terrain = make_terrain(config)
     lattice = make_lattice(config)
     zones = assign_zones(config, lattice, terrain)
@@ -205,7 +205,7 @@ def _finish(planner: Planner) -> WorldPlan:
 
 
 def _sites(planner: Planner) -> tuple[Building, ...]:
-    """Free plots near houses, with what may be built there; the plan itself has none of it."""
+    """Free plots near houses with a building that may be built later; none is in the plan."""
     rng = planner.config.rng(60)
     standing = list(planner.buildings)
     if not standing:
@@ -245,7 +245,7 @@ def _roads(planner: Planner) -> tuple[Array, ...]:
 
 
 def _targets(planner: Planner) -> tuple[PlannedTarget, ...]:
-    """Static points near the middle: a crossing, a flat roof, a corner of a pitch (or a node)."""
+    """Static points near the centre: a crossing, a flat roof, a pitch's corner (or a node)."""
     terrain, net = planner.terrain, planner.net
     degree = np.bincount([n for s in net.streets for n in (s.a, s.b)], minlength=len(net.nodes))
     rank = np.bincount([n for s in net.streets if s.rank == 0 for n in (s.a, s.b)],

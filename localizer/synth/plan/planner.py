@@ -25,7 +25,7 @@ CROSS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 class Occupancy:
-    """A raster of what is taken: streets, water, buildings."""
+    """A raster of occupied ground: streets, water, buildings."""
 
     def __init__(self, config: WorldConfig) -> None:
         self.half = config.half_m + 20.0
@@ -38,12 +38,12 @@ class Occupancy:
         return np.asarray(np.round(uv - 0.5), np.int32)
 
     def stroke(self, points: ArrayLike, width_m: float) -> None:
-        """Mark a band along points (N, 2) as taken."""
+        """Mark a band of width_m along points (N, 2) as occupied."""
         thickness = max(1, round(width_m / _OCCUPANCY_GSD_M))
         cv2.polylines(self.grid, [self._pixels(points)], False, 1, thickness)
 
-    def claim(self, polygon: ArrayLike, margin: ArrayLike | None = None) -> bool:
-        """Take a polygon if it (or `margin`, a larger one around it) is free."""
+    def occupy(self, polygon: ArrayLike, margin: ArrayLike | None = None) -> bool:
+        """Occupy a polygon if it (or `margin`, a larger one around it) is free; True if it was."""
         test = self._pixels(polygon if margin is None else margin)
         low, high = test.min(0), test.max(0) + 1
         n = self.grid.shape[0]
@@ -57,7 +57,7 @@ class Occupancy:
         cv2.fillConvexPoly(self.grid, self._pixels(polygon), 1)
         return True
 
-    def free(self, xy: Array, radius: float) -> NDArray[np.bool_]:
+    def is_free(self, xy: Array, radius: float) -> NDArray[np.bool_]:
         """Which points (N, 2) have nothing within about `radius`, and lie inside the world."""
         n = self.grid.shape[0]
         uv = self._pixels((xy[:, None] + radius * CROSS).reshape(-1, 2))
@@ -69,7 +69,9 @@ class Occupancy:
 
 @dataclass
 class Planner:
-    """The state of planning one world."""
+    """The state of planning one world. Lengths in metres, angles in radians from east, positions
+    ENU.
+    """
 
     config: WorldConfig
     terrain: Terrain
@@ -86,12 +88,12 @@ class Planner:
         self, rng: np.random.Generator, kind: Kind, centre: ArrayLike, angle: float, length: float,
         width: float, eaves: float, margin: float = 1.5,
     ) -> Building | None:  # fmt: skip
-        """Put a building if its ground is free and inside the world."""
+        """Add a building if it, with `margin` (m), is on free ground in the world; else None."""
         c = np.asarray(centre, float)
         polygon = rectangle(c, angle, length, width)
         if np.abs(polygon).max() > self.config.half_m - 4.0:
             return None
-        if not self.taken.claim(polygon, rectangle(c, angle, length, width, margin)):
+        if not self.taken.occupy(polygon, rectangle(c, angle, length, width, margin)):
             return None
         z = self.terrain.height(polygon[:, 0], polygon[:, 1])
         base = float(0.35 * z.min() + 0.65 * z.max()) + 0.15
@@ -102,12 +104,14 @@ class Planner:
         self.buildings.append(building)
         return building
 
-    def tree(
+    def plant_tree(
         self, rng: np.random.Generator, xy: ArrayLike, size: float = 1.0, species: int | None = None
     ) -> None:
-        """Put one free-standing tree if there is room for its trunk."""
+        """Add one free-standing tree if there is room for its trunk. species: as of `Trees`; None:
+        drawn.
+        """
         p = np.asarray(xy, float).reshape(1, 2)
-        if not self.taken.free(p, 0.8)[0]:
+        if not self.taken.is_free(p, 0.8)[0]:
             return
         kind = int(rng.random() < 0.18) if species is None else species
         radius = size * (rng.uniform(1.6, 3.9) if kind == 0 else rng.uniform(1.4, 2.4))
@@ -116,9 +120,11 @@ class Planner:
             radius, height = size * rng.uniform(0.7, 1.6), size * rng.uniform(1.1, 2.4)
         self.trees.append((*p[0], radius, height, kind, 0, int(rng.integers(1 << 30))))
 
-    def wood(self, rng: np.random.Generator, polygon: Array, spacing: float, conifers: float
+    def plant_wood(self, rng: np.random.Generator, polygon: Array, spacing: float, conifers: float
              ) -> None:  # fmt: skip
-        """Fill a polygon with trees on a jittered grid."""
+        """Fill a polygon with trees on a jittered grid. spacing: m; conifers: their share, 0 to
+        1.
+        """
         low, high = polygon.min(0), polygon.max(0)
         x, y = np.meshgrid(np.arange(low[0], high[0], spacing), np.arange(low[1], high[1], spacing))
         xy = np.stack([x, y], -1).reshape(-1, 2)
@@ -127,7 +133,7 @@ class Planner:
         inside = np.array(
             [cv2.pointPolygonTest(outline, (float(a), float(b)), False) > 0 for a, b in xy], bool
         )
-        xy = xy[inside & self.taken.free(xy, 2.0)] if len(xy) else xy
+        xy = xy[inside & self.taken.is_free(xy, 2.0)] if len(xy) else xy
         for a, b in xy:
             conifer = rng.random() < conifers
             radius = spacing * (rng.uniform(0.42, 0.62) if conifer else rng.uniform(0.5, 0.78))
@@ -179,16 +185,18 @@ def scatter_trees(
     contour = outline.astype(np.float32)
     for xy in rng.uniform(low, high, (count, 2)):
         if cv2.pointPolygonTest(contour, (float(xy[0]), float(xy[1])), False) > 0:
-            planner.tree(rng, xy, size * rng.uniform(0.7, 1.3))
+            planner.plant_tree(rng, xy, size * rng.uniform(0.7, 1.3))
 
 
 def park_rows(
     planner: Planner, rng: np.random.Generator, centre: Array, angle: float, length: float,
     width: float, ready: float,
 ) -> None:  # fmt: skip
-    """A car park of double rows, if there is room."""
+    """Add a car park of double rows if there is room. ready: readiness of its slots
+    (`WorldPlan`).
+    """
     polygon = rectangle(centre, angle, length, width)
-    if not planner.taken.claim(polygon):
+    if not planner.taken.occupy(polygon):
         return
     ground = planner.ground
     ground.polygon(LAYER_PATH, rectangle(centre, angle, length, width, 0.6),

@@ -92,7 +92,7 @@ class StreetNet:
     edge_street: dict[tuple[tuple[int, int], tuple[int, int]], Street]
 
     def side(self, a: tuple[int, int], b: tuple[int, int]) -> Street | None:
-        """The street between two neighbouring lattice nodes, if there is one."""
+        """The street between two neighbouring lattice nodes; None without one."""
         return self.edge_street.get((min(a, b), max(a, b)))
 
 
@@ -234,7 +234,7 @@ def resample(points: Array, step_m: float) -> Array:
 
 
 def cut_ends(points: Array, start_m: float, end_m: float) -> Array | None:
-    """The line without its first and last metres, at 1 m steps; None if nothing remains."""
+    """The line (N, 2) without its first and last metres, at 1 m steps; None if nothing is left."""
     fine = resample(points, 1.0)
     kept = fine[round(start_m) : len(fine) - round(end_m)]
     return kept if len(kept) >= 3 else None

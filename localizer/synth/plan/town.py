@@ -1,4 +1,7 @@
-"""Urban cells besides houses: centre, blocks, industry, sports, parks; and the streets' edges."""
+"""Urban cells besides houses: centre, blocks, industry, sports, parks; and the streets' edges.
+
+Functions as in `country`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from localizer.synth.plan.streets import cut_ends, offset_line
 
 
 def plan_centre(planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
-    """Closed rows of tall houses along the streets and yards behind them."""
+    """Closed rows of tall houses along the streets, and yards behind them."""
     for line, street in frontages(planner, i, j):
         s = int(street.reach_m + 2)
         while s < len(line) - 14:
@@ -173,7 +176,7 @@ def plan_carpark(
     for line, street in frontages(planner, i, j):
         for s in range(12, len(line) - 12, 9):
             p, _, normal = line_frame(line, s)
-            planner.tree(rng, p + normal * (street.reach_m + 2.0), 0.7, 0)
+            planner.plant_tree(rng, p + normal * (street.reach_m + 2.0), 0.7, 0)
 
 
 def plan_church(planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
@@ -187,7 +190,7 @@ def plan_church(planner: Planner, rng: np.random.Generator, i: int, j: int, outl
     for line, street in frontages(planner, i, j):
         for s in range(14, len(line) - 14, 11):
             p, _, normal = line_frame(line, s)
-            planner.tree(rng, p + normal * (street.reach_m + 3.5), 0.9, 0)
+            planner.plant_tree(rng, p + normal * (street.reach_m + 3.5), 0.9, 0)
     plan_centre(planner, rng, i, j, outline)
 
 
@@ -199,7 +202,7 @@ def plan_sports(planner: Planner, rng: np.random.Generator, i: int, j: int, outl
     ground = planner.ground
     for scale in (1.25, 1.0, 0.8):
         length, width = 62.0 * scale, 42.0 * scale
-        if planner.taken.claim(rectangle(middle, angle, length, width, 3.0)):
+        if planner.taken.occupy(rectangle(middle, angle, length, width, 3.0)):
             break
     else:
         plan_park(planner, rng, i, j, outline)
@@ -232,12 +235,12 @@ def plan_sports(planner: Planner, rng: np.random.Generator, i: int, j: int, outl
     for line, street in frontages(planner, i, j):
         for k in range(10, len(line) - 10, 12):
             p, _, normal = line_frame(line, k)
-            planner.tree(rng, p + normal * (street.reach_m + 2.5), 1.0, 0)
+            planner.plant_tree(rng, p + normal * (street.reach_m + 2.5), 1.0, 0)
 
 
 def _plan_court(planner: Planner, rng: np.random.Generator, centre: Array, angle: float) -> None:
     """A tennis court with its run-off."""
-    if not planner.taken.claim(rectangle(centre, angle, 30.0, 15.0)):
+    if not planner.taken.occupy(rectangle(centre, angle, 30.0, 15.0)):
         return
     ground = planner.ground
     cover = Material.TRACK if rng.random() < 0.7 else Material.ASPHALT
@@ -266,7 +269,7 @@ def plan_park(planner: Planner, rng: np.random.Generator, i: int, j: int, outlin
     inner = planner.ground.region(Material.WATER if pond else Material.BED)
     planner.ground.polygon(LAYER_PATH + 1, ring, inner)
     if pond:
-        planner.taken.claim(ring)
+        planner.taken.occupy(ring)
     for _ in range(8):
         at = outline.mean(0) + rng.uniform(-34, 34, 2)
         bed = planner.ground.region(Material.BED, vary=0.12)

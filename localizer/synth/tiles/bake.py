@@ -23,7 +23,7 @@ from localizer.synth.tiles.scene import TileScene
 from localizer.synth.tiles.terrain_mesh import terrain_mesh
 from localizer.synth.tiles.write import TileNode, glb_bytes
 from localizer.synth.visits.noise import noise
-from localizer.synth.visits.texture import regrown, wetted
+from localizer.synth.visits.texture import with_new_texture, with_wet_patches
 from localizer.types import Float32, Image
 
 _LIGHT_MARGIN_M = 60.0  # objects belong to the tile of their middle and reach out of it
@@ -41,8 +41,8 @@ _IS_SOFT = np.isin(np.arange(len(Material)), _SOFT)  # by material: its fine tex
 
 @dataclass(frozen=True)
 class TilePart:
-    """What a finished tile hands up to the next coarser one. ground: its image at twice the texel
-    size of that tile's; mesh: what coarser levels still show; node: itself.
+    """What a finished tile gives to the next coarser one. ground: its ground image at twice the
+    texel size; mesh: the objects that coarser levels still show; nodes: the tile's own.
     """
 
     nodes: list[TileNode]
@@ -54,7 +54,9 @@ class TilePart:
 
 @dataclass
 class Baker:
-    """Paints the tiles of one scene into a folder. Belongs to one process."""
+    """Paints the tiles of one scene into a folder. Belongs to one process. west, north: edges, ENU
+    m.
+    """
 
     scene: TileScene
     folder: Path
@@ -79,7 +81,7 @@ class Baker:
         for dy in (0, 1):
             for dx in (0, 1):
                 leaf = (2 * column + dx, 2 * row + dy)
-                mesh = self._standing.on_leaf(leaf, light)
+                mesh = self._standing.leaf_mesh(leaf, light)
                 image = ground[(1 - dy) * n : (2 - dy) * n, dx * n : (dx + 1) * n]
                 leaf_west, leaf_north = west + dx * LEAF_M, south + (dy + 1) * LEAF_M
                 leaves.append(self.write(LEAF, leaf, leaf_west, leaf_north, image, mesh))
@@ -126,7 +128,7 @@ class Baker:
         return TileNode(uri, origin, origin + low, origin + high, max(error, dropped))
 
     def _dropped_m(self, level: int, west: float, north: float, side: float) -> float:
-        """Size of what a level leaves out or simplifies within a tile, metres."""
+        """Size (m) of the details that a level omits or simplifies within a tile."""
         if level == LEAF:
             return 0.0
         xy = self.scene.plan.trees.xy
@@ -167,11 +169,11 @@ class Baker:
             light.north, light.gsd_m, light.sun, light.sun_rgb, light.sky_rgb, out,
         )  # fmt: skip
         survey = self.scene.visit.survey
-        return out if survey is None else survey.photographed(out, LEAF_GSD_M)
+        return out if survey is None else survey.apply_blur(out, LEAF_GSD_M)
 
     def _albedo(self, region: NDArray[np.uint16], west: float, north: float, light: WindowLight
                 ) -> Float32:  # fmt: skip
-        """Colours (n, n, 3) of a block's ground, 0 to 255, with what grew again at this visit."""
+        """Colours (n, n, 3) of a block's ground, 0 to 255, with the visit's new fine texture."""
         albedo = self._painted(region, west, north, light, np.zeros(2))
         changes = self.scene.visit.changes
         if changes is None or not changes.regrown:
@@ -182,8 +184,8 @@ class Baker:
         anew = self._painted(region, west, north, light, rng.uniform(2000, 9000, 2))
         lasting = np.where(_IS_SOFT[plan.regions.material], np.float32(0), np.float32(1))[region]
         scale = np.float32(255)
-        albedo = regrown(albedo / scale, lasting, LEAF_GSD_M, rng, anew / scale)
-        wet = wetted(albedo, lasting, rng, self._patches(west, north, len(region)))
+        albedo = with_new_texture(albedo / scale, lasting, LEAF_GSD_M, rng, anew / scale)
+        wet = with_wet_patches(albedo, lasting, rng, self._patches(west, north, len(region)))
         return np.asarray(wet * scale, np.float32)
 
     def _painted(
@@ -203,7 +205,7 @@ class Baker:
         return out
 
     def _patches(self, west: float, north: float, side: int) -> Float32:
-        """The window of the world's noise (side, side) over a block: patches have no seams."""
+        """The part (side, side) of the world's noise over a block: patches have no seams."""
         config, changes = self.scene.plan.config, self.scene.visit.changes
         rng = config.rng(64, 0 if changes is None else changes.seed)
         field = noise(round(config.size_m / _PATCH_M), rng, round(config.size_m / 25.0), 3, 0.6)
@@ -233,5 +235,5 @@ def start_worker(scene_file: Path, folder: Path) -> None:
 
 
 def bake_block(place: tuple[int, int]) -> tuple[tuple[int, int], TilePart]:
-    """Paint one block in a worker process."""
+    """`Baker.block` in a worker process; returns its place, too."""
     return place, _baker[0].block(*place)

@@ -62,7 +62,7 @@ class ChartedMesh:
         )  # fmt: skip
 
     def halved(self, times: int = 1) -> ChartedMesh:
-        """The same with charts of half the resolution, `times` over."""
+        """The same mesh with charts of half the resolution, `times` over."""
         factor = 2**times
         charts, scale = [], np.ones((len(self.charts), 2))
         for k, image in enumerate(self.charts):
@@ -84,7 +84,8 @@ class Atlas:
 
 
 def pack(ground: Image, charts: tuple[Image, ...], gutter: int, pad: int) -> Atlas:
-    """One image of the ground, framed by a gutter, with the charts in shelves below it.
+    """Pack the textures of a tile into one image: the ground, framed by a gutter, and below it the
+    charts in rows. gutter, pad: pixels around the ground and around each chart.
 
     Borders repeat the edge texels, so that filtering does not mix neighbours.
     """

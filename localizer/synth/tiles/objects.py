@@ -35,7 +35,7 @@ class StandingObjects:
         column, row = np.floor((xy + self._scene.plan.config.half_m) / LEAF_M).astype(int)
         return int(column), int(row)
 
-    def on_leaf(self, leaf: tuple[int, int], light: WindowLight) -> ChartedMesh:
+    def leaf_mesh(self, leaf: tuple[int, int], light: WindowLight) -> ChartedMesh:
         """The mesh of a leaf tile, (column, row) from south-west, with its painted charts."""
         parts = [
             self._surface(s, light) for b in self._leaf_buildings.get(leaf, ()) for s in build(b)
@@ -58,7 +58,7 @@ class StandingObjects:
         )  # fmt: skip
         survey = self._scene.visit.survey
         if survey is not None:
-            out = survey.photographed(out, gsd, float(surface.normal[2]))
+            out = survey.apply_blur(out, gsd, float(surface.normal[2]))
         n = len(surface.polygon)
         away = surface.polygon - surface.origin
         st = np.stack([away @ surface.right, away @ surface.down], -1) / gsd

@@ -122,7 +122,7 @@ def _tile_mesh(shape: PropShape, image: Image) -> TileMesh:
 
 
 def car_mesh(colour: tuple[int, int, int] | None = None, seed: int = 0) -> TileMesh:
-    """A car, x forward, z up, origin on the ground below its middle; `colour` RGB or by seed."""
+    """A car, x forward, z up, origin on the ground below its middle; colour: RGB, None: by seed."""
     chosen = CAR_COLOURS[seed % len(CAR_COLOURS)] if colour is None else colour
     return _tile_mesh(car_shape(), car_image(chosen, seed))
 

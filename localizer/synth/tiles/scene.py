@@ -17,7 +17,7 @@ from localizer.synth.plan.plan import Hedge, WorldPlan
 from localizer.synth.plan.terrain import Terrain
 from localizer.synth.tiles.props import PropShape, car_shape
 from localizer.synth.tiles.vegetation import hedge_corners, tree_meshes
-from localizer.synth.visits.changes import changed
+from localizer.synth.visits.changes import apply_changes
 from localizer.synth.visits.visit import Visit
 
 _DSM_MARGIN_M = 20.0
@@ -42,10 +42,10 @@ class TileScene:
 
 
 def make_scene(plan: WorldPlan, visit: Visit) -> TileScene:
-    """Change what changed, fill parking places, take away gone buildings, and model the surface."""
+    """Apply the visit's changes, fill parking slots, remove buildings, and model the surface."""
     look = visit.look
     if visit.changes is not None:
-        plan = changed(plan, visit.changes)
+        plan = apply_changes(plan, visit.changes)
     rng = plan.config.rng(40, look.parking_seed)
     buildings = plan.buildings
     if look.changed_buildings > 0:

@@ -71,7 +71,7 @@ def crown_images(rng: np.random.Generator, look: VisitLook, light: WindowLight) 
 
 
 def crown_template(conifer: bool, dense: bool, level: int) -> tuple[Array, NDArray[np.int64]]:
-    """The crown mesh of a level of detail."""
+    """The crown mesh of unit size for a level of detail."""
     if level == TOP:
         return _BLOB
     if conifer:
@@ -83,7 +83,7 @@ def tree_meshes(
     trees: Trees, chosen: NDArray[np.intp], ground_z: Array, shaded: NDArray[np.bool_],
     charts: list[Image], levels: tuple[int, ...] = (LEAF, MID, TOP),
 ) -> ChartedMesh:  # fmt: skip
-    """Crowns of the chosen trees; ground_z and shaded belong to them."""
+    """Crowns of the chosen trees, each with its ground_z (m) and whether it is shaded."""
     parts = []
     half = _VARIANTS // 2
     small = trees.species[chosen] == 2

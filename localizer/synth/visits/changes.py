@@ -18,8 +18,8 @@ _GROWTH = (1.0, 1.2)  # of a crown's radius and height, in a few years
 @dataclass(frozen=True)
 class Changes:
     """Shares of changed objects. gone, rebuilt, new: shares of the buildings; felled: share of the
-    trees, of which the others have grown. regrown: whether soft ground has another fine texture.
-    seed: selects the changed objects.
+    trees (the others have grown). regrown: whether soft ground gets another fine texture. seed:
+    selects the changed objects.
     """
 
     gone: float = 0.03
@@ -30,7 +30,7 @@ class Changes:
     seed: int = 1
 
 
-def changed(plan: WorldPlan, changes: Changes) -> WorldPlan:
+def apply_changes(plan: WorldPlan, changes: Changes) -> WorldPlan:
     """The plan after the changes; ground and streets stay."""
     rng = plan.config.rng(61, changes.seed)
     draw = rng.random(len(plan.buildings))
@@ -48,7 +48,7 @@ def changed(plan: WorldPlan, changes: Changes) -> WorldPlan:
 
 
 def _rebuilt(building: Building, rng: np.random.Generator) -> Building:
-    """Another house on the same plot; what is no house comes back in its own kind."""
+    """Another house on the same plot; a building that is no house keeps its kind."""
     house = building.kind in _HOUSES or building.kind is Kind.L_GABLE
     return replace(
         building,

@@ -9,7 +9,9 @@ from localizer.types import Float32
 
 
 def noise(n: int, rng: np.random.Generator, base: int, octaves: int, gain: float) -> Float32:
-    """Fractal value noise (n, n), about zero mean and unit variance per octave."""
+    """Fractal value noise (n, n) of zero mean. base: cells of the coarsest octave, doubled in each;
+    gain: amplitude of an octave over the one before.
+    """
     out: Float32 = np.zeros((n, n), np.float32)
     amplitude = np.float32(1.0)
     for octave in range(octaves):

@@ -23,7 +23,7 @@ _WALL = 0.35  # height of a wall's unit normal at most
 
 @dataclass(frozen=True)
 class SurveyErrors:
-    """A survey's own errors. bumps_m: standard deviation of the surface per axis; holes_per_km2:
+    """Errors of one survey. bumps_m: standard deviation of the surface per axis; holes_per_km2:
     number of holes; wall_blur_m: blur of the facades, which a survey sees at a flat angle; texel_m:
     ground size of a texel; seed: selects the positions of bumps and holes.
     """
@@ -74,8 +74,10 @@ class SurveyErrors:
             kept &= np.linalg.norm(middle - centre, axis=1) > radius
         return kept
 
-    def photographed(self, chart: Image, gsd_m: float, normal_up: float = 1.0) -> Image:
-        """A surface's image, blurred as by the survey; normal_up: its normal's z."""
+    def apply_blur(self, chart: Image, gsd_m: float, normal_up: float = 1.0) -> Image:
+        """A surface's image, blurred as by the survey. gsd_m: size of its pixel; normal_up: its
+        normal's z.
+        """
         if abs(normal_up) < _WALL and self.wall_blur_m > 0:
             sigma = self.wall_blur_m / gsd_m
             chart = np.asarray(cv2.GaussianBlur(chart, (0, 0), sigma), np.uint8)

@@ -18,8 +18,8 @@ _KEPT = 0.35  # largest share of that fine texture which is still the map's own
 
 
 def hard_surfaces(texture: Image) -> Float32:
-    """Mask of pavement and roofs in a photo: grey, blue or strongly red, unlike vegetation or soil,
-    which are green to yellow-brown.
+    """Mask (H, W), 0 to 1, of pavement and roofs in a photo: grey, blue or strongly red, unlike
+    vegetation or soil, which are green to yellow-brown.
     """
     smooth = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 1.5)
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
@@ -28,23 +28,23 @@ def hard_surfaces(texture: Image) -> Float32:
     return hard
 
 
-def regrown(
+def with_new_texture(
     albedo: Float32,
     lasting: Float32,
     cell_m: float,
     rng: np.random.Generator,
-    painted_anew: Float32 | None = None,
+    other_texture: Float32 | None = None,
 ) -> Float32:
     """The albedo (n, n, 3) with new fine texture of the same strength on soft ground.
 
-    lasting: (n, n) in 0..1, one on roads, roofs and pavement. painted_anew: the same ground with
-    another fine texture, where there is one; else texture of elsewhere in the place, or noise.
+    lasting: (n, n) in 0..1, one on roads, roofs and pavement. other_texture: the same ground with
+    another fine texture; None: texture from elsewhere in the place, or noise.
     """
     sigma = max(float(np.exp(rng.uniform(*np.log(_REGROWN_M)))) / cell_m, 0.7)
     base, detail, spread = _fine_texture(albedo, sigma)
     n = albedo.shape[0]
-    if painted_anew is not None:
-        _, other, its_spread = _fine_texture(painted_anew, sigma)
+    if other_texture is not None:
+        _, other, its_spread = _fine_texture(other_texture, sigma)
         other = other / its_spread
     elif rng.random() < 0.5:
         # Texture of the same place from elsewhere in it.
@@ -61,14 +61,14 @@ def regrown(
 
 
 def _fine_texture(albedo: Float32, sigma: float) -> tuple[Float32, Float32, Float32]:
-    """What is coarser than `sigma` (pixels), what is finer, and how strong that is, (n, n, 1)."""
+    """What is coarser than `sigma` (pixels), what is finer, and its strength (n, n, 1)."""
     base = cv2.GaussianBlur(albedo, (0, 0), sigma)
     detail = albedo - base
     power = cv2.GaussianBlur((detail**2).mean(-1), (0, 0), 2 * sigma)
     return np.asarray(base), np.asarray(detail), np.sqrt(power + 1e-8)[..., None]
 
 
-def wetted(
+def with_wet_patches(
     albedo: Float32,
     lasting: Float32,
     rng: np.random.Generator,
@@ -76,7 +76,7 @@ def wetted(
 ) -> Float32:
     """The albedo with patches of hard surface darker or paler: wet, dry, worn, dusty.
 
-    patches: noise (n, n) that says where, drawn when it is not given.
+    patches: noise (n, n) that places them; None: drawn.
     """
     n = albedo.shape[0]
     field = noise(n, rng, 8, 3, 0.6) if patches is None else patches
@@ -87,7 +87,7 @@ def wetted(
 
 
 def coarser(image: Image, texel_px: float) -> Image:
-    """The image with one texture sample per `texel_px` pixels."""
+    """The image (same size) with one texture sample per `texel_px` pixels."""
     if texel_px <= 1.0:
         return image
     height, width = image.shape[:2]

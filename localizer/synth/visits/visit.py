@@ -15,8 +15,8 @@ _BUILT = 0.04  # largest share of buildings gone, rebuilt, and new, each
 
 @dataclass(frozen=True)
 class Visit:
-    """name: of the variant. changes: since the survey, None for none. survey: errors of the map
-    made at this visit, None for the true place.
+    """A visit to a place. name: of the variant. changes: since the survey; None: none. survey:
+    errors of the map made at this visit; None: the true place.
     """
 
     name: str

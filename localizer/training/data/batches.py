@@ -58,10 +58,11 @@ class Schedule:
 
 
 class ShardStream:
-    """Makes batches of the shards that a schedule selects.
+    """Makes batches from the shards that a schedule selects.
 
     A step waits until its shards exist. Training can therefore begin while later shards are still
-    being generated, and it sees the same data in every run.
+    being generated, and it sees the same data in every run. generating: result of the generation;
+    its failure is raised here.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class ShardStream:
         self._next: tuple[int, Future[Batch]] | None = None
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step; the next one is prepared meanwhile."""
+        """The batch of a step; a thread prepares the next one meanwhile."""
         if self._next is not None and self._next[0] == step:
             current = self._next[1]
         else:
@@ -153,10 +154,10 @@ class TrainingSample:
 
 
 def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> TrainingSample | None:
-    """Degrade the query, and crop windows of the same ground; None without overlap."""
+    """Degrade the images by light, weather and sensor, then crop as `window_pair`."""
     query, reference = pair.query, pair.reference
     if config.appearance:
-        look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+        look = limit_haze(sample_appearance(rng, pair.condition), pair.query_depth)
         query = apply_appearance(query, pair.query_depth, look, rng)
         survey = survey_appearance(rng)
         if survey is not None:
@@ -258,8 +259,8 @@ def collate(samples: list[TrainingSample]) -> Batch:
     return Batch(pixels.float() / 255.0, *stacked)
 
 
-def tamed(appearance: Appearance, depth: Float32) -> Appearance:
-    """The appearance with less haze if nothing would be visible at these distances."""
+def limit_haze(appearance: Appearance, depth: Float32) -> Appearance:
+    """The appearance with less haze if surfaces at these depths (m) would be invisible."""
     surface = depth[depth > 0]
     if not surface.size:
         return appearance

@@ -9,7 +9,7 @@ import numpy as np
 
 from localizer.pictures import write_rgb
 from localizer.synth.appearance.model import apply_appearance, sample_appearance
-from localizer.training.data.batches import tamed
+from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import Pair, warp_check
 from localizer.types import Image
 
@@ -17,14 +17,14 @@ _CHECKER_PX = 24
 
 
 def contact_sheet(pairs: Sequence[Pair], path: Path) -> Path:
-    """One row a pair: reference, clean query, query as trained on, warped checkerboard, depth."""
+    """Write one row a pair: reference, clean query, degraded query, warped checkerboard, depth."""
     rows = [_row(pair, np.random.default_rng(k)) for k, pair in enumerate(pairs)]
     write_rgb(path, np.vstack(rows))
     return path
 
 
 def _row(pair: Pair, rng: np.random.Generator) -> Image:
-    look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+    look = limit_haze(sample_appearance(rng, pair.condition), pair.query_depth)
     weathered = apply_appearance(pair.query, pair.query_depth, look, rng)
     warped, mask = warp_check(pair)
     height, width = mask.shape

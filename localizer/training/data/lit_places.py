@@ -32,7 +32,7 @@ class PlaceVisits:
 def make_place(
     seed: int, scenes: SceneConfig, photos: PhotoSource | None, flight_days: int
 ) -> PlaceVisits:
-    """The place of a seed, lit and ready to render."""
+    """The place of a seed, lit and ready to render. photos: None: generated ground only."""
     rng = np.random.default_rng(seed)
     place, source = draw_place(rng, scenes, None if photos is None else photos.library())
     survey = survey_scene(rng, place, scenes)
@@ -44,7 +44,7 @@ def make_place(
     return PlaceVisits(survey, tuple((lit, visit, season) for visit, lit, season in days), source)
 
 
-def be_nice() -> None:
+def low_priority() -> None:
     """Initialise a worker process: low priority, one core."""
     os.nice(5)
     cv2.setNumThreads(1)

@@ -26,11 +26,11 @@ from localizer.training.data.batches import (
     LoaderConfig,
     TrainingSample,
     collate,
+    limit_haze,
     survey_appearance,
-    tamed,
     window_pair,
 )
-from localizer.training.data.lit_places import PlaceVisits, be_nice, make_place
+from localizer.training.data.lit_places import PlaceVisits, low_priority, make_place
 from localizer.training.data.pairs import Pair, SceneConfig, draw_views
 from localizer.training.data.shards import PhotoSource
 from localizer.training.losses import Batch
@@ -52,12 +52,12 @@ class LivePlan:
     flight_days: int
 
     def window(self, step: int) -> range:
-        """Running numbers of the places of a step; number k lies in slot ``k % active``."""
+        """Running numbers of a step's places; place k uses slot ``k % active``."""
         first = step // self.steps_per_place
         return range(first, first + self.active)
 
     def seed(self, number: int, rank: int, count: int) -> int:
-        """The seed of a place; processes of one run have different ones."""
+        """Seed of place `number` of process `rank` of `count`; the processes' seeds differ."""
         return self.first_seed + (number * count + rank) % self.places
 
 
@@ -81,7 +81,7 @@ class LiveStream:
         self._loader, self._seed, self._rank, self._count = loader, seed, rank, count
         self._ahead = workers
         # Forked processes would inherit a GPU's context, which does not work in them.
-        self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=be_nice)
+        self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=low_priority)
         self._views = plan.flight_days + 1  # slots of a place: its survey and its days
         self._pool = ScenePool(plan.active * self._views, scenes.cells, device)
         self._coming: dict[int, Future[PlaceVisits]] = {}
@@ -95,7 +95,7 @@ class LiveStream:
         return self._pool.device
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step; the next one is prepared meanwhile."""
+        """The batch of a step; a thread prepares the next one meanwhile."""
         if self._next is not None and self._next[0] == step:
             current = self._next[1]
         else:
@@ -109,7 +109,7 @@ class LiveStream:
         self._makers.shutdown(wait=False, cancel_futures=True)
 
     def _make(self, step: int) -> Batch:
-        self.provide(step)
+        self.load_places(step)
         key = (self._seed, self._rank, step)
         rng = np.random.default_rng(key)
         noise = torch.Generator(self._pool.device)
@@ -123,8 +123,8 @@ class LiveStream:
                     samples.append(made)
         return collate(samples[: self._loader.batch])
 
-    def provide(self, step: int) -> None:
-        """Bring the step's places into their slots; later ones are begun."""
+    def load_places(self, step: int) -> None:
+        """Wait for the step's places and copy them into their slots; begin to make later ones."""
         window = self._plan.window(step)
         for number in range(window.start, window.stop + self._ahead):
             if number not in self._places and number not in self._coming:
@@ -173,7 +173,7 @@ class LiveStream:
             if not self._loader.appearance:
                 yield clean
                 continue
-            look = tamed(sample_appearance(rng, visit.weather), clean.query_depth)
+            look = limit_haze(sample_appearance(rng, visit.weather), clean.query_depth)
             shown = apply_appearance(seen[k], seen_depths[k], look, rng, noise)
             survey = survey_appearance(rng)
             known = maps[k]

@@ -25,9 +25,9 @@ from localizer.synth.heightfield.scene import (
     compose,
     height_at,
     light_scene,
-    without,
+    omit_randomly,
 )
-from localizer.synth.visits.texture import draw_texel, regrown, wetted
+from localizer.synth.visits.texture import draw_texel, with_new_texture, with_wet_patches
 from localizer.training.places.changes import coarse_mesh, plain_walls
 from localizer.training.places.land import generated_place, photo_place
 from localizer.training.places.objects import new_buildings, parked_cars
@@ -66,10 +66,9 @@ class Pair:
 @dataclass(frozen=True)
 class SceneConfig:
     """Size and variety of the scenes and views. light_variety False keeps the map's own light and
-    season in the query (the ablation of the paper's Table 4). cell_m: range of the size of a cell,
-    which sets the altitude. conditions: of each light in turn when given (`visit_of`), as many as
-    there are lights; else drawn. motion: metres and
-    degrees between the two views, exactly, instead of the training's mixture.
+    season in the query (the ablation of the paper's Table 4). cell_m: range of a cell's size, which
+    sets the altitude. conditions: one for each light in turn (`named_conditions`); empty: drawn.
+    motion: exact metres and degrees between the two views; None: the training's mixture.
     """
 
     cells: int = 1024
@@ -86,8 +85,8 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class FlightDay:
-    """Conditions of a flight: weather or light (of `CONDITIONS`), changed buildings, another season
-    (None: drawn).
+    """Conditions of a flight. weather: weather or light, of `CONDITIONS`; outdated: whether
+    buildings have changed; season: whether the season differs from the map's; None: drawn.
     """
 
     weather: str
@@ -96,7 +95,7 @@ class FlightDay:
 
 
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
-    """Yield all training pairs of the place of `seed`."""
+    """Yield all training pairs of the place of `seed`. library: None: generated ground only."""
     rng = np.random.default_rng(seed)
     place, source = draw_place(rng, config, library)
     survey = survey_scene(rng, place, config)
@@ -105,7 +104,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
     for k in range(config.references):
         if lived is None or k % config.queries_per_light == 0:
             if config.conditions:
-                visit = visit_of(rng, config.conditions[k // config.queries_per_light])
+                visit = named_conditions(rng, config.conditions[k // config.queries_per_light])
             else:
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
@@ -159,7 +158,7 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
 
 
 def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneConfig) -> LitScene:
-    """The map: the place on the survey day, as a baked texture on a coarse mesh."""
+    """The place on the survey day, as the map shows it: a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
     if rng.random() < _PLAIN_WALLS:
         prisms = plain_walls(prisms)
@@ -174,8 +173,8 @@ def flight_day_scene(
     visit: FlightDay,
     light: SkyLight | None,
 ) -> tuple[LitScene, bool]:
-    """The place on the flight day, and whether its season differs from the map's; a given light
-    also keeps the season.
+    """The place on the flight day, and whether its season differs from the map's. light: keeps this
+    light and the map's season; None: both are drawn.
     """
     land, prisms, season = place.land, list(place.prisms), False
     condition, outdated = visit.weather, visit.outdated
@@ -185,10 +184,10 @@ def flight_day_scene(
         if rng.random() < 0.7 or (visit.season and not season):
             albedo, season = season_shift(albedo, rng), True
         land = Land(land.height, albedo, land.cell_m)
-    albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
-    land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
+    albedo = with_new_texture(land.albedo, place.lasting, land.cell_m, rng)
+    land = Land(land.height, with_wet_patches(albedo, place.lasting, rng), land.cell_m)
     if outdated:
-        prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
+        prisms = omit_randomly(prisms, rng, rng.uniform(0.03, 0.25))
         prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
     prisms += parked_cars(rng, place, _car_count(rng, place))
     direct = 0.0 if condition in ("fog", "rain", "snow", "night") else 1.0
@@ -223,7 +222,7 @@ def draw_condition(rng: np.random.Generator) -> str:
     return str(rng.choice(CONDITIONS, p=(0.42, 0.15, 0.17, 0.1, 0.08, 0.08)))
 
 
-def visit_of(rng: np.random.Generator, condition: str) -> FlightDay:
+def named_conditions(rng: np.random.Generator, condition: str) -> FlightDay:
     """Conditions of a named test: a weather, `SEASON`, `OUTDATED`, or any weather with both
     (`COMBINED`).
     """
@@ -274,7 +273,9 @@ def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Gen
 def moved(
     rng: np.random.Generator, pose: Pose, distance: float, exact: tuple[float, float] | None
 ) -> Pose:
-    """Draw the query pose: up to 15 m and 15 deg away, or a few video frames further."""
+    """Draw the query pose near `pose`: up to 15 m and 15 deg away. distance: m to the ground,
+    limits the shift; exact: (metres, degrees) instead of drawn ones.
+    """
     if rng.random() < 0.3:
         metres, degrees = rng.uniform(0, 3), rng.uniform(0, 3)
     else:
@@ -304,7 +305,7 @@ def _overlap(scene: LitScene, reference: Pose, query: Pose, camera: Camera) -> f
 
 
 def soften(rng: np.random.Generator, image: Image) -> Image:
-    """A map texture somewhat coarser than the view."""
+    """Blur a map texture slightly, half the time."""
     if rng.random() < 0.5:
         return image
     soft: Image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))

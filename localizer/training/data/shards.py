@@ -27,8 +27,8 @@ WORLD_SHARD_PAIRS = 10
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """Where the real textures are and which groups of them to use; held_out: of the cross-season
-    plots, those for tests.
+    """Folder of real textures and the groups to use. held_out: of the cross-season plots, use those
+    for tests instead of the others.
     """
 
     root: Path
@@ -36,7 +36,7 @@ class PhotoSource:
     held_out: bool = False
 
     def library(self) -> PhotoLibrary:
-        """The textures themselves, one reader a process."""
+        """Open the textures; each process needs its own."""
         return PhotoLibrary(self.root, self.groups, held_out=self.held_out)
 
 
@@ -89,7 +89,7 @@ def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoSource |
 
 
 def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:
-    """Write a shard; a reader never sees half a file, and a stopped run leaves none."""
+    """Write a shard and return its path. The file appears whole or not at all."""
     partial = path.with_suffix(".partial.npz")
     try:
         np.savez(

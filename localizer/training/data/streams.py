@@ -17,7 +17,7 @@ from localizer.training.distributed import TrainingProcess
 def open_stream(
     config: TrainConfig, workers: TrainingProcess, generating: Future[None] | None
 ) -> ShardStream | LiveStream:
-    """The batches of one process of a run. generating: what writes missing shards alongside."""
+    """The batches of one process of a run. generating: writes missing shards meanwhile."""
     data, o = config.data, config.optimizer
     loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
     if isinstance(data, DataSection):
@@ -32,7 +32,7 @@ def open_stream(
 
 
 def schedule(data: DataSection) -> Schedule:
-    """The shards of a run."""
+    """Which shards each step of a run draws from."""
     seeds = range(data.first_seed, data.first_seed + data.scenes)
     worlds = range(FIRST_WORLD_SEED, FIRST_WORLD_SEED + data.worlds)
     return Schedule(
@@ -46,7 +46,7 @@ def schedule(data: DataSection) -> Schedule:
 
 
 def scene_config(data: DataSection | LiveSection) -> SceneConfig:
-    """What the generator needs of a run's configuration."""
+    """Scene configuration of a run's data section."""
     scenes = SceneConfig(photo_share=data.photo_share, light_variety=data.light_variety)
     width, height = data.image
     scenes = replace(scenes, width=width, height=height)
@@ -54,5 +54,5 @@ def scene_config(data: DataSection | LiveSection) -> SceneConfig:
 
 
 def photo_source(data: DataSection | LiveSection) -> PhotoSource | None:
-    """The real textures of a run, if it uses any."""
+    """The real textures of a run; None if it uses none."""
     return None if data.photos is None else PhotoSource(data.photos, data.photo_groups)

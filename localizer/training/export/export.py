@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from localizer.errors import ModelError
 from localizer.features.extractor import OnnxExtractor
-from localizer.training.checkpoint import fill, read_checkpoint
+from localizer.training.checkpoint import load_weights, read_checkpoint
 from localizer.training.config import TrainConfig
 from localizer.training.models.networks import Network, build, fuse
 from localizer.training.models.s0 import S0Net
@@ -28,8 +28,8 @@ _HALF_COSINE = 0.999  # least mean cosine of float16 features to the float32 one
 
 @dataclass(frozen=True)
 class Parity:
-    """A model against torch in float32: largest difference of any output, and the mean cosine of
-    the features on the level where it is least.
+    """How a model differs from torch in float32: largest difference of any output, and the mean
+    cosine of the features on the worst level.
     """
 
     difference: float
@@ -37,8 +37,8 @@ class Parity:
 
 
 class Deployed(nn.Module):
-    """The network as the flight path sees it: uint8 channels-last in, channels-last out. half: it
-    computes in float16; what comes out is float32 in any case.
+    """The network as the flight path uses it: uint8 channels-last in, channels-last out. half:
+    computes in float16; its outputs are float32 all the same.
     """
 
     def __init__(self, network: nn.Module, *, half: bool = False) -> None:
@@ -65,15 +65,15 @@ def load_network(checkpoint: Path) -> tuple[Network, TrainConfig, dict[str, obje
     except ValidationError as error:
         raise ModelError(f"{checkpoint}: of another version of the training: {error}") from error
     network = build(config.model)
-    fill(network, state["average"], checkpoint)
+    load_weights(network, state["average"], checkpoint)
     return network.eval(), config, progress
 
 
 def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
-    """Write `model` (ONNX) and its JSON; returns how it compares with torch in float32, checked.
+    """Write `model` (ONNX) and its JSON; returns its checked difference from torch in float32.
 
-    half: float16 inside, for GPUs. `tiny` is refused: its fixed channels need float32. `ModelError`
-    for a precision that the network does not support.
+    half: float16 inside, for GPUs; only for s0, because tiny's fixed channels need float32.
+    `ModelError` for a precision that the network does not support.
     """
     network, config, progress = load_network(checkpoint)
     if half and not isinstance(network, S0Net):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from localizer.errors import ModelError
-from localizer.training.checkpoint import fill, read_checkpoint, write_checkpoint
+from localizer.training.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.data.streams import open_stream
 from localizer.training.distributed import TrainingProcess
@@ -33,8 +33,8 @@ _log = logging.getLogger(__name__)
 class Trainer:
     """A training run that can be stopped and resumed at any step with the same result.
 
-    Under torchrun every process takes batches of its own and all take the mean step; the first one
-    writes. Batch statistics stay each process's own, the first one's are kept.
+    Under torchrun every process takes its own batches and all take the mean step; the first process
+    writes the files. Batch statistics are not averaged; the first process's are kept.
     """
 
     def __init__(self, config: TrainConfig) -> None:
@@ -46,7 +46,7 @@ class Trainer:
         self.model = build(config.model).to(self.device).train()
         if config.warm_start is not None:
             first = read_checkpoint(config.warm_start, self.device)
-            fill(self.model, first["average"], config.warm_start)
+            load_weights(self.model, first["average"], config.warm_start)
         self.average = build(config.model).to(self.device).eval()
         self.average.load_state_dict(self.model.state_dict())
         self.log_scale = nn.Parameter(
@@ -66,13 +66,13 @@ class Trainer:
 
     @property
     def checkpoint(self) -> Path:
-        """The newest state of this run."""
+        """Path of the run's newest checkpoint."""
         return self.config.output / f"{self.config.name}.pt"
 
     def run(self, steps: int | None = None, generating: Future[None] | None = None) -> None:
-        """Train up to the configured number of steps, or `steps` more.
+        """Train up to the configured number of steps, or `steps` more, and write a checkpoint.
 
-        generating: what writes the shards alongside; its failure ends the run.
+        generating: generation of shards in parallel; its failure ends the run.
         """
         last = self.config.optimizer.steps
         if steps is not None:
@@ -132,7 +132,7 @@ class Trainer:
                 anchors, query, batch.query_pixels / stride, batch.visible,
                 self.log_scale[k].exp(), 64, o.whole_map_cells,
             )  # fmt: skip
-            start = perturbed(batch, o.start_error_px[k], generator)
+            start = perturbed_poses(batch, o.start_error_px[k], generator)
             alignment, error = alignment_loss(
                 batch, (anchors, trust), (query, confidence[pairs:]), stride, start,
                 o.lm_iterations,
@@ -176,8 +176,8 @@ class Trainer:
             return
         state = read_checkpoint(self.checkpoint, self.device)
         try:
-            fill(self.model, state["model"], self.checkpoint)
-            fill(self.average, state["average"], self.checkpoint)
+            load_weights(self.model, state["model"], self.checkpoint)
+            load_weights(self.average, state["average"], self.checkpoint)
             with torch.no_grad():
                 self.log_scale.copy_(state["log_scale"])
             self.optimizer.load_state_dict(state["optimizer"])
@@ -209,13 +209,13 @@ def learning_rate(step: int, o: OptimizerSection) -> float:
 
 
 def alignment_ramp(step: int, o: OptimizerSection) -> float:
-    """Share of Eq. 3's weight at a step: none before its first one, then rising to all of it."""
+    """Share of Eq. 3's weight at a step: 0 before `alignment_first_step`, then rising to 1."""
     since = max(step - o.alignment_first_step, 0)
     return min(1.0, since / o.alignment_ramp_steps)
 
 
-def perturbed(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:
-    """The true poses, displaced so that anchors move by about `error_px` image pixels."""
+def perturbed_poses(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:
+    """The true poses query_from_reference, displaced so that anchors move by about error_px."""
     depth = batch.points[..., 2].median(dim=1).values
     xi = torch.randn(len(depth), 6, generator=generator).to(depth.device) * 0.6
     angle = error_px / batch.K_query[:, 0]

@@ -32,7 +32,7 @@ def build(config: ModelConfig | S0Config) -> Network:
 
 
 def fuse(network: Network) -> Network:
-    """The same function with single convolutions instead of training's branches, in place."""
+    """Fold training's branches into single convolutions, in place; the function stays the same."""
     if isinstance(network, S0Net):
         model_s0.fuse(network)
     else:

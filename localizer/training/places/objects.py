@@ -12,7 +12,7 @@ from localizer.types import Float32
 
 
 def parked_cars(rng: np.random.Generator, place: TrainingPlace, count: int) -> list[Prism]:
-    """Cars beside roads, or anywhere where there are none."""
+    """Cars beside roads, or anywhere if the place has no roads."""
     n, cell = place.land.height.shape[0], place.land.cell_m
     cars = []
     for _ in range(count):
@@ -32,7 +32,7 @@ def parked_cars(rng: np.random.Generator, place: TrainingPlace, count: int) -> l
 
 
 def new_buildings(rng: np.random.Generator, place: TrainingPlace, count: int) -> list[Prism]:
-    """Buildings where the map has none: what was built since."""
+    """Buildings at random places, as built since the survey."""
     n, cell = place.land.height.shape[0], place.land.cell_m
     return [building(rng, rng.uniform(0, n, 2), rng.uniform(0, np.pi), cell) for _ in range(count)]
 
@@ -125,7 +125,7 @@ def plant(
     blocked: NDArray[np.uint8],
     cell_m: float,
 ) -> None:
-    """Tree crowns as domes: dense in the forest, scattered elsewhere; drawn in place."""
+    """Draw tree crowns as domes, in place: dense in the forest, scattered elsewhere."""
     n = height.shape[0]
     budget = int(min(5000, 0.02 * n * n))
     at = rng.uniform(0, n, (budget, 2))

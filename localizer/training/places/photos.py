@@ -34,7 +34,7 @@ class PhotoLibrary:
         self.groups = groups
 
     def sample(self, rng: np.random.Generator, n: int) -> list[NDArray[np.uint8]]:
-        """One place's texture layers, (n, n, 3) uint8 RGB each."""
+        """One place's texture layers, (n, n, 3) uint8 RGB each; several if its dates differ."""
         group = str(rng.choice(self.groups))
         files = self._files[group]
         if group == _SEASONS:
@@ -63,7 +63,7 @@ class PhotoLibrary:
 
 
 def read_photo(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a photo's file; SequenceError where it is none."""
+    """(H, W, 3) RGB of a photo's file; `SequenceError` if it is no image."""
     return read_rgb(path)
 
 

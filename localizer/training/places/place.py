@@ -10,8 +10,9 @@ from localizer.types import Float32
 
 @dataclass(frozen=True)
 class TrainingPlace:
-    """A training place. seasons: albedos of the same ground at other dates, where the data has
-    them; lasting: (n, n) in 0..1, one where the fine texture stays: roads, roofs, pavement.
+    """A training place: ground, prisms (buildings and plants) on it and roads. seasons: albedos of
+    the same ground at other dates, where the data has them. lasting: (n, n) in 0..1, one where the
+    fine texture is the same at all dates: roads, roofs, pavement.
     """
 
     land: Land

@@ -36,7 +36,10 @@ _HEIGHT_P, _CLIMB_P, _CLIMB_I = 1.0, 4.0, 1.0
 def attitude_control(
     q: Array, gyro: Array, target: Array, integrator: Array, dt: float, motors: Array
 ) -> None:
-    """Write motor thrusts (4,) N for a target (5,): attitude quaternion and total thrust."""
+    """Write motor thrusts (4,) in N to `motors`. q: attitude, body to NED; gyro: rad/s, body axes;
+    target: (5,) attitude quaternion and total thrust in N; integrator: (3,) of the rate loop,
+    updated in place.
+    """
     # Error quaternion conj(q) * target; its vector part is half the rotation vector.
     w, x, y, z = q[0], -q[1], -q[2], -q[3]
     a, b, c, d = target[0], target[1], target[2], target[3]
@@ -65,7 +68,9 @@ def attitude_control(
 
 
 def sqrt_controller(error: float, gain: float, limit: float) -> float:
-    """Target speed for a position error: proportional near it, sqrt(2 limit error) farther."""
+    """Target speed for a position error: gain * error near zero; farther away, the speed from which
+    `limit` (m/s²) can still stop.
+    """
     linear = limit / gain**2
     if abs(error) <= linear:
         return gain * error
@@ -84,7 +89,7 @@ class ControlLimits:
 
 
 @dataclass
-class Carrot:
+class SetPoint:
     """A set point that moves along a straight leg with limited speed and acceleration."""
 
     start: Vector
@@ -104,7 +109,11 @@ class Carrot:
         return self.position == self.end
 
     def move(self, vehicle: Vector, limits: ControlLimits, dt: float) -> None:
-        """Advance the set point; wait if the vehicle lags by more than its stopping distance."""
+        """Advance the set point by dt seconds. vehicle: the vehicle's position, NED m.
+
+        The set point slows down if the vehicle lags by more than half of 2 m + 1.5 s at full speed,
+        and stops at the whole of that distance.
+        """
         leg = tuple(e - s for s, e in zip(self.start, self.end, strict=True))
         length = sqrt(sum(c * c for c in leg))
         if length < 1e-3 or self._travelled >= length:
@@ -146,7 +155,7 @@ def _along(direction: tuple[float, ...], limits: ControlLimits) -> tuple[float, 
 
 
 class PositionController:
-    """Velocity and climb controllers with integrators; output: attitude and thrust."""
+    """Computes attitude and thrust from velocity targets; has integrators."""
 
     def __init__(self) -> None:
         self._integral = [0.0, 0.0, 0.0]  # m/s², NED
@@ -166,7 +175,7 @@ class PositionController:
         self.yaw_rad = wrap_pi(self.yaw_rad + min(max(error, -limit), limit))
 
     def velocity_for(self, error: Vector, feedforward: Vector, limits: ControlLimits) -> Vector:
-        """Velocity target (NED m/s) for a position error (NED m) and the target's own velocity."""
+        """Velocity target (NED m/s) for a position error (NED m); feedforward: the set point's."""
         distance = hypot(error[0], error[1])
         pull = sqrt_controller(distance, _POSITION_P, limits.acceleration)
         scale = pull / distance if distance > 1e-6 else 0.0
@@ -180,7 +189,9 @@ class PositionController:
     def horizontal(
         self, wanted: Vector, velocity: Vector, feedforward: Vector, dt: float
     ) -> tuple[float, float]:
-        """Horizontal acceleration command (m/s²) for a velocity target and its own acceleration."""
+        """Horizontal acceleration command (north, east m/s²). wanted: velocity target, velocity:
+        the present one, both NED m/s; feedforward: the set point's own acceleration.
+        """
         errors = [wanted[i] - velocity[i] for i in range(2)]
         raw = [feedforward[i] + _VELOCITY_P * errors[i] + self._integral[i] for i in range(2)]
         size = hypot(raw[0], raw[1])
@@ -198,7 +209,9 @@ class PositionController:
     def thrust(
         self, wanted_down: float, velocity_down: float, tilt_cosine: float, dt: float
     ) -> float:
-        """Total thrust (N) for a down-velocity target (m/s) at a given tilt."""
+        """Total thrust (N) from wanted and present down velocity (m/s). tilt_cosine: of the
+        tilt.
+        """
         error = wanted_down - velocity_down
         self._integral[2] = min(max(self._integral[2] + _CLIMB_I * error * dt, -3.0), 3.0)
         down = min(max(_CLIMB_P * error + self._integral[2], -5.0), 4.0)
@@ -206,7 +219,10 @@ class PositionController:
         return min(max(total, 0.05 * 4 * MOTOR_MAX), 0.9 * 4 * MOTOR_MAX)
 
     def lean(self, acceleration: tuple[float, float], yaw_rad: float) -> Array:
-        """Attitude quaternion that leans for a horizontal NED acceleration at a heading."""
+        """Attitude quaternion that tilts the thrust so that it gives a horizontal acceleration
+        (north, east m/s²). yaw_rad: the present heading; the quaternion's heading is the
+        controller's target.
+        """
         n, e = acceleration
         forward = n * cos(yaw_rad) + e * sin(yaw_rad)
         right = -n * sin(yaw_rad) + e * cos(yaw_rad)

@@ -7,7 +7,7 @@ from math import atan2, cos, hypot
 
 import numpy as np
 
-from sitl.embedded.control.controller import Carrot, ControlLimits, PositionController, Vector
+from sitl.embedded.control.controller import ControlLimits, PositionController, SetPoint, Vector
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.dynamics import TICK_S
@@ -18,15 +18,17 @@ _LAND_FINAL_HEIGHT = 10.0  # m; below it LAND_SPEED
 
 @dataclass
 class Guidance:
-    """Target of the vehicle, and the attitude and thrust that lead to it.
+    """Computes attitude and thrust that lead the vehicle to its target.
 
-    returning: RTL's speed and heading hold. NED metres about the EKF origin, m/s, radians.
+    Positions are NED metres from the EKF origin; speeds m/s; angles radians. set_point: None before
+    take-off. speed_override: replaces WPNAV_SPEED; None: no override. yaw_target: heading to turn
+    to; None: keep the heading. landing: descend. returning: use RTL_SPEED.
     """
 
     parameters: Parameters
     estimator: Estimator
     controller: PositionController = field(default_factory=PositionController)
-    carrot: Carrot | None = None
+    set_point: SetPoint | None = None
     speed_override: float | None = None
     yaw_target: float | None = None
     landing: bool = False
@@ -53,24 +55,26 @@ class Guidance:
         )
 
     def reset(self) -> None:
-        """Forget the controller's history and hold the heading."""
+        """Clear the controller's integrators and hold the present heading."""
         self.controller.reset(self.yaw)
 
     def hold_here(self) -> None:
         """Stay where the vehicle is."""
         here = self.estimator.position
-        self.carrot = Carrot(here, here)
+        self.set_point = SetPoint(here, here)
 
     def climb(self, down: float) -> None:
-        """Straight up, with a fresh controller, to a NED down."""
+        """Fly straight up (or down) to `down`, NED metres, with a fresh controller."""
         self.reset()
         north, east, here = self.estimator.position
-        self.carrot = Carrot((north, east, here), (north, east, down))
+        self.set_point = SetPoint((north, east, here), (north, east, down))
         self.yaw_target = self.yaw
 
     def fly(self, target: Vector) -> None:
-        """Follow a straight leg to a target, NED metres, starting at the last set point."""
-        old, here = self.carrot, self.estimator.position
+        """Follow a straight leg to `target`, NED metres. The leg starts at the present set point,
+        or at the vehicle if that set point is 20 m away or more.
+        """
+        old, here = self.set_point, self.estimator.position
         if old is not None and old.end == target:
             return
         start, speed = here, 0.0
@@ -79,7 +83,7 @@ class Guidance:
             way = [t - s for t, s in zip(target, start, strict=True)]
             length = max(sum(w * w for w in way) ** 0.5, 1e-6)
             speed = sum(v * w for v, w in zip(old.velocity, way, strict=True)) / length
-        self.carrot = Carrot(start, target, max(speed, 0.0))
+        self.set_point = SetPoint(start, target, max(speed, 0.0))
         north, east = target[0] - start[0], target[1] - start[1]
         behavior = int(self.parameters["WP_YAW_BEHAVIOR"])
         follows = behavior == 1 or (behavior == 2 and not self.returning)
@@ -88,26 +92,28 @@ class Guidance:
 
     def arrived(self) -> bool:
         """Whether the vehicle is within the waypoint radius of the leg's end."""
-        if self.carrot is None:
+        if self.set_point is None:
             return True
-        end = self.carrot.end
+        end = self.set_point.end
         radius = self.parameters["WPNAV_RADIUS"] / 100.0
         gap = sum((a - b) ** 2 for a, b in zip(end, self.estimator.position, strict=True)) ** 0.5
-        return self.carrot.arrived and gap < radius
+        return self.set_point.arrived and gap < radius
 
     def steer(self, home_down: float, *, level_when_lost: bool) -> Array:
-        """Attitude quaternion and thrust (5,) that follow the set point (or descend) and hold the
-        heading target. home_down: height of home, NED metres; level_when_lost: without a position
-        stay level and drift with the wind.
+        """Attitude quaternion and total thrust (5,) for the next tick. They follow the set point
+        (in a landing: descend) and hold the heading target.
+
+        home_down: NED down coordinate of home, m. level_when_lost: without a valid position, stay
+        level and drift with the wind.
         """
         limits, position = self.limits, self.estimator.position
         if self.yaw_target is not None:
             self.controller.turn(self.yaw_target, TICK_S)
-        carrot = self.carrot or Carrot(position, position)
-        carrot.move(position, limits, TICK_S)
-        error = tuple(a - b for a, b in zip(carrot.position, position, strict=True))
+        set_point = self.set_point or SetPoint(position, position)
+        set_point.move(position, limits, TICK_S)
+        error = tuple(a - b for a, b in zip(set_point.position, position, strict=True))
         wanted = self.controller.velocity_for(
-            (error[0], error[1], error[2]), carrot.velocity, limits
+            (error[0], error[1], error[2]), set_point.velocity, limits
         )
         if self.landing:
             wanted = (wanted[0], wanted[1], self._landing_speed(home_down))
@@ -118,7 +124,7 @@ class Guidance:
         if not self.estimator.position_valid and level_when_lost:
             return np.array([*quaternion(0.0, 0.0, self.controller.yaw_rad), thrust])
         lean = self.controller.horizontal(
-            wanted, self.estimator.velocity, carrot.acceleration, TICK_S
+            wanted, self.estimator.velocity, set_point.acceleration, TICK_S
         )
         return np.array([*self.controller.lean(lean, self.yaw), thrust])
 

@@ -71,7 +71,7 @@ class MissionStore:
         self._peer = (0, 0)
 
     def handle(self, message: Any, reply: Reply) -> bool:
-        """Answer a mission-protocol message; True when it replaced the mission."""
+        """Answer a mission-protocol message on `reply`; True if it replaced the mission."""
         kind = message.get_type()
         self._peer = (message.get_srcSystem(), message.get_srcComponent())
         if getattr(message, "mission_type", _MISSION_TYPE) != _MISSION_TYPE:
@@ -92,7 +92,7 @@ class MissionStore:
         return False
 
     def _other_type(self, kind: str, message: Any, reply: Reply) -> None:
-        """Fences and rally points: there are none, and none are taken."""
+        """Answer a message about fences or rally points: the vehicle has none and accepts none."""
         if kind == "MISSION_REQUEST_LIST":
             reply.send(mavlink.MAVLink_mission_count_message(*self._peer, 0, message.mission_type))
         elif kind in ("MISSION_COUNT", "MISSION_CLEAR_ALL"):
@@ -165,7 +165,9 @@ class MissionStore:
 
 
 def _not_a_number(item: StoredMissionItem) -> int | None:
-    """Index of the first NaN parameter; only the yaw of a place may be one, as in ArduPilot."""
+    """Index of the first NaN parameter that is not allowed; None if there is none. Only the yaw of
+    an item with a position may be NaN, as in ArduPilot.
+    """
     for index, value in enumerate(item.parameters):
         if isnan(value) and not (index == 3 and item.command in NAVIGATION):
             return index
@@ -173,7 +175,7 @@ def _not_a_number(item: StoredMissionItem) -> int | None:
 
 
 def item_from(message: Any) -> StoredMissionItem:
-    """From MISSION_ITEM_INT, COMMAND_INT (1e-7 degrees) or MISSION_ITEM (degrees)."""
+    """Read MISSION_ITEM_INT, COMMAND_INT (1e-7 degrees) or MISSION_ITEM (degrees)."""
     scale = 1.0 if message.get_type() == "MISSION_ITEM" else 1e-7
     return StoredMissionItem(
         message.command,

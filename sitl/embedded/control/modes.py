@@ -63,7 +63,9 @@ class FlightModes:
     # --- requests ----------------------------------------------------------------------------
 
     def set_mode(self, mode: Mode) -> bool:
-        """Change mode; refused without a position where one is needed."""
+        """Change the flight mode; True if it was changed. Refused with a STATUSTEXT: a mode that
+        needs a position, without one while armed; AUTO without a mission.
+        """
         if mode is self.mode:
             return True
         if mode.needs_position and self.armed and not self.estimator.position_valid:
@@ -101,24 +103,28 @@ class FlightModes:
         """Stop the motors."""
         self.armed = self.estimator.sources.armed = False
         self._flying = self._guidance.landing = False
-        self._guidance.carrot = None
+        self._guidance.set_point = None
 
     def takeoff(self, height_m: float) -> bool:
-        """MAV_CMD_NAV_TAKEOFF: climb to a height above home; only on the ground in GUIDED."""
+        """MAV_CMD_NAV_TAKEOFF: climb to a height above home. False unless armed on the ground in
+        GUIDED.
+        """
         if not (self.armed and self.mode is Mode.GUIDED and not self._flying):
             return False
         self._begin_takeoff(height_m)
         return True
 
     def go_to(self, location: Location, yaw_rad: float | None = None) -> bool:
-        """Fly to a location in GUIDED."""
+        """Fly to a location, and turn to yaw_rad if given. False if the vehicle does not fly in
+        GUIDED, or has no EKF origin.
+        """
         if not self._guided or self.estimator.origin is None:
             return False
         self.go_to_local(self.estimator.origin.ned_of(location), yaw_rad)
         return True
 
     def go_to_local(self, target: Vector, yaw_rad: float | None = None) -> bool:
-        """Fly to NED metres about the EKF origin in GUIDED."""
+        """Fly to NED metres from the EKF origin (yaw_rad None: keep it); False outside GUIDED."""
         if not self._guided:
             return False
         self._guidance.fly(target)
@@ -127,7 +133,9 @@ class FlightModes:
         return True
 
     def start_mission(self, index: int = 1) -> bool:
-        """MAV_CMD_MISSION_START, MISSION_SET_CURRENT: (re)start AUTO at an item."""
+        """MAV_CMD_MISSION_START, MISSION_SET_CURRENT: fly the mission from item `index` on. False
+        without that item; outside AUTO only item 1 is accepted.
+        """
         if not 0 < index < len(self.mission.items):
             return False
         if self.mode is Mode.AUTO:
@@ -138,14 +146,16 @@ class FlightModes:
         return index == 1 and self.set_mode(Mode.AUTO)
 
     def condition_yaw(self, angle_deg: float, direction: float, relative: bool) -> None:
-        """MAV_CMD_CONDITION_YAW: hold a heading until the next waypoint."""
+        """MAV_CMD_CONDITION_YAW: hold a heading until the next waypoint. relative: angle_deg counts
+        from the present heading, clockwise if direction >= 0.
+        """
         angle = radians(angle_deg)
         if relative:
             angle = self._guidance.yaw + (angle if direction >= 0 else -angle)
         self._guidance.yaw_target = wrap_pi(angle)
 
     def change_speed(self, speed_m_s: float) -> bool:
-        """MAV_CMD_DO_CHANGE_SPEED."""
+        """MAV_CMD_DO_CHANGE_SPEED: speed instead of WPNAV_SPEED; False if it is not positive."""
         if speed_m_s <= 0:
             return False
         self._guidance.speed_override = speed_m_s
@@ -159,7 +169,7 @@ class FlightModes:
     @property
     def target(self) -> Vector | None:
         """Target position, NED metres about the origin; None without one."""
-        return self._guidance.carrot.end if self._guidance.carrot else None
+        return self._guidance.set_point.end if self._guidance.set_point else None
 
     # --- every tick --------------------------------------------------------------------------
 
@@ -180,7 +190,9 @@ class FlightModes:
         return self._guidance.steer(self._home_ned()[2], level_when_lost=self.mode is Mode.LAND)
 
     def check_ekf(self) -> None:
-        """Run the EKF checks at 10 Hz, and the failsafe if they fail."""
+        """Run the EKF checks, and the failsafe if they fail: LAND, or a text only if FS_EKF_ACTION
+        is 0 or the mode needs no position. Called at 10 Hz.
+        """
         if self.ekf_check.fails(self._time) and self.armed:
             self.ekf_check.failsafe = True
             if not self.mode.needs_position or self.parameters["FS_EKF_ACTION"] == 0:
@@ -188,7 +200,7 @@ class FlightModes:
             else:
                 self._enter(Mode.LAND)
                 self.notify(CRITICAL, "EKF Failsafe: changed to LAND Mode")
-        self.ekf_check.watch_glitch()
+        self.ekf_check.report_glitch()
 
     # --- helpers -----------------------------------------------------------------------------
 

@@ -23,17 +23,19 @@ def custom_mode(mode: Mode) -> int:
 
 
 class Px4Modes(FlightModes):
-    """Descend (shown as Land) where a mode's position is gone; a new position does not end it."""
+    """PX4's modes. If the position is lost in a mode that needs it, the vehicle descends (shown as
+    Land); a new position does not end the descent.
+    """
 
     def check_ekf(self) -> None:
-        """The 10 Hz check of the position, as the commander makes it."""
+        """PX4's position check, called at 10 Hz: starts the descent if the position is lost."""
         if self.armed and self.mode.needs_position and not self.position_ok:
             self._enter(Mode.LAND)
             self.notify(CRITICAL, "Failsafe activated")
 
     @property
     def position_ok(self) -> bool:
-        """Whether there is a position, and not worse than COM_POS_FS_EPH (negative: any)."""
+        """Whether the position is valid, with a sigma up to COM_POS_FS_EPH (negative: any)."""
         limit = self.parameters["COM_POS_FS_EPH"]
         near = limit < 0 or self.estimator.accuracy()[0] <= limit
         return self.estimator.position_valid and near

@@ -43,9 +43,9 @@ class Aiding(IntEnum):
 
 
 class AidedFilter:
-    """Fuses measurements of the active source set (1 to 3) into `gated`, after alignment.
+    """Fuses measurements of the active source set (1 to 3) into the filter `gated` once aligned.
 
-    armed: whether the vehicle is. `notify(severity, text)` sends a STATUSTEXT.
+    armed: whether the vehicle is armed. `notify(severity, text)` sends a STATUSTEXT.
     """
 
     def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
@@ -61,7 +61,7 @@ class AidedFilter:
         self._last_position_source = self._last_yaw_source = -1
 
     def set_origin(self, origin: Location) -> bool:
-        """Set the origin once; a second one is ignored without a message, as in EKF3."""
+        """Set the origin; False, without a message, if there is one already (as in EKF3)."""
         if self.origin is not None:
             return False
         self.origin = origin
@@ -69,14 +69,14 @@ class AidedFilter:
         return True
 
     def force_position(self, north_m: float, east_m: float, sigma_m: float) -> bool:
-        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: a reset, taken only after 1 s without aiding."""
+        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: reset the position. False while aided (1 s)."""
         if self.gated.now_ms - self.gated.clock.position_pass <= 1000 or self.origin is None:
             return False
         self.gated.reset_position(north_m, east_m, sigma_m**2)
         return True
 
     def fuse(self, measurement: Measurement) -> None:
-        """Fuse one measurement if its source is selected."""
+        """Fuse one measurement if the active source set uses its source."""
         if isinstance(measurement, Baro):
             self._fuse_baro(measurement.height)
         elif isinstance(measurement, Compass):
@@ -100,7 +100,7 @@ class AidedFilter:
         return int(self._parameters[f"EK3_SRC{self.source_set}_{what}"])
 
     def check_sources(self) -> None:
-        """After a change of the source set, reset position and yaw to the new source."""
+        """After a change of the source set, its next position and yaw reset the filter."""
         position, yaw = self.source("POSXY"), self.source("YAW")
         if position != self._last_position_source:
             self.gated.source_reset = self._last_position_source >= 0 and position != 0
@@ -110,7 +110,7 @@ class AidedFilter:
             self._last_yaw_source = yaw
 
     def check_gps(self, gps: GpsData) -> None:
-        """EKF3's receiver checks; the first good fix sets the origin."""
+        """EKF3's receiver checks; the first fix that passes sets a missing origin."""
         now = self.gated.now_ms
         if not gps.good or now - self.gated.clock.gps_received > 1000:
             self.gated.clock.gps_bad = now
@@ -127,7 +127,7 @@ class AidedFilter:
         self._tell(INFO, f"is using {source}")
 
     def update_aiding(self) -> None:
-        """End aiding by sources that have timed out."""
+        """End aiding by sources that have timed out. Called after every step."""
         if self.aiding is not Aiding.ABSOLUTE:
             return
         now, clock = self.gated.now_ms, self.gated.clock
@@ -159,7 +159,7 @@ class AidedFilter:
     # --- fusion ------------------------------------------------------------------------------
 
     def _use_gps(self, gps: GpsData) -> None:
-        self.gated.note_innovations()
+        self.gated.update_innovation_status()
         if self.source("YAW") == 2 and gps.yaw_rad is not None:
             self.gated.fuse_yaw(gps.yaw_rad, radians(10.0))
         if self.source("POSXY") != GPS or self.origin is None:

@@ -34,7 +34,9 @@ _HORIZONTAL, _VELOCITY = 1, 4  # bits of EKF2_GPS_CTRL and EKF2_EV_CTRL
 
 @dataclass
 class _Aid:
-    """A source of horizontal position. Times in ms since boot."""
+    """State of one source of horizontal position. active: it aids the filter. fused, received:
+    times of the last fused and the last received measurement, ms since boot.
+    """
 
     active: bool = False
     fused: int = _NEVER
@@ -42,7 +44,7 @@ class _Aid:
 
 
 class Ekf2Filter(AidedFilter):
-    """Every source that its parameter enables is fused at once; there are no source sets."""
+    """PX4's fusion: fuses every source that its parameter enables; no source sets."""
 
     def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
         super().__init__(parameters, notify)
@@ -69,14 +71,14 @@ class Ekf2Filter(AidedFilter):
             self._use_external(measurement)
 
     def source(self, what: str) -> int:
-        """None: EKF2 has no source sets."""
+        """Always 0, because EKF2 has no source sets."""
         return 0
 
     def check_sources(self) -> None:
-        """See `source`."""
+        """Does nothing, because EKF2 has no source sets."""
 
     def update_aiding(self) -> None:
-        """End the sources that are silent, and aiding after EKF2_NOAID_TOUT without any."""
+        """End sources that are silent. End aiding if nothing was fused for EKF2_NOAID_TOUT."""
         now, clock = self.gated.now_ms, self.gated.clock
         for name, aid in self._aids.items():
             aid.active = aid.active and now - aid.received <= _SILENT_MS[name]
@@ -86,7 +88,7 @@ class Ekf2Filter(AidedFilter):
             self._stop_aiding()
 
     def _tell(self, severity: int, text: str) -> None:
-        """EKF2 sends no texts."""
+        """Does nothing, because EKF2 sends no texts."""
 
     # --- sources -----------------------------------------------------------------------------
 
@@ -115,7 +117,10 @@ class Ekf2Filter(AidedFilter):
             self.gated.fuse_velocity(velocity, gps.vertical_velocity, speed, speed)
 
     def _use_external(self, fix: ExternalPosition) -> None:
-        """Beside GNSS only its changes count: an estimated bias takes up the rest, and stays."""
+        """Use a position of external vision. While GNSS aids, only changes of the position count:
+        an estimated bias absorbs its constant offset from GNSS. The bias stays after GNSS has
+        ended.
+        """
         aid, now = self._aids["vision"], self.gated.now_ms
         if not (self._on("EKF2_EV_CTRL", _HORIZONTAL) and self.origin is not None):
             return
@@ -199,7 +204,9 @@ class Ekf2Filter(AidedFilter):
         self.gated.position_timeout = self.gated.velocity_timeout = False
 
     def _fuse_position(self, source: Source, place: Place, sigma: float, gate: str) -> bool:
-        """Whether both axes are inside the gate; then they are fused."""
+        """Fuse a position if both axes are inside the gate; returns whether it was fused. gate:
+        name of the gate's parameter.
+        """
         gated = self.gated
         limit = max(self._parameters[gate], 1.0) ** 2
         innovation = self._difference(place)

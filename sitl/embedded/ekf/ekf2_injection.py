@@ -18,33 +18,37 @@ _EXCHANGES = 20
 
 
 class RemoteClock:
-    """Offset of a sender's clock, from the fastest of the last TIMESYNC exchanges."""
+    """Offset of a sender's clock, from the fastest of the last TIMESYNC exchanges. Times in µs."""
 
     def __init__(self) -> None:
         self._exchanges: deque[tuple[int, int]] = deque(maxlen=_EXCHANGES)
 
-    def answered(self, remote_us: int, asked_us: int, now_us: int) -> None:
-        """TIMESYNC's tc1 and ts1, and the time of its arrival."""
+    def add_exchange(self, remote_us: int, asked_us: int, now_us: int) -> None:
+        """Add a TIMESYNC answer: its tc1 (sender's clock), its ts1 (own clock when asked), and the
+        own clock at its arrival, all µs.
+        """
         middle = (asked_us + now_us) // 2
         self._exchanges.append((now_us - asked_us, remote_us - middle))
 
     def local_ms(self, remote_us: int, now_ms: int) -> int:
-        """A remote stamp in ms since boot; now, before the first exchange."""
+        """Convert a sender's timestamp (µs) to ms since boot; now_ms before the first exchange."""
         if not self._exchanges:
             return now_ms
         return (remote_us - min(self._exchanges)[1]) // 1000
 
 
 class Px4PositionInput(ExternalNavInput):
-    """State of PX4's inputs; `vision` and `odometry` of the ArduPilot model are not called."""
+    """Handles PX4's position messages; `vision` and `odometry` of ArduPilot are not called."""
 
     def external_vision(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
-        """VISION_POSITION_ESTIMATE, NED."""
+        """Take VISION_POSITION_ESTIMATE, NED."""
         stamp = clock.local_ms(message.usec, now_ms)
         self._position(message, message.covariance, stamp, now_ms)
 
     def external_odometry(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
-        """ODOMETRY in LOCAL_NED or LOCAL_FRD, whose axes count as north and east here."""
+        """Take ODOMETRY in LOCAL_NED or LOCAL_FRD; the axes of LOCAL_FRD count as north and east.
+        Other frames, and a quality below EKF2_EV_QMIN, are ignored.
+        """
         p, stamp = self._parameters, clock.local_ms(message.time_usec, now_ms)
         if message.frame_id not in (_LOCAL_NED, _LOCAL_FRD):
             return
@@ -61,7 +65,7 @@ class Px4PositionInput(ExternalNavInput):
         self._estimator.add(velocity, stamp - int(p["EKF2_EV_DELAY"]))
 
     def global_position(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
-        """GLOBAL_POSITION_SENSOR with the id of EKF2_AGP0; the first sets a missing origin."""
+        """Take GLOBAL_POSITION_SENSOR with id EKF2_AGP0_ID; the first sets a missing origin."""
         p, estimator = self._parameters, self._estimator
         if message.id == 0 or message.id != p["EKF2_AGP0_ID"] or not int(p["EKF2_AGP0_CTRL"]) & 1:
             return

@@ -15,8 +15,8 @@ _WARNING_PERIOD_S = 30.0
 class EkfCheck:
     """Checks the EKF's variances and innovations; call both methods at 10 Hz.
 
-    failsafe: set by the caller that acts on a failure; cleared with a text when the filter is good
-    again.
+    failsafe: set by the caller if it acts on a failure. The check clears it, with a text, when the
+    EKF is good again.
     """
 
     def __init__(
@@ -33,7 +33,9 @@ class EkfCheck:
         self._glitching = False
 
     def fails(self, time_s: float) -> bool:
-        """Whether the EKF has just failed."""
+        """True once per failure: at the check that completes the required number of failing checks.
+        Never before the EKF was good once.
+        """
         limit = self._parameters["FS_EKF_THRESH"]
         if self._estimator.origin is None or limit <= 0:
             return False
@@ -55,8 +57,8 @@ class EkfCheck:
             self._notify(CRITICAL, "EKF variance")
         return self._bad
 
-    def watch_glitch(self) -> None:
-        """Report when GNSS leaves the innovation gate and when it returns."""
+    def report_glitch(self) -> None:
+        """Send a text when GNSS leaves the innovation gate, and when it returns."""
         if self._estimator.gps_glitching is self._glitching:
             return
         self._glitching = not self._glitching

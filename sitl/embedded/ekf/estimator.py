@@ -49,7 +49,8 @@ class EkfFlags(IntFlag):
 class Estimator:
     """The vehicle's EKF.
 
-    output: the nominal state (16,) at the present, see `navigation`; sources: what it fuses.
+    output: the nominal state (16,) at the present, see `navigation`. sources: the filter that
+    selects and fuses measurements.
     """
 
     def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
@@ -67,7 +68,7 @@ class Estimator:
     # --- input -------------------------------------------------------------------------------
 
     def align(self, yaw_rad: float) -> None:
-        """Initial attitude: level (at rest) and a compass heading."""
+        """Set the initial attitude: level, with a compass heading from true north."""
         self._gated.state[nav.Q : nav.Q + 4] = (np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2))
         self.output[:] = self._gated.state
         self._gated.cov[2, 2] = 0.1**2
@@ -78,7 +79,7 @@ class Estimator:
         return self.sources.set_origin(origin)
 
     def add(self, measurement: Measurement, time_ms: int) -> None:
-        """Queue a measurement taken at time_ms since boot."""
+        """Queue a measurement taken at time_ms since boot (at the delayed horizon if older)."""
         if isinstance(measurement, GpsData):
             self.sources.check_gps(measurement)
         heapq.heappush(
@@ -87,8 +88,8 @@ class Estimator:
         )
 
     def add_external(self, fix: ExternalPosition, stamp_ms: int) -> bool:
-        """Queue a companion's position with its corrected time stamp; False if it is dropped
-        because of the 50 Hz limit.
+        """Queue a companion's position. stamp_ms: its timestamp in ms since boot, before
+        VISO_DELAY_MS is subtracted. False if it is dropped: not finite, or above the 50 Hz limit.
         """
         if not all(isfinite(c) for c in (*fix.position, fix.sigma)):
             return False
@@ -100,7 +101,7 @@ class Estimator:
         return True
 
     def add_external_velocity(self, velocity: ExternalVelocity, stamp_ms: int) -> None:
-        """Queue a companion's velocity with its corrected time stamp."""
+        """Queue a companion's velocity, with the same timestamp and limits as `add_external`."""
         if not all(isfinite(c) for c in velocity.velocity):
             return
         if not self._spaced(stamp_ms - self._gated.clock.external_velocity_stamp):
@@ -112,7 +113,7 @@ class Estimator:
 
     @property
     def origin(self) -> Location | None:
-        """Of the local frame; None before it is set or GNSS gave one."""
+        """Origin of the local frame; None until it is set."""
         return self.sources.origin
 
     @property
@@ -145,7 +146,7 @@ class Estimator:
 
     @property
     def gps_glitching(self) -> bool:
-        """GNSS innovations out of gate for more than a second while GNSS is the source."""
+        """Whether GNSS, the active source, has been outside the gate for more than a second."""
         return (
             not self._gated.innovations_good
             and self.sources.aiding is Aiding.ABSOLUTE
@@ -175,7 +176,7 @@ class Estimator:
 
     @property
     def variances(self) -> tuple[float, float, float, float]:
-        """Velocity, position, height and compass variances as EKF_STATUS_REPORT carries them."""
+        """EKF_STATUS_REPORT's test ratios of velocity, position, height, compass; 1 is the gate."""
         r = self._gated.ratios
         return sqrt(r.velocity), sqrt(r.position), sqrt(r.height), sqrt(r.yaw)
 
@@ -191,7 +192,7 @@ class Estimator:
     # --- one tick ----------------------------------------------------------------------------
 
     def update(self, increment: Array, now_ms: int) -> None:
-        """Process a 10 ms IMU increment: propagate, fuse what is due, update the output."""
+        """Process a tick's 10 ms IMU increment: propagate, fuse what is due, update `output`."""
         self._gated.now_ms = now_ms
         size = self._ring.shape[0]
         self._ring[(self._start + self._filled) % size] = increment

@@ -17,7 +17,7 @@ from sitl.embedded.physics.rotation import euler, rotate_world, wrap_pi
 
 @dataclass
 class TestRatios:
-    """Squared innovation over gate; 1 is the limit."""
+    """Squared ratio of innovation to gate; below 1 a measurement is inside the gate."""
 
     velocity: float = 0.0
     position: float = 0.0
@@ -27,7 +27,7 @@ class TestRatios:
 
 @dataclass
 class FilterClock:
-    """Times of the last events, ms since boot; None: never."""
+    """Times of the last events, ms since boot; -1,000,000: never."""
 
     position_pass: int = -1_000_000
     velocity_pass: int = -1_000_000
@@ -44,9 +44,9 @@ class FilterClock:
 class GatedFilter:
     """State and covariance with gated updates. Times are ms since boot.
 
-    state: nominal state (16,), cov: (15, 15), see `navigation`, at the delayed time horizon;
-    now_ms: the present. position_timeout, velocity_timeout: time without a measurement within its
-    gate after which the state may be reset to a measurement.
+    state: nominal state (16,), cov: (15, 15), see `navigation`, at the delayed time horizon.
+    now_ms: the present. position_timeout, velocity_timeout: whether no measurement was inside the
+    gate for so long that the next one resets the state.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -73,7 +73,9 @@ class GatedFilter:
         sigma: float,
         velocity: tuple[float, float] | None,
     ) -> None:
-        """Fuse north and east (m); after a timeout, reset to them instead."""
+        """Fuse north and east (m) if they are inside the gate; after a timeout, reset the position
+        to them instead. velocity: (north, east) m/s for that reset; None: not measured.
+        """
         p = self.parameters
         innovation = [position[i] - float(self.state[nav.P + i]) for i in range(2)]
         variance = self.cov[6, 6] + self.cov[7, 7]
@@ -106,7 +108,9 @@ class GatedFilter:
         sigma: float,
         gate_sigma: float,
     ) -> None:
-        """North, east and, if given, down in m/s; gate_sigma widens the gate alone."""
+        """Fuse north, east and (unless None) down velocity, m/s, if inside the gate. sigma: of the
+        measurement; gate_sigma: the sigma that the gate is computed with.
+        """
         observed = [*horizontal] if vertical is None else [*horizontal, vertical]
         squared, variance = 0.0, 0.0
         for i, value in enumerate(observed):
@@ -136,7 +140,7 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 8, innovation, sigma**2)
 
     def fuse_yaw(self, yaw_rad: float, sigma: float) -> None:
-        """Fuse a heading if it is inside the gate."""
+        """Fuse a heading (from true north, radians) if it is inside the gate."""
         innovation = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
         variance = self.cov[2, 2] + sigma**2
         gate = max(0.01 * self.parameters["EK3_YAW_I_GATE"], 1.0) ** 2
@@ -145,14 +149,14 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 2, innovation, sigma**2)
 
     def rotate_to(self, yaw_rad: float, sigma: float) -> None:
-        """Reset the heading."""
+        """Reset the heading (radians) and its variance."""
         self.yaw_reset = False
         change = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
         rotate_world(self.state[nav.Q : nav.Q + 4], 0.0, 0.0, change)
         nav.reset_error(self.cov, 2, 1, sigma**2)
 
     def reset_position(self, north: float, east: float, variance: float | None) -> None:
-        """Set the position; variance None keeps the covariance (EKF3's announced reset)."""
+        """Set north and east, m. variance None keeps the covariance (EKF3's announced reset)."""
         self.source_reset = False
         self.state[nav.P : nav.P + 2] = (north, east)
         if variance is not None:
@@ -161,14 +165,16 @@ class GatedFilter:
             self.position_timeout = False
 
     def reset_velocity(self, horizontal: tuple[float, float], variance: float) -> None:
-        """Set the horizontal velocity, m/s."""
+        """Set the horizontal velocity (north, east m/s) and its variance."""
         self.state[nav.V : nav.V + 2] = horizontal
         nav.reset_error(self.cov, 3, 2, variance)
         self.velocity_timeout = False
         self.clock.velocity_pass = self.now_ms
 
-    def note_innovations(self) -> None:
-        """GNSS glitch logic: bad after 1 s out of gate, good again after 10 s inside."""
+    def update_innovation_status(self) -> None:
+        """Update `innovations_good`: False after 1 s outside the gate, True again after 10 s
+        inside.
+        """
         clock, now = self.clock, self.now_ms
         if self.ratios.position < 1.0 and self.ratios.velocity < 1.0:
             clock.innovation_pass = now

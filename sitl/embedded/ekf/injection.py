@@ -33,7 +33,7 @@ _NO_HDOP = 99.99
 
 
 class ExternalNavInput:
-    """State of the vision and MAVLink-GPS inputs."""
+    """Handles the companion's position messages: vision, odometry and GPS_INPUT."""
 
     def __init__(self, parameters: Parameters, estimator: Estimator) -> None:
         self._parameters = parameters
@@ -52,7 +52,9 @@ class ExternalNavInput:
         return now_ms - self._last_vision_ms < _VISION_TIMEOUT_MS
 
     def vision(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
-        """VISION_POSITION_ESTIMATE (and GLOBAL_VISION_..., which is local all the same)."""
+        """Take VISION_POSITION_ESTIMATE or GLOBAL_VISION_POSITION_ESTIMATE; both are read as local
+        positions. VISO_TYPE 0 ignores them.
+        """
         if self._parameters["VISO_TYPE"] == 0:
             return
         angles = (message.roll, message.pitch, message.yaw)
@@ -65,7 +67,7 @@ class ExternalNavInput:
         self._pose(message, yaw=yaw, errors=covariance, stamp_ms=stamp, now_ms=now_ms, quality=0)
 
     def odometry(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
-        """ODOMETRY in LOCAL_FRD with BODY_FRD velocity; anything else is dropped silently."""
+        """Take ODOMETRY in LOCAL_FRD with velocity in BODY_FRD; other frames are ignored."""
         if self._parameters["VISO_TYPE"] == 0:
             return
         if (message.frame_id, message.child_frame_id) != (_LOCAL_FRD, _BODY_FRD):
@@ -145,7 +147,7 @@ class ExternalNavInput:
     # --- GPS_INPUT ---------------------------------------------------------------------------
 
     def gps_fix(self, now_ms: int) -> bool:
-        """Whether GPS_INPUT states a 3D fix now."""
+        """Whether the newest GPS_INPUT is fresh and has a 3D fix."""
         fresh = bool(self._gps_times) and now_ms - self._gps_times[-1] < _GPS_TIMEOUT_MS
         return fresh and self._gps_fix_type >= 3
 
@@ -157,7 +159,7 @@ class ExternalNavInput:
         return (times[-1] - times[0]) / (len(times) - 1) <= _GPS_MAX_GAP_MS
 
     def gps_input(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
-        """GPS_INPUT: gps_id 0 where GPS1_TYPE is 14, 1 where GPS2_TYPE is."""
+        """Take GPS_INPUT of gps_id 0 or 1 if GPS1_TYPE or GPS2_TYPE, respectively, is 14."""
         receiver = f"GPS{message.gps_id + 1}"
         if message.gps_id > 1 or self._parameters[f"{receiver}_TYPE"] != _GPS_MAVLINK:
             return
@@ -190,7 +192,7 @@ class ExternalNavInput:
 
 
 def _covariance(values: Any) -> tuple[float, float]:
-    """Position and angle error of an upper-triangle covariance, by ArduPilot 4.7's formula."""
+    """(position sigma m, angle sigma rad) of an upper triangle, by ArduPilot 4.7's formula."""
     c = [float(v) for v in values]
     if isnan(c[0]):
         return 0.0, 0.0

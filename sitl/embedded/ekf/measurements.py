@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class GpsData:
-    """A GNSS solution. velocity: NED m/s, None if the receiver has none."""
+    """A GNSS solution. Velocities: NED m/s; None if the receiver measures none. Accuracies: m and
+    m/s. yaw_rad: None without a heading.
+    """
 
     latitude_deg: float
     longitude_deg: float
@@ -33,9 +35,11 @@ class GpsData:
 
 @dataclass(frozen=True)
 class ExternalPosition:
-    """A position from the companion: NED metres about the EKF origin, sigma in metres.
+    """A position from the companion: NED metres from the EKF origin, sigma in metres. yaw_rad: None
+    if not measured.
 
-    is_global: whether it was received as latitude and longitude (PX4's auxiliary global position).
+    reset: the sender announces a position jump. is_global: received as latitude and longitude
+    (PX4's auxiliary global position).
     """
 
     position: tuple[float, float, float]

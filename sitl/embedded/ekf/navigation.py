@@ -34,7 +34,7 @@ def strapdown(s: Array, imu: Array) -> None:
 
 @njit(cache=True)
 def replay(s: Array, ring: Array, start: int, count: int, out: Array) -> None:
-    """Propagate s through `count` buffered IMU increments from index `start`, into out."""
+    """Propagate s through `count` buffered IMU increments ring (n, 7) from `start`, into out."""
     for i in range(NOMINAL_SIZE):
         out[i] = s[i]
     for k in range(count):

@@ -116,7 +116,7 @@ class Commands:
 
     def _set_interval(self, link: SerialPort, command: Any) -> int:
         message_id, interval_us = int(command.param1), command.param2
-        if not self._telemetry.knows(message_id):
+        if not self._telemetry.can_send(message_id):
             return FAILED
         if interval_us < 0:
             link.set_interval(message_id, None)
@@ -155,7 +155,7 @@ class Commands:
     # --- streams -----------------------------------------------------------------------------
 
     def _data_stream(self, link: SerialPort, message: Any) -> None:
-        """REQUEST_DATA_STREAM, the old way: the groups of status, attitude and position."""
+        """Handle REQUEST_DATA_STREAM: groups of messages (status, attitude, position)."""
         groups = {
             2: (mavlink.MAVLINK_MSG_ID_SYS_STATUS,),
             6: (

@@ -127,7 +127,7 @@ class NavigationCommands:
         return ACCEPTED if v.modes.go_to(location, yaw) else DENIED
 
     def _target_global(self, _link: SerialPort, message: Any) -> None:
-        """A place to fly to; velocities are not followed."""
+        """Handle SET_POSITION_TARGET_GLOBAL_INT: fly to its position. Velocities are ignored."""
         modes, frame = self._vehicle.modes, message.coordinate_frame
         location = location_of(modes.home, frame, message.lat_int, message.lon_int, message.alt)
         if location is not None and not message.type_mask & _IGNORE_POSITION:

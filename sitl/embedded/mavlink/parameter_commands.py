@@ -25,7 +25,7 @@ class ParameterCommands:
     def _param_value(self, name: str, index: int) -> Any:
         p = self._vehicle.parameters
         return mavlink.MAVLink_param_value_message(
-            name.encode(), p.sent(name), p.type_of(name), len(p), index
+            name.encode(), p.encode_value(name), p.type_of(name), len(p), index
         )
 
     def _param_list(self, link: SerialPort, _message: Any) -> None:
@@ -43,7 +43,7 @@ class ParameterCommands:
         v = self._vehicle
         name = _text(message.param_id)
         p = v.parameters
-        if name in p and p.set(name, p.received(name, message.param_value)):
+        if name in p and p.set(name, p.decode_value(name, message.param_value)):
             # ArduPilot tells every link of a change, with an index of 65535.
             v.server.broadcast(self._param_value(name, 65535))
 

@@ -84,7 +84,7 @@ class Px4Telemetry(TelemetryBuilder):
 
 
 class Px4Commands(Commands):
-    """PX4's messages of position, its modes, and TIMESYNC that the autopilot asks for."""
+    """PX4's position messages, its modes, and the answers to the vehicle's own TIMESYNC."""
 
     def __init__(self, vehicle: Aircraft, telemetry: TelemetryBuilder) -> None:
         super().__init__(vehicle, telemetry)
@@ -101,7 +101,7 @@ class Px4Commands(Commands):
         return self._mode(modes[0]) if modes else FAILED
 
     def _takeoff(self, _link: SerialPort, command: Any) -> int:
-        """Its altitude is above mean sea level."""
+        """MAV_CMD_NAV_TAKEOFF with an altitude above mean sea level."""
         v = self._vehicle
         if v.modes.home is None or not v.modes.set_mode(Mode.GUIDED):
             return FAILED
@@ -112,7 +112,7 @@ class Px4Commands(Commands):
         super()._timesync(link, message)
         if message.tc1 != 0:
             now_us = self._vehicle.time_ms * 1000
-            self._clocks[link.name].answered(message.tc1 // 1000, message.ts1 // 1000, now_us)
+            self._clocks[link.name].add_exchange(message.tc1 // 1000, message.ts1 // 1000, now_us)
 
     @property
     def _input(self) -> Px4PositionInput:

@@ -64,7 +64,7 @@ class SerialPort:
         self._outgoing += raw
 
     def set_interval(self, message_id: int, seconds: float | None) -> None:
-        """Stream a message; None stops it."""
+        """Send a message every `seconds` from now on; None stops it."""
         if seconds is None:
             self.intervals.pop(message_id, None)
             self.due.pop(message_id, None)
@@ -87,7 +87,7 @@ class SerialPort:
         return sorted(ready)
 
     def receive(self) -> list[Any]:
-        """Receive all waiting messages; accepts new clients and drops closed ones."""
+        """All waiting messages. Without a client it accepts one; a closed client is dropped."""
         if self.client is None:
             self._accept()
             return []
@@ -181,7 +181,7 @@ class MavlinkServer:
             link.close()
 
     def _route(self, source: SerialPort, message: Any) -> bool:
-        """Forward as ArduPilot's MAVLink_routing does; True when it is for the autopilot too."""
+        """Forward as ArduPilot's MAVLink_routing does; True if the autopilot handles it, too."""
         sender = (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self.system_id, 1):
             return False  # our own, come back by a loop

@@ -59,8 +59,8 @@ class TelemetryBuilder:
             m.MAVLINK_MSG_ID_GIMBAL_MANAGER_INFORMATION: self._gimbal_manager_information,
         }
 
-    def knows(self, message_id: int) -> bool:
-        """Whether the vehicle can send a message."""
+    def can_send(self, message_id: int) -> bool:
+        """Whether the vehicle has this message."""
         return message_id in self._builders
 
     def message(self, message_id: int) -> Any | None:
@@ -69,7 +69,7 @@ class TelemetryBuilder:
         return builder() if builder else None
 
     def stream(self) -> None:
-        """Send what is due on each link."""
+        """Send on each link the streamed messages that are due."""
         now = self._vehicle.time_s
         built: dict[int, Any] = {}
         for link in self._vehicle.server.links:

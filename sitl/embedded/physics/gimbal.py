@@ -32,7 +32,9 @@ class GimbalMode(Enum):
 
 @dataclass
 class Gimbal:
-    """The first mount (instance 1)."""
+    """The first mount (instance 1). Pitch is measured from the horizon, up positive; yaw from the
+    vehicle's nose. yaw_locked: yaw is held in the earth frame.
+    """
 
     parameters: Parameters
     mode: GimbalMode = GimbalMode.NEUTRAL
@@ -93,7 +95,9 @@ class Gimbal:
         return quaternion(roll, pitch, self.yaw_rad)
 
     def point(self, pitch_deg: float, yaw_deg: float, *, yaw_locked: bool) -> None:
-        """MAV_CMD_DO_MOUNT_CONTROL, MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; NaN keeps an angle."""
+        """MAV_CMD_DO_MOUNT_CONTROL, MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW: point at these angles. NaN
+        keeps an angle. yaw_locked: yaw_deg counts from north.
+        """
         self.mode = GimbalMode.ANGLE
         self.yaw_locked = yaw_locked
         if not isnan(pitch_deg):
@@ -108,7 +112,7 @@ class Gimbal:
         self._rates = (radians(pitch_rate_deg), radians(yaw_rate_deg))
 
     def look_at(self, location: Location | None) -> None:
-        """MAV_CMD_DO_SET_ROI_LOCATION; None is MAV_CMD_DO_SET_ROI_NONE."""
+        """MAV_CMD_DO_SET_ROI_LOCATION: keep pointing at a location; None: return to neutral."""
         self._roi = location
         self.mode = GimbalMode.NEUTRAL if location is None else GimbalMode.LOCATION
 
@@ -117,7 +121,12 @@ class Gimbal:
         self.mode = GimbalMode.NEUTRAL
 
     def update(self, vehicle: Location | None, vehicle_yaw_rad: float, dt: float) -> None:
-        """Move towards the target, within the limits and the slew rate."""
+        """Move pitch and yaw towards the mode's target for dt seconds, within the limits and the
+        slew rate.
+
+        vehicle: its location; None if not known. vehicle_yaw_rad: heading from north. Does nothing
+        without a configured mount.
+        """
         if not self.fitted:
             return
         pitch, yaw = self._target(vehicle, vehicle_yaw_rad, dt)

@@ -55,7 +55,7 @@ class Jammer:
         self._satellites, self._fix = 0, False
 
     def distort(self, clean: GpsSample) -> GpsSample:
-        """The jammed sample that replaces a clean one, `_GPS_PERIOD_S` after the last."""
+        """The jammed sample that replaces the clean one. Called for each sample of the receiver."""
         if clean.time_s < self._silent_until_s:
             return replace(clean, satellites=0, fix=False)
         rng = self._rng
@@ -85,7 +85,7 @@ class Jammer:
 
 
 class Sensors:
-    """All sensors of one vehicle."""
+    """All sensors of one vehicle. x: its true state (17,)."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
@@ -128,9 +128,11 @@ class Sensors:
         lag_s: float = 0.1,
         accuracy_m: float = 0.5,
     ) -> GpsSample | None:
-        """The GNSS solution that arrives now, if any; it is lag_s old and states accuracy_m.
+        """The GNSS solution that arrives at time_s; None if none arrives. It is lag_s old and
+        states accuracy_m.
 
-        glitch: (3,) NED metres added to its position.
+        x: true state (17,). glitch: (3,) NED metres added to its position. jammed: replace it by a
+        jammed one.
         """
         if time_s >= self._gps_next_s:
             self._gps_next_s = time_s + _GPS_PERIOD_S

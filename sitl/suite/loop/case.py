@@ -26,7 +26,7 @@ _PITCH_DEG = -80.0
 
 
 class VideoFault(StrictModel):
-    """A video fault of some seconds; see `PictureFault`."""
+    """A fault of the camera's video that lasts for_s; kinds: see `PictureFault`."""
 
     kind: PictureFaultKind
     for_s: float = Field(gt=0, le=300)
@@ -54,18 +54,20 @@ class Load(StrictModel):
 
 
 class OperatorHint(StrictModel):
-    """The operator sends a position hint that is off_north_m from the true position."""
+    """A position hint of uncertainty radius_m, off_north_m north of the true position."""
 
     radius_m: float = Field(gt=0, le=5000)
     off_north_m: float = Field(0.0, ge=-2000, le=2000)
 
 
 class LoopEvent(Ramp):
-    """A fault or command, at_s seconds after the recorded part began (and GNSS was denied).
+    """A fault or command, at_s seconds after the start of the recorded part (where GNSS is switched
+    off).
 
-    picture: a fault of the video. zoom: of the lens. kill: SIGKILL to the companion, started again
-    restart_after_s later, or by its supervisor. hang: SIGSTOP to the flight process. start: of a
-    companion that did not run until now (`cold`). vehicle: parameters that the ground station sets.
+    picture: a fault of the video. zoom: a change of the focal length. load: CPU load. hint: a
+    position hint. kill: SIGKILL to the companion; the supervisor starts it again, or the flight
+    does restart_after_s later. hang: SIGSTOP to the flight process. start: start the companion (for
+    `cold`). vehicle: parameters that the ground station sets.
     """
 
     at_s: float = Field(ge=0)
@@ -81,13 +83,13 @@ class LoopEvent(Ramp):
 
 
 class DeploymentErrors(StrictModel):
-    """Errors in the deployment file or the map from the start.
+    """Errors of the deployment file or the map, present from the start.
 
-    map_shift_m: east, north, up of where the map shows the ground. gimbal_deg: roll, pitch, yaw
-    that the gimbal does not report. focal: the calibration's focal length over the true one.
-    other_map: the map of another generated place. map_reach_m: nothing is in the map further east,
-    west, north or south of home; a multiple of 200 m. terrain_off_m: the companion has a terrain
-    model of the whole world, a height each 30 m, so much too high.
+    map_shift_m: offset of the companion's map from the world (east, north, up). gimbal_deg: roll,
+    pitch, yaw that the gimbal does not report. focal: the file's focal length over the true one.
+    other_map: the companion's map is of another generated world. map_reach_m: the map ends at this
+    distance from home, east, west, north and south. terrain_off_m: the companion also has a terrain
+    model with a height every 30 m, all too high by this; None: no terrain model.
     """
 
     map_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -99,17 +101,17 @@ class DeploymentErrors(StrictModel):
 
 
 class Expectation(StrictModel):
-    """Limits and alerts to check between start and end of the recorded part.
+    """Limits and alerts to check over the recorded part.
 
-    told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
-    monitor that stands) at latest so long after it began. never_modes: flight modes that must not
-    be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
-    injects: and some are injected. back_within_s: of a kill or a hang, injected again.
-    repeats: how often the companion may say the same, figures aside. ends_tracking: the last health
-    is ok. reports: alerts that must come from the companion; alerts: those that must come, or
-    must not, within a time; warns_first: one that must come before the first text that localization
-    is degraded or lost.
-    silent: no warning text, no finding of the monitor, and a health that is ok throughout.
+    told_within_s: longest time with an EKF error above `beyond_m` and neither a health worse than
+    ok nor an active finding of the monitor. never_modes: flight modes that the vehicle must not
+    enter. max_error_m: of the EKF. false_fixes: allowed number of injected positions with an error
+    above 5 m; None: any. injects: at least one position is injected. back_within_s: time from a
+    kill or hang to the next injected position. ends_tracking: the last health is ok. reports:
+    alerts that the companion must raise at any time; alerts: alerts that it must or must not raise
+    within a span. warns_first: an alert that it must raise before DEGRADED, BRIDGING or LOST.
+    silent: no warning, no finding, and a health that is always ok. repeats: how often the companion
+    may raise one alert.
     """
 
     beyond_m: float = Field(10.0, gt=0)
@@ -128,15 +130,20 @@ class Expectation(StrictModel):
 
 
 class LoopCase(StrictModel):
-    """One flight. seconds: length of the recorded part. hover: stay; else the corners are flown in
-    AUTO (metres east and north of home, at `height_m`). wind_m_s: from the west. deny: GNSS is
-    switched off when it begins. cold: no companion runs until an event starts it. supervised: by
-    `companion run --supervised`. gated: injection is opened by the pilot's command (mode ``rc``).
-    size_m: of the world. honest: that world as another visit shows it, with the demo's camera and
-    the errors drawn for it. ci: flown in every test run on the embedded vehicle. deployment: keys
-    that differ from the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no
-    landing while the place is searched). zoom_points: the deployment's table of a lens that reports
-    its zoom (level, focal length over the model's); none: a lens that says nothing of it.
+    """One flight. seconds: length of the recorded part. hover: the vehicle stays above home;
+    otherwise it flies the corners in AUTO (metres east and north of home, at `height_m`). wind_m_s:
+    from the west.
+
+    deny: GNSS is switched off at the start of the recorded part. cold: no companion runs until an
+    event starts it. supervised: `companion run --supervised`. gated: bridge mode ``rc``, where the
+    pilot's command opens injection. size_m: side of the world. honest: the world has changed since
+    the survey, and camera and map have drawn errors, as in the demo. ci: whether every test run
+    flies it on the embedded vehicle.
+
+    deployment: keys that differ from the demo's deployment file. vehicle: parameters likewise
+    (FS_EKF_ACTION 0: no landing during relocalization). zoom_points: the deployment's zoom table
+    (level, focal length over the model's) of a lens that reports its zoom; empty: the lens does not
+    report it.
     """
 
     name: str
@@ -175,15 +182,16 @@ class LoopCase(StrictModel):
         return self
 
     @property
-    def earns(self) -> bool:
-        """Whether the shadow check must pass before GNSS is denied. Otherwise injection is forced:
-        for errors that would fail the check, and for a companion that starts later.
+    def needs_shadow_check(self) -> bool:
+        """Whether injection waits for a passed shadow check before GNSS is switched off. Otherwise
+        injection is forced: with deployment errors, which would fail the check, and for a companion
+        that starts later.
         """
         return self.wrong == DeploymentErrors() and not self.cold
 
     @property
     def is_normal(self) -> bool:
-        """Whether no fault is injected, so that each alert is a false one."""
+        """Whether no fault is injected (a reported zoom is none): each alert is a false one."""
         told = bool(self.zoom_points) and all(e.zoom is not None for e in self.timeline)
         return self.wrong == DeploymentErrors() and (not self.timeline or told) and not self.cold
 
@@ -210,9 +218,8 @@ class LoopCase(StrictModel):
 def load_loop_cases(
     names: Iterable[str] = (), folder: Path = LOOP_SCENARIOS
 ) -> tuple[LoopCase, ...]:
-    """Load all scenarios of a folder, or those named; `ScenarioError` for an invalid file.
-
-    ``normal`` names all flights in which nothing is wrong.
+    """Load all scenarios of a folder, or those named. The name ``normal`` stands for all flights
+    without a fault. Raises `ScenarioError` for an invalid file or an unknown name.
     """
     files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     if not files:

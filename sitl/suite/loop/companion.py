@@ -22,9 +22,11 @@ _FRESH_S = 2.0  # a health report that is written every second
 
 @dataclass(frozen=True)
 class Health:
-    """Contents of the newest ``health.json``. age_s: infinite without a file; findings: names of
-    active findings of the monitor; rate_hz: localized frames per second; shadow, ready: shadow
-    check; alerts: ids of active alerts.
+    """Contents of the newest ``health.json``.
+
+    age_s: since it was written; infinite without a file. findings: names of the monitor's active
+    findings. rate_hz: localized frames per second. shadow, ready: text and result of the shadow
+    check. alerts: ids of active alerts.
     """
 
     level: str = "starting"
@@ -39,7 +41,7 @@ class Health:
 
     @property
     def is_tracking(self) -> bool:
-        """Whether the health is ok."""
+        """Whether the health is ok and the alert TRACKING is active."""
         return self.level == "ok" and AlertId.TRACKING.value in self.alerts
 
 
@@ -67,7 +69,7 @@ class LoopCompanion:
         self._process = self._stack.enter_context(companion)
 
     def wait_up(self) -> None:
-        """Wait until it reports its health; `FlightError` after a timeout."""
+        """Wait for a fresh health report; `FlightError` on timeout or if the process ends."""
         started = time.monotonic()
         while self.health().age_s > _FRESH_S:
             self.require()
@@ -78,7 +80,9 @@ class LoopCompanion:
             time.sleep(0.2)
 
     def kill(self) -> None:
-        """SIGKILL, and wait for the end of the process. A supervised process is restarted."""
+        """SIGKILL to the flight process. With a supervisor, which starts a new one, the call does
+        not wait; without, it waits until the process has ended.
+        """
         if self._supervised:
             os.kill(self.health().pid, signal.SIGKILL)
         elif self._process is not None:
@@ -90,13 +94,13 @@ class LoopCompanion:
         os.kill(self.health().pid, signal.SIGSTOP)
 
     def require(self) -> None:
-        """`FlightError` if the process has ended by itself."""
+        """Raise `FlightError` if the started process has ended; nothing before `start`."""
         code = None if self._process is None else self._process.poll()
         if code is not None:
             raise FlightError(f"the companion ended with code {code}: see {self._out}")
 
     def confine(self, processors: set[int]) -> None:
-        """Set the CPU affinity of all its present and future threads."""
+        """Restrict all its present threads, and their children, to these processors."""
         if self._process is None:
             return
         for thread in Path(f"/proc/{self._process.pid}/task").glob("*"):
@@ -104,7 +108,7 @@ class LoopCompanion:
                 os.sched_setaffinity(int(thread.name), processors)
 
     def health(self) -> Health:
-        """Its newest report."""
+        """The newest health report; the defaults of `Health` if there is none."""
         try:
             reports = self._out.glob("companion*/health.json")
             newest = max(reports, key=lambda path: path.stat().st_mtime)

@@ -19,7 +19,7 @@ while time.monotonic() < end:
 
 
 class CpuLoad:
-    """CPU load: confines the companion and busy processes to one processor."""
+    """CPU load: busy processes that share one processor with the companion."""
 
     def __init__(self, load: Load, companion: LoopCompanion) -> None:
         self._companion = companion
@@ -34,7 +34,7 @@ class CpuLoad:
             os.sched_setaffinity(process.pid, one)
 
     def end(self) -> None:
-        """End the load; harmless if it has ended."""
+        """Stop the busy processes and give the companion all processors back; idempotent."""
         for process in self._processes:
             process.kill()
             process.wait()

@@ -33,7 +33,7 @@ from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import CpuLoad
-from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText, RestartTimes
+from sitl.suite.loop.evaluation import LoopRecord, LoopSample, LoopText, RestartTimes
 from sitl.suite.loop.terrain_file import terrain_file
 from sitl.suite.ramp import RunningRamp
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
@@ -47,7 +47,7 @@ _POSITION_FRESH_S = 1.0  # LOCAL_POSITION_NED comes 25 times a second, while the
 
 @dataclass(frozen=True)
 class LoopAssets:
-    """The world of a flight. wrong_map: a map of another world for the companion, if any."""
+    """The world of a flight. wrong_map: another map's cache for the companion; None: its own."""
 
     world: FlightAssets
     wrong_map: Path | None = None
@@ -55,7 +55,7 @@ class LoopAssets:
 
 @dataclass(frozen=True)
 class ParticipantContext:
-    """The running flight for a `FlightParticipant`. frames: log of the world camera; movers: all
+    """The flight for a `FlightParticipant`. frames: path of the world camera's log; movers: all
     moving objects, map ENU.
     """
 
@@ -66,25 +66,27 @@ class ParticipantContext:
 
 
 class FlightParticipant(Protocol):
-    """Code that takes part in a flight: a simulated operator or pilot."""
+    """Code that takes part in a flight, for example a simulated operator or pilot."""
 
     def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
         """Additional moving objects in the world; epoch_ns: CLOCK_MONOTONIC."""
         ...
 
-    def ride(self, cabin: ParticipantContext) -> AbstractContextManager[None]:
-        """Context of the recorded part: entered at its start, left at its end."""
+    def take_part(self, context: ParticipantContext) -> AbstractContextManager[None]:
+        """Context manager around the recorded part: entered at its start, left at its end."""
         ...
 
 
 def fly(
     case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
-    passenger: FlightParticipant | None = None,
+    participant: FlightParticipant | None = None,
 ) -> LoopRecord:  # fmt: skip
-    """Fly a case; `out` receives the records. SimulationError when it could not be flown at all."""
+    """Fly a case; `out` receives the logs. seed: of world, light and errors. participant: None:
+    nobody takes part. `SimulationError` if it could not be flown.
+    """
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        flight = _LoopFlight(case, assets, kind, seed, out, stack, passenger)
+        flight = _LoopFlight(case, assets, kind, seed, out, stack, participant)
         flight.prepare()
         flight.run()
     return flight.record()
@@ -98,10 +100,10 @@ class _LoopFlight:
 
     def __init__(
         self, case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
-        stack: ExitStack, passenger: FlightParticipant | None = None,
+        stack: ExitStack, participant: FlightParticipant | None = None,
     ) -> None:  # fmt: skip
         self._case, self._assets, self._kind = case, assets, kind
-        self._passenger = passenger
+        self._participant = participant
         self._movers: tuple[Mover, ...] = ()
         self._seed, self._out, self._stack = seed, out, stack
         self._home = home_of(assets.world)
@@ -118,7 +120,7 @@ class _LoopFlight:
         self._shadow: Health | None = None
 
     def prepare(self) -> None:
-        """From power on to a companion that tracks at the flight's height."""
+        """Start all processes and take off; returns when the companion tracks at height."""
         case = self._case
         self._ports = Ports(free_udp_port(), free_udp_port())
         vehicle = self._vehicle = self._open_vehicle()
@@ -147,7 +149,7 @@ class _LoopFlight:
             pilot.link.set_parameter("SIM_WIND_DIR", 270.0)
             pilot.link.set_parameter("SIM_WIND_SPD", case.wind_m_s)
             pilot.link.sleep(8.0)
-        if case.earns:
+        if case.needs_shadow_check:
             pilot.link.wait_wall(self._has_go, _GO_S)
             self._shadow = self._companion.health()
         if case.gated:
@@ -162,10 +164,10 @@ class _LoopFlight:
             link.wait_wall(self._is_tracking, _WRONG_S)
 
     def run(self) -> None:
-        """The recorded part: faults, samples, until the time is over."""
+        """Fly the recorded part: inject the faults and take samples until its time is over."""
         if self._case.deny:
             self._pilot.use_source_set(VISION_SOURCE)
-            self._pilot.gps(False)
+            self._pilot.switch_gnss(False)
         if not self._case.hover:
             self._pilot.start_mission()
         self._start_ns = time.monotonic_ns()
@@ -183,7 +185,7 @@ class _LoopFlight:
         self._camera.stop()
 
     def record(self) -> LoopRecord:
-        """Everything that the judge needs, after the processes have ended."""
+        """The data for the expectations; call it after the processes have ended."""
         texts = tuple(
             LoopText((t.time_ns - self._start_ns) * 1e-9, t.component, t.severity, t.text)
             for t in self._pilot.record.texts
@@ -219,7 +221,7 @@ class _LoopFlight:
         for axis in ("fx", "fy"):
             settings["camera"]["model"][axis] *= case.wrong.focal
         settings["bridge"]["mode"] = "rc" if case.gated else settings["bridge"]["mode"]
-        settings["bridge"]["injection"]["force"] = not case.earns and not case.cold
+        settings["bridge"]["injection"]["force"] = not case.needs_shadow_check and not case.cold
         if case.wrong.terrain_off_m is not None:
             terrain = terrain_file(flown.world, self._out / "terrain.tif", case.wrong.terrain_off_m)
             settings["localizer"].setdefault("odometry", {})["terrain"] = str(terrain)
@@ -237,8 +239,8 @@ class _LoopFlight:
         self._movers = traffic(
             world.world, cache.frame, cars=3, people=3, seed=self._seed, epoch_ns=epoch_ns
         )
-        if self._passenger is not None:
-            self._movers += self._passenger.movers(epoch_ns)
+        if self._participant is not None:
+            self._movers += self._participant.movers(epoch_ns)
         filmed = FilmedFlight(world, case.scenario, self._ports, self._seed, self._movers)
         config = camera_config(filmed, self._out)
         self._camera = WorldCameraProcess(config)
@@ -251,11 +253,11 @@ class _LoopFlight:
     # --- during ----------------------------------------------------------------------------------
 
     def _riding(self) -> AbstractContextManager[None]:
-        if self._passenger is None:
+        if self._participant is None:
             return nullcontext()
         frames = self._out / "frames.csv"
         context = ParticipantContext(self._vehicle, self._pilot, frames, self._movers)
-        return self._passenger.ride(context)
+        return self._participant.take_part(context)
 
     @property
     def _now_s(self) -> float:
@@ -288,7 +290,7 @@ class _LoopFlight:
             self._later(event.restart_after_s, self._companion.start)
 
     def _open_gate(self) -> None:
-        """MAV_CMD_USER_1 to the localizer, as the pilot's button: inject."""
+        """Send MAV_CMD_USER_1 (inject) to the companion, as the pilot's command would."""
         self._pilot.link.send(
             mavlink.MAVLink_command_long_message(
                 VEHICLE, _LOCALIZER, mavlink.MAV_CMD_USER_1, 0, 1.0, *[0.0] * 6
@@ -317,7 +319,7 @@ class _LoopFlight:
             self._reporting.set(self._zooming)
 
     def _later(self, seconds: float, do: Callable[[], None]) -> None:
-        """Have something done by the flight's own loop, so many seconds from now."""
+        """Let the flight's loop call `do`, so many seconds from now."""
         self._due.append((self._now_s + seconds, do))
         self._due.sort(key=lambda item: item[0])
 
@@ -343,7 +345,7 @@ class _LoopFlight:
     # --- after -----------------------------------------------------------------------------------
 
     def _with_errors(self) -> tuple[LoopSample, ...]:
-        """The samples with the EKF's horizontal error at their times."""
+        """The samples with the newest EKF position's horizontal error; infinite if too old."""
         pairs = list(self._pilot.record.ekf_pairs())
         times = np.array([(ekf.time_ns - self._start_ns) * 1e-9 for ekf, _ in pairs])
         samples = []
@@ -358,7 +360,7 @@ class _LoopFlight:
         return tuple(samples)
 
     def _back(self) -> RestartTimes | None:
-        """What came after the companion's end, by its own record and by what was sent."""
+        """When the companion worked again after kill or hang; None if there was neither."""
         if self._ended_ns is None:
             return None
         ended_ns = self._ended_ns

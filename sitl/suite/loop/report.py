@@ -14,7 +14,7 @@ from rich.markup import escape
 from scipy.stats import beta
 
 from sitl.demo.scenario import ScenarioError
-from sitl.suite.loop.judge import Held, LoopFigures
+from sitl.suite.loop.evaluation import LoopExpectationResult, LoopFigures
 from sitl.suite.runner import PACE_LIMIT, STALL_LIMIT_S
 from sitl.vehicles.process import VehicleKind
 
@@ -26,16 +26,15 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class LoopRow:
-    """Result of one flight; error: why it could not be flown.
+    """Result of one flight; error: why it could not be flown, otherwise empty.
 
-    alarms: what was told although nothing was wrong; None where something was. pace, stall_s: of
-    the simulated vehicle.
+    alarms: false alarms; None for a flight with a fault. pace, stall_s: see `sitl.suite.record`.
     """
 
     name: str
     vehicle: VehicleKind
     seed: int
-    held: tuple[Held, ...]
+    held: tuple[LoopExpectationResult, ...]
     figures: LoopFigures | None = None
     alarms: tuple[str, ...] | None = None
     pace: float = 1.0
@@ -114,7 +113,7 @@ def _row(flight: dict[str, Any]) -> LoopRow:
     if figures is not None:
         unknown = {k: math.nan for k, v in figures.items() if v is None}
         figures = LoopFigures(**(figures | unknown))
-    known["held"] = tuple(Held(**one) for one in known["held"])
+    known["held"] = tuple(LoopExpectationResult(**one) for one in known["held"])
     return LoopRow(**known, figures=figures, alarms=None if alarms is None else tuple(alarms))
 
 

@@ -14,9 +14,9 @@ from sitl.demo.assets import prepare
 from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
 from sitl.suite.loop.case import LoopCase
+from sitl.suite.loop.evaluation import evaluate, false_alarms, figures
 from sitl.suite.loop.flight import LoopAssets, fly
 from sitl.suite.loop.inner_map import inner_map
-from sitl.suite.loop.judge import false_alarms, figures, judge
 from sitl.suite.loop.report import LoopRow, as_data, markdown, read_rows
 from sitl.vehicles.process import VehicleKind
 
@@ -28,9 +28,10 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Vehicles, seeds (world, light, errors), and folders of records and worlds. say: receives
-    progress lines; building: receives the progress of world generation (step, share done).
-    resume: fly only what ``out`` does not hold yet, or holds as not flown or too slow.
+    """Vehicles, seeds (of world, light, errors), and folders of records and worlds. worlds: None:
+    the default folder. say: receives progress lines; building: receives the progress of world
+    generation (step, share done). resume: skip flights that ``out`` already holds with a valid
+    result.
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -72,7 +73,10 @@ def fly_loop(
 def loop_assets(
     case: LoopCase, seed: int, worlds: Path | None, progress: Callable[[str, float], None]
 ) -> LoopAssets:
-    """The world of a scenario and the companion's map; generated if missing."""
+    """The world of a loop case and a seed, and the companion's map of the world; generated if
+    missing. worlds: folder of generated worlds; None: the default. progress: called with a stage
+    and its share that is done.
+    """
     world = prepare(seed, worlds, progress, case.size_m, ideal=not case.honest)
     if case.wrong.other_map:
         other = prepare(seed + _OTHER_SEED, worlds, progress, case.size_m, ideal=True)
@@ -112,7 +116,7 @@ def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: RunOptions) ->
         case.name,
         kind,
         seed,
-        judge(record, case.expect, denied=case.deny),
+        evaluate(record, case.expect, denied=case.deny),
         figures(record, case.expect.beyond_m),
         false_alarms(record, denied=case.deny) if case.is_normal else None,
         record.pace,

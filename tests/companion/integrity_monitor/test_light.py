@@ -12,7 +12,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.opening import open_localizer
 from localizer.types import Frame, PosePrior
-from sitl.camera.faults import darkened
+from sitl.camera.faults import darken
 
 LIMIT = VideoCheckConfig().low_detail
 
@@ -27,7 +27,7 @@ def test_it_is_told_while_registrations_are_still_accepted(small_assets, small_s
     with open_localizer(small_assets.map_cache, frame.camera, config) as localizer:
         for k in range(0, 20, 2):
             rng = np.random.default_rng(k)
-            image = darkened(frame.image, 0.5**k, 16.0, rng) if k else frame.image
+            image = darken(frame.image, 0.5**k, 16.0, rng) if k else frame.image
             at_ns = (k + 1) * 10**9
             localizer.set_prior(PosePrior(beside, sigma, at_ns))
             estimate = localizer.track(Frame(image, at_ns, frame.camera, k), passes=2)

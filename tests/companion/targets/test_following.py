@@ -9,7 +9,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.targets.follow import FollowedPosition
 from localizer.targets.limits import RefusalReason, TargetRefusal
-from localizer.targets.track import TargetTrack, projected
+from localizer.targets.track import TargetTrack, pixel_of
 from localizer.types import Visibility
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
@@ -120,7 +120,7 @@ def click(watcher, point, delay_s=0.25):
     """Where the operator saw it: the frame is `delay_s` old when the command comes."""
     seen_s = (watcher.now_ms + 40) / 1e3 - delay_s
     seen = scene.estimate(watcher.at(seen_s), 0, camera=CAMERA)
-    pixel = projected(seen, np.array(point(seen_s)))
+    pixel = pixel_of(seen, np.array(point(seen_s)))
     assert pixel is not None
     u, v = pixel
     watcher.clicks_at(u / CAMERA.width, v / CAMERA.height)
@@ -252,11 +252,11 @@ class _Slides:
     def find(self, _gray, estimate, expected, reach_m, was_hidden=False):
         since_s = (estimate.exposure_time_ns - self._begun_ns) * 1e-9
         at = self._place + np.array([0.0, self.speed * since_s, 0.0])
-        pixel = projected(estimate, at)
+        pixel = pixel_of(estimate, at)
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
         return FollowedPosition(at, pixel, 0.9) if near else None
 
-    def find_before(self, *_picture, **_how):
+    def find_on_ground(self, *_picture, **_how):
         return False, None  # it looks as the ground does
 
     def shows_ground(self, _gray, _estimate):
@@ -294,7 +294,7 @@ class _Edge(_Returns):
         if since_s < self.until_s:
             return None
         at = self._place + np.array([0.0, self.speed * self.until_s + 2.0, 0.0])
-        pixel = projected(estimate, at)
+        pixel = pixel_of(estimate, at)
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
         return FollowedPosition(at, pixel, 0.9) if near else None
 
@@ -305,11 +305,11 @@ class _Glimpse(_Slides):
     speed = 0.0
     times_s: tuple[float, ...] = (0.2,)
 
-    def find_before(self, _gray, estimate, *_picture, **_how):
+    def find_on_ground(self, _gray, estimate, *_picture, **_how):
         since_s = round((estimate.exposure_time_ns - self._begun_ns) * 1e-9, 1)
         at = self._place + np.array([0.0, 3.0, 0.0])
         found = (
-            FollowedPosition(at, projected(estimate, at), 0.9) if since_s in self.times_s else None
+            FollowedPosition(at, pixel_of(estimate, at), 0.9) if since_s in self.times_s else None
         )
         return True, found
 
@@ -361,7 +361,7 @@ def test_a_car_that_comes_out_where_it_must_is_found_at_once(monkeypatch):
 @pytest.mark.parametrize("refused_s", [6.0, 1.0])
 def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeypatch, refused_s):
     """It was neither told nor ended: the operator heard of it no more."""
-    see = TargetTrack.see
+    see = TargetTrack.observe
 
     def refuses(track, estimate, pixel, **known):
         if 2_300 <= estimate.exposure_time_ns // MS < 2_300 + 1_000 * refused_s:
@@ -369,7 +369,7 @@ def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeyp
             return None
         return see(track, estimate, pixel, **known)
 
-    monkeypatch.setattr(TargetTrack, "see", refuses)
+    monkeypatch.setattr(TargetTrack, "observe", refuses)
     flown = _flown(_Drives, monkeypatch, 75, (0.9, 0.95))
     is_lost = refused_s > 4.0
     lost = alert(AlertId.TARGET_NOT_LOCATED, number=1, why="no map at its place")

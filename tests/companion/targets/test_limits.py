@@ -13,13 +13,13 @@ from companion.targets.target_manager import Click, TargetEstimate, TargetManage
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits
 from localizer.targets.limits import (
-    LastPlace,
+    LastPosition,
     RefusalReason,
     TargetRefusal,
     is_at_seen_depth,
     is_on_map,
 )
-from localizer.targets.track import TargetSettings, TargetTrack, projected
+from localizer.targets.track import TargetSettings, TargetTrack, pixel_of
 from localizer.types import (
     TargetFix,
     TargetSurface,
@@ -67,7 +67,7 @@ def errors(holed, velocity, say=lambda *_: None):
     for k in range(FRAMES):
         estimate, ground.is_holed = estimate_at(k), k in holed
         true = np.array([20.0, 60.0, 0.0]) + 0.1 * k * np.array([*velocity, 0.0])
-        at = projected(estimate, true)
+        at = pixel_of(estimate, true)
         assert at is not None
         u, v = at + noise.normal(scale=0.7, size=2)
         before = len(told)
@@ -124,7 +124,7 @@ def clicked(cast, place):
     """(fixes, alerts) of a click at a place (3,)."""
     told, alerts, estimate = list[TargetEstimate](), list[Alert](), estimate_at(0)
     population = TargetManager(TargetConfig(), cast, told.append, lambda _: None, alerts.append)
-    population.begin(Click(1, estimate, projected(estimate, np.array(place))))
+    population.begin(Click(1, estimate, pixel_of(estimate, np.array(place))))
     return told, alerts
 
 
@@ -158,16 +158,14 @@ def _fix(place, time_ns, sigma=1.0):
 
 
 def test_another_object_under_the_same_name_is_told_once_it_was_seen_for_as_long():
-    last = LastPlace()
+    last = LastPosition()
     for k in range(100):
-        assert last.objection(_fix([0, 0, 0], k * SECOND // 10), moves=False) is None
+        assert last.check(_fix([0, 0, 0], k * SECOND // 10), moves=False) is None
     refused = [
-        k
-        for k in range(100, 150)
-        if last.objection(_fix([300, 0, 0], k * SECOND // 10), moves=False)
+        k for k in range(100, 150) if last.check(_fix([300, 0, 0], k * SECOND // 10), moves=False)
     ]
     assert refused == list(range(100, 130))
-    assert last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False) == TargetRefusal(
+    assert last.check(_fix([0, 0, 0], 16 * SECOND), moves=False) == TargetRefusal(
         RefusalReason.MOVED, 300.0
     )
 
@@ -193,8 +191,8 @@ def test_a_car_that_coasts_off_the_map_or_out_of_the_picture_is_told_no_more():
     track = TargetTrack("car", TargetSettings(), ground.cast)
     for k in range(12):
         estimate = estimate_at(k)
-        at = projected(estimate, np.array([20.0, 60.0 + 1.5 * k, 0.0]))  # 15 m/s to the north
-        track.see(estimate, at)
+        at = pixel_of(estimate, np.array([20.0, 60.0 + 1.5 * k, 0.0]))  # 15 m/s to the north
+        track.observe(estimate, at)
     assert track.moves
     far = [track.coast(estimate_at(k)) for k in range(12, 40)]
     told = [fix.position_world[1] for fix in far if fix is not None]

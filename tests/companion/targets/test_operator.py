@@ -9,7 +9,7 @@ from companion.config import TargetConfig
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import Detection, clicked_name
 from companion.targets.target_manager import TargetManager
-from localizer.targets.track import projected
+from localizer.targets.track import pixel_of
 from localizer.types import TrackingState, Visibility
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
@@ -100,13 +100,13 @@ def test_forty_clicks_and_rectangles_with_stops_between_are_each_told_under_thei
         # In the frame that the operator saw, not in the one that was newest when he clicked.
         assert abs(first.estimate.exposure_time_ns - seen_ns) <= 20 * MS
         exact = estimate(operator._flown(seen_ns * 1e-9), seen_ns)
-        back = np.array(projected(exact, first.fix.position_world))
+        back = np.array(pixel_of(exact, first.fix.position_world))
         assert (
             np.linalg.norm(back - pixel)
             < 12.0 * abs(first.estimate.exposure_time_ns - seen_ns) / (20 * MS) + 1.0
         )
         np.testing.assert_allclose(
-            projected(first.estimate, first.fix.position_world), pixel, atol=0.5
+            pixel_of(first.estimate, first.fix.position_world), pixel, atol=0.5
         )
         for target in told:  # a life of one place, and no velocity where none was measured
             assert target.velocity is None
@@ -194,7 +194,7 @@ def test_a_target_is_held_by_geometry_hidden_by_a_roof_and_ends_when_it_is_long_
     operator = Operator(delay_ms=0.0, timeout_s=2.0, flown=lambda t: pose_at(t, speed=10.0))
     place = np.array([-12.0, 0.0, 0.0])  # on the ground, beside the roof (-10 to 10 m)
     operator.fly(10)
-    pixel = projected(estimate(pose_at(0.9), 0), place)
+    pixel = pixel_of(estimate(pose_at(0.9), 0), place)
     assert pixel is not None
     operator.clicks_at(pixel[0] / 640, pixel[1] / 480, after_ms=0)
     operator.fly(200)

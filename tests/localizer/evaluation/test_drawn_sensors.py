@@ -12,11 +12,11 @@ from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.sequences import Sequence
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp, so3_log
-from localizer.relocalization.patch import turned
+from localizer.relocalization.patch import with_heading
 from localizer.render.topview import DOWN
 from localizer.types import PosePrior
 
-TRUTH = Pose(turned(so3_exp((0.2, -0.1, 0.0)) @ DOWN, 0.7), np.array([5.0, -3.0, 110.0]))
+TRUTH = Pose(with_heading(so3_exp((0.2, -0.1, 0.0)) @ DOWN, 0.7), np.array([5.0, -3.0, 110.0]))
 
 
 def test_reports_scatter_as_they_say_and_are_constant_over_a_flight() -> None:
@@ -33,7 +33,7 @@ def test_reports_scatter_as_they_say_and_are_constant_over_a_flight() -> None:
 def test_a_prior_takes_roll_pitch_and_height_and_keeps_place_and_heading() -> None:
     drawn = DrawnSensors(1.0, 3.0, by_frame=True)
     off = Pose(
-        so3_exp((0.1, 0.05, 0.0)) @ turned(TRUTH.rotation, 0.1),
+        so3_exp((0.1, 0.05, 0.0)) @ with_heading(TRUTH.rotation, 0.1),
         TRUTH.translation + np.array([8.0, -6.0, 20.0]),
     )
     prior = drawn.in_prior(PosePrior(off, np.eye(6), 0), TRUTH, 3)

@@ -7,7 +7,7 @@ import pytest
 from localizer.config import LocalizerConfig
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
-from localizer.forecast.forecast import Forecaster, prior_of
+from localizer.forecast.forecast import Forecaster, draw_prior
 from localizer.forecast.risk import RISK_LIMIT, Figures, failure_risk
 from localizer.forecast.visit import FORECAST_CONDITIONS, simulate_visit
 from localizer.geometry.camera import Camera
@@ -113,7 +113,7 @@ def test_more_error_or_less_agreement_is_more_risk():
 def test_priors_err_as_they_say():
     truth = Pose(DOWN, np.zeros(3))
     rng = np.random.default_rng(2)
-    drawn = [prior_of(truth, rng) for _ in range(400)]
+    drawn = [draw_prior(truth, rng) for _ in range(400)]
     offsets = np.array([p.world_from_camera.translation for p in drawn])
     sigma = np.sqrt(drawn[0].covariance.diagonal()[:3])
     assert offsets.std(axis=0) == pytest.approx(sigma, rel=0.15)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from localizer.geometry.antimeridian import GeoBox, beside, cut, geo_box, wrapped
+from localizer.geometry.antimeridian import GeoBox, geo_box, lon_near, split_outline, wrapped
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.inspection.footprint import as_geojson, as_kml
 from localizer.map.inspection.usable import usable_part
@@ -39,15 +39,15 @@ def test_longitudes() -> None:
     assert wrapped(180.0) == 180.0
     assert wrapped(-180.0) == -180.0
     assert wrapped(180.5) == -179.5
-    assert beside(-179.9, 179.9) == pytest.approx(180.1)
-    assert beside(179.9, -179.9) == pytest.approx(-180.1)
-    assert beside(7.4, 7.5) == pytest.approx(7.4)
+    assert lon_near(-179.9, 179.9) == pytest.approx(180.1)
+    assert lon_near(179.9, -179.9) == pytest.approx(-180.1)
+    assert lon_near(7.4, 7.5) == pytest.approx(7.4)
 
 
 @pytest.mark.parametrize("first", range(4))
 def test_an_outline_is_cut_in_two(first: int) -> None:
     turned = TAVEUNI[first:] + TAVEUNI[:first]
-    parts = cut([(lon, lat) for lat, lon in turned])
+    parts = split_outline([(lon, lat) for lat, lon in turned])
     assert len(parts) == 2
     assert sorted((min(x), max(x)) for x in ([lon for lon, _ in p] for p in parts)) == [
         pytest.approx((-180.0, -179.97)), pytest.approx((179.98, 180.0)),
@@ -66,7 +66,7 @@ def test_an_outline_elsewhere_and_one_that_ends_at_the_meridian_are_as_they_were
     assert geometry["type"] == "Polygon"
     assert geometry["coordinates"][0][:4] == [[lon, lat] for lat, lon in BERN]
     edge = [(179.9, 0.0), (180.0, 0.0), (180.0, 1.0), (179.9, 1.0)]
-    assert cut(edge) == [edge]
+    assert split_outline(edge) == [edge]
 
 
 def test_the_usable_part_is_a_rectangle_there_too() -> None:

@@ -38,17 +38,17 @@ def test_the_moved_points_are_seen_where_the_rolling_camera_sees_the_true_ones()
     points, sweep = _ground(), Sweep.of(RATE, VELOCITY, CAMERA.readout_ms)
     rolled = _pixels_row_by_row(points)
     still, inside = CAMERA.project(DOWN.inverse.apply(points))
-    moved, _ = CAMERA.project(DOWN.inverse.apply(sweep.seen(points, DOWN, CAMERA)))
+    moved, _ = CAMERA.project(DOWN.inverse.apply(sweep.apparent_points(points, DOWN, CAMERA)))
     assert np.linalg.norm(still - rolled, axis=1)[inside].max() > 4.0  # what is mended
     assert np.linalg.norm(moved - rolled, axis=1)[inside].max() < 0.05
 
 
 def test_a_camera_that_stands_still_sweeps_nothing():
     points, still = _ground(), Sweep.of(np.zeros(3), np.zeros(3), 20.0)
-    assert np.allclose(still.seen(points, DOWN, CAMERA), points, atol=1e-9)
-    assert not still.matters(CAMERA, 120.0)
-    assert not Sweep.of(RATE, VELOCITY, 0.0).matters(CAMERA, 120.0)
-    assert Sweep.of(np.zeros(3), VELOCITY, 20.0).matters(CAMERA, 120.0)
+    assert np.allclose(still.apparent_points(points, DOWN, CAMERA), points, atol=1e-9)
+    assert not still.displaces_pixels(CAMERA, 120.0)
+    assert not Sweep.of(RATE, VELOCITY, 0.0).displaces_pixels(CAMERA, 120.0)
+    assert Sweep.of(np.zeros(3), VELOCITY, 20.0).displaces_pixels(CAMERA, 120.0)
 
 
 @pytest.mark.parametrize("readout_ms", [-1.0, 1e4, float("nan")])

@@ -70,7 +70,7 @@ def test_the_height_of_what_the_map_lacks_is_learned(spread_m, low, high):
     for seed in range(8):
         seen, off = town(spread_m, seed)
         likelihood = height_likelihood(seen, registered(off), gravity(seed))
-        error = error.after(likelihood)
+        error = error.updated(likelihood)
     assert low <= error.sigma_m <= high
 
 
@@ -106,7 +106,7 @@ def test_a_surface_model_is_taken_at_its_word_until_images_contradict():
     assert surface.sigma_m < 0.2
     for seed in range(6):
         seen, off = town(5.0, seed)
-        surface = surface.after(height_likelihood(seen, registered(off), gravity(seed)))
+        surface = surface.updated(height_likelihood(seen, registered(off), gravity(seed)))
     assert surface.sigma_m > 1.0
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.config import GrowthModel
-from localizer.odometry.growth import add_scale_error, carried, fuse, without_constant_error
+from localizer.odometry.growth import add_scale_error, fuse, transferred, without_constant_error
 from localizer.registration import attitude_constraint, combine, height_constraint
 
 MODEL = GrowthModel(scale=0.01, horizontal=0.1, vertical=0.2, tilt=1e-3, heading=2e-3)
@@ -20,7 +20,7 @@ def test_a_carried_pose_errs_as_its_keyframe_does():
     moved = [e[:3] + so3_exp(e[3:]) @ lever - lever for e in errors]
     expected = np.cov(np.array(moved).T)
     np.testing.assert_allclose(
-        carried(SIGMA, lever)[:3, :3], expected, atol=0.06 * expected.diagonal().max()
+        transferred(SIGMA, lever)[:3, :3], expected, atol=0.06 * expected.diagonal().max()
     )
 
 

@@ -12,10 +12,10 @@ from localizer.registration.backend import LMSettings, level_problems, local_ori
 from localizer.registration.covariance import (
     NoiseModel,
     anchor_model,
-    apart_px,
     covariance_sums,
     curvature_ratio,
     curvature_steps,
+    image_gap_px,
     mean_motion,
     pose_differences,
     sandwich_covariance,
@@ -140,7 +140,7 @@ def test_distances_between_poses_are_those_of_the_image(scene, problem, pose):
     R = other.rotation.T
     after = project(level, R, R @ (problem[1] - other.translation))[1]
     expected = np.sqrt(((after - before) ** 2).sum(axis=1).mean())
-    assert apart_px(differences, *pose, motion)[0] == pytest.approx(expected, rel=0.05)
+    assert image_gap_px(differences, *pose, motion)[0] == pytest.approx(expected, rel=0.05)
 
 
 def test_only_other_modes_share_the_probability():

@@ -40,7 +40,7 @@ def test_a_focal_length_that_is_off_is_found_out(jngo, scene_factory, prior, fac
         found = jngo.register(scene.query, camera, scene.anchors, begun)
         let_in += is_acceptable(CONFIG, found, 0.0)
         assert found.world_from_camera.distance_to(scene.true)[0] > 3.0
-        tested = jngo.focal_tested(scene.query, camera, scene.anchors, found)
+        tested = jngo.with_focal_gain(scene.query, camera, scene.anchors, found)
         refused += not is_acceptable(CONFIG, tested, 0.0)
     assert let_in == 3
     assert refused >= 2
@@ -52,7 +52,7 @@ def test_a_calibration_as_good_as_one_is_raises_no_alarm(jngo, scene_factory, pr
         scene = scene_factory(seed, 2.0, 2.0)
         camera, begun = believed(scene, factor), prior(scene.reference, 4.0, 5.0)
         found = jngo.register(scene.query, camera, scene.anchors, begun)
-        tested = jngo.focal_tested(scene.query, camera, scene.anchors, found)
+        tested = jngo.with_focal_gain(scene.query, camera, scene.anchors, found)
         assert np.isfinite(tested.focal_gain)
         assert is_acceptable(CONFIG, tested, 0.0)
 
@@ -67,7 +67,7 @@ def test_a_perfect_fit_raises_no_alarm(jngo, scene_factory, prior):
     reference = scene.place.pyramid(scene.reference, scene.camera)
     anchors = select_anchors(scene.place.view(scene.reference, scene.camera), reference, 300, 0)
     found = jngo.register(exact, scene.camera, anchors, prior(scene.reference, 4.0, 5.0))
-    tested = jngo.focal_tested(exact, scene.camera, anchors, found)
+    tested = jngo.with_focal_gain(exact, scene.camera, anchors, found)
     assert found.world_from_camera.distance_to(scene.true)[0] < 0.1
     assert tested.focal_gain < -0.1
     assert is_acceptable(CONFIG, tested, 0.0)
@@ -77,7 +77,9 @@ def test_what_failed_is_not_tested(jngo, scene_factory, prior):
     scene = scene_factory(0, 2.0, 2.0)
     found = jngo.register(scene.query, scene.camera, scene.anchors, prior(scene.reference, 4, 5))
     failed = replace(found, status=RegistrationStatus.NO_OVERLAP)
-    assert jngo.focal_tested(scene.query, scene.camera, scene.anchors, failed).focal_gain == -np.inf
+    assert (
+        jngo.with_focal_gain(scene.query, scene.camera, scene.anchors, failed).focal_gain == -np.inf
+    )
 
 
 def test_the_focal_length_is_found_beside_the_pose(jngo, scene_factory, prior):
@@ -88,7 +90,7 @@ def test_the_focal_length_is_found_beside_the_pose(jngo, scene_factory, prior):
         scene = scene_factory(seed, 2.0, 2.0)
         camera, begun = believed(scene, 1.0 / factor), prior(scene.reference, 4.0, 5.0)
         found = jngo.register(scene.query, camera, scene.anchors, begun)
-        fits.append(jngo.focal_fitted(scene.query, camera, scene.anchors, found))
+        fits.append(jngo.fit_focal(scene.query, camera, scene.anchors, found))
     told = [fit for fit in fits if fit is not None]
     assert len(told) == 3
     assert all(abs(fit.factor - factor) < 4.0 * fit.sigma for fit in told)
@@ -106,7 +108,7 @@ def test_flat_ground_below_tells_no_focal_length(jngo, camera, prior):
     query = place.pyramid(pose, camera, 0.05, 1)
     found = jngo.register(query, camera, anchors, prior(reference, 4.0, 5.0))
     assert found.status is RegistrationStatus.OK
-    assert jngo.focal_fitted(query, camera, anchors, found) is None
+    assert jngo.fit_focal(query, camera, anchors, found) is None
 
 
 def test_what_a_longer_lens_does_not_show_has_no_vote(jngo, scene_factory, prior):

@@ -12,12 +12,12 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.integrity.acceptance import IntegrityConfig
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
-from localizer.relocalization.align import FrameShift, moved
+from localizer.relocalization.align import FrameShift, displacement
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
-from localizer.relocalization.patch import rectify, turned
-from localizer.relocalization.search import ground_of, over_roofs, scales
+from localizer.relocalization.patch import rectify, with_heading
+from localizer.relocalization.search import above_roofs, ground_of, scales
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
 from localizer.render.topview import DOWN
@@ -155,7 +155,7 @@ def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_o
 
 def test_rectified_ground_lies_where_it_is():
     """A camera that looks down obliquely, turned to the north-east: a spot on the ground."""
-    rotation = turned(so3_exp((np.radians(25), 0, 0)) @ DOWN, np.radians(-40))
+    rotation = with_heading(so3_exp((np.radians(25), 0, 0)) @ DOWN, np.radians(-40))
     height, spot = 80.0, np.array([13.0, 31.0])
     pixel, inside = CAMERA.project(rotation.T @ np.array([*spot, -height]))
     assert inside
@@ -186,13 +186,13 @@ def test_the_height_is_above_roofs_that_the_map_lacks():
     flat = level(np.zeros((3, 32, 32), np.int8))
     flat.ground[:] = ((0.0, 1.0), (np.nan, -1.0))
     asked = query(height_m=120.0, height_sigma_m=3.0)
-    over = over_roofs(asked, flat, 8.0, CONFIG)
+    over = above_roofs(asked, flat, 8.0, CONFIG)
     seen, bare = (scales(each, flat.ground, CONFIG) for each in (over, asked))
     assert len(seen) == len(bare) == 1  # takes no longer
     assert 120 / CONFIG.scale_step < seen[0] < bare[0] - 4  # bare ground stays within a step
-    assert over_roofs(asked, flat, 2.0, CONFIG).height_m == 118
+    assert above_roofs(asked, flat, 2.0, CONFIG).height_m == 118
     flat.ground[:] = np.nan
-    assert over_roofs(asked, flat, 8.0, CONFIG).height_m == 120
+    assert above_roofs(asked, flat, 8.0, CONFIG).height_m == 120
 
 
 def test_the_shift_of_an_image_is_found_and_moves_the_camera():
@@ -205,15 +205,15 @@ def test_the_shift_of_an_image_is_found_and_moves_the_camera():
         features = np.ascontiguousarray(ground[row : row + 40, column : column + 50])
         return (FeatureLevel(features, sure, 8), FeatureLevel(features, sure, 4))
 
-    shift = FrameShift(pyramid(10, 8)).over(pyramid(5, 5))
+    shift = FrameShift(pyramid(10, 8)).estimate(pyramid(5, 5))
     assert (shift.u, shift.v) == (12.0, 20.0)
     assert shift.score == pytest.approx(0.9, abs=0.1)
     pose = Pose(DOWN, np.array([7.0, 8.0, 100.0]))
     # From 80 m above the ground, north up: right is east, below is south.
     expected = np.array([12.0, -20.0]) * 80.0 / CAMERA.fx
-    np.testing.assert_allclose(moved(pose, CAMERA, shift, 20.0), expected)
+    np.testing.assert_allclose(displacement(pose, CAMERA, shift, 20.0), expected)
     level_view = Pose(so3_exp((np.pi / 2, 0, 0)) @ DOWN, pose.translation)
-    assert not moved(level_view, CAMERA, shift, 20.0).any()  # sees no ground
+    assert not displacement(level_view, CAMERA, shift, 20.0).any()  # sees no ground
 
 
 @pytest.mark.parametrize(

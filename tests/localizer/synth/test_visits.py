@@ -6,7 +6,7 @@ import pytest
 from localizer.synth.config import WorldConfig
 from localizer.synth.plan.layout import plan_world
 from localizer.synth.plan.plan import WorldPlan
-from localizer.synth.visits.changes import Changes, changed
+from localizer.synth.visits.changes import Changes, apply_changes
 from localizer.synth.visits.survey import SurveyErrors
 from localizer.synth.visits.visit import survey_and_flight_visits
 
@@ -25,7 +25,7 @@ def test_what_is_built_later_stands_on_free_ground(plan: WorldPlan) -> None:
 
 
 def test_buildings_go_change_and_come_in_the_shares_that_are_said(plan: WorldPlan) -> None:
-    after = changed(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
+    after = apply_changes(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
     before = {b.centre: b for b in plan.buildings}
     count = len(before)
     kept = [b for b in after.buildings if before.get(b.centre) == b]
@@ -38,7 +38,7 @@ def test_buildings_go_change_and_come_in_the_shares_that_are_said(plan: WorldPla
     assert len(after.trees.xy) == pytest.approx(0.7 * len(plan.trees.xy), rel=0.15)
     assert after.trees.radius.mean() > plan.trees.radius.mean()
     assert after.shapes is plan.shapes  # streets and fields stay
-    again = changed(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
+    again = apply_changes(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
     assert again.buildings == after.buildings
 
 

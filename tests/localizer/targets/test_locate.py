@@ -152,7 +152,7 @@ def _told(today_half_m, east, **settings):
     estimate = _estimate(oblique, np.diag([0.06, 0.06, 0.06, 5e-4, 5e-4, 5e-4]) ** 2)
     pixel = _pixel_of(oblique, (east, 3.0, 8.0))
     track = TargetTrack("click", TargetSettings(confirm_s=0.0, **settings), _roofs(10.0))
-    fix = track.see(estimate, pixel)
+    fix = track.observe(estimate, pixel)
     eye, ray = ray_in_world(estimate, pixel)
     truth = eye + ray * _roofs(today_half_m)(eye, ray[None]).distances[0]
     off = fix.position_world - truth

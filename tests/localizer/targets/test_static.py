@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from localizer.targets.locate import RaySpread
-from localizer.targets.static import SightedRay, StaticTarget, every_second
+from localizer.targets.static import ObservedRay, StaticTarget, every_second
 from localizer.types import TargetSurface
 
 PLACE = np.zeros(3)
 SURFACE = TargetSurface(1.0, PLACE, np.eye(3), np.array([0.0, 0.0, 1.0]), 0.1)
 
 
-def _ray(turn_deg: float) -> SightedRay:
+def _ray(turn_deg: float) -> ObservedRay:
     turn = np.radians(turn_deg)
     eye = np.array([100.0 * np.cos(turn), 100.0 * np.sin(turn), 80.0])
     direction = (PLACE - eye) / np.linalg.norm(PLACE - eye)
     sideways = np.linalg.svd(direction[None])[2][1:]
-    return SightedRay(eye, direction, RaySpread(sideways, 1e-5 * np.eye(2), 1e-6 * np.eye(2)))
+    return ObservedRay(eye, direction, RaySpread(sideways, 1e-5 * np.eye(2), 1e-6 * np.eye(2)))
 
 
 def _covariance(turns_deg: list[float]) -> np.ndarray:

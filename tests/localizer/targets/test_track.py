@@ -7,7 +7,7 @@ from localizer.map.cache.pick import cast_bundle
 from localizer.map.kind import UNKNOWN_HEIGHT_SIGMA_M, MapKind
 from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import RefusalReason, TargetRefusal
-from localizer.targets.track import TargetSettings, TargetTrack, projected
+from localizer.targets.track import TargetSettings, TargetTrack, pixel_of
 from localizer.types import TargetSighting, TargetSurface
 from tests.companion.targets.scene import MS, cast, estimate, pose_at, square
 
@@ -45,8 +45,8 @@ def test_a_moving_target_begins_anew_after_a_gap_and_lies_under_its_pixel():
     def see(time_s):
         place = _car(time_s, turned_s=3.0) + np.array([0.0, 110.0, 0.0])
         frame = estimate(pose_at(3.0), round(time_s * 1e9))
-        pixel = projected(frame, place)
-        return track.see(frame, pixel), place
+        pixel = pixel_of(frame, place)
+        return track.observe(frame, pixel), place
 
     for k in range(12):
         fix, _ = see(k * 0.2)
@@ -62,10 +62,10 @@ def test_a_lone_sighting_elsewhere_is_refused_with_a_word():
     track = TargetTrack("a", TargetSettings(), cast)
     for k in range(20):
         frame = estimate(pose_at(k * 0.2), k * 200 * MS)
-        fix = track.see(frame, projected(frame, np.array([-30.0, 20.0, 0.0])))
+        fix = track.observe(frame, pixel_of(frame, np.array([-30.0, 20.0, 0.0])))
         assert (fix is not None) == (k >= 3)  # at first it is not confirmed
         if k == 15:
-            assert track.see(frame, (600.0, 20.0)) is None
+            assert track.observe(frame, (600.0, 20.0)) is None
             assert track.refusal == TargetRefusal(RefusalReason.ELSEWHERE)
     np.testing.assert_allclose(fix.position_world, [-30.0, 20.0, 0.0], atol=0.1)
     assert fix.velocity is None
@@ -75,7 +75,7 @@ def test_what_is_known_to_tens_of_metres_only_is_refused():
     settings = TargetSettings(max_sigma_m=0.5)
     frame = estimate(pose_at(0.0), 0)
     track = TargetTrack("a", settings, cast)
-    assert track.see(frame, (320.0, 240.0)) is None
+    assert track.observe(frame, (320.0, 240.0)) is None
     assert track.refusal.reason is RefusalReason.UNCERTAIN
 
 
@@ -89,7 +89,7 @@ def _roof_beyond_bound(map_sigma_m, roof_m=8.0):
     beyond = 0
     for k in range(30):
         frame = estimate(pose_at(k * 0.2), k * 200 * MS)
-        fix = track.see(frame, projected(frame, place))
+        fix = track.observe(frame, pixel_of(frame, place))
         if fix is not None:
             offset = fix.position_world - place
             fixes += 1

@@ -109,7 +109,7 @@ def test_a_height_far_from_the_origin_is_told_in_the_worlds_axes(monkeypatch):
     dead_reckoning.begin(begun, nothing, nothing, np.zeros(3))
     prior = PosePrior(Pose(np.eye(3), places[1]), np.eye(6), 1)
     image = np.zeros((48, 64, 3), np.uint8)
-    dead_reckoning.carry(Frame(image, 1, camera, 1), nothing, prior, None)
+    dead_reckoning.propagate(Frame(image, 1, camera, 1), nothing, prior, None)
     assert _HeardOdometry.told == pytest.approx([place[2] for place in places], abs=0.05)
 
 

@@ -92,7 +92,7 @@ class FakeOptimizer:
         pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
         return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1, self.agreement)
 
-    def focal_tested(self, query, camera, anchors, found):
+    def with_focal_gain(self, query, camera, anchors, found):
         return replace(found, focal_gain=self.focal_gain)
 
 
@@ -103,7 +103,7 @@ def _localizer(renderer=None, optimizer=None) -> Localizer:
         optimizer or FakeOptimizer(),  # type: ignore[arg-type]
         CAMERA,
         # The fake optimizer registers to the map alone; each frame has its own reference.
-        LocalizerConfig(odometry=None, reference_shift_px=0),
+        LocalizerConfig(odometry=None, reference_shift=0),
     )
 
 

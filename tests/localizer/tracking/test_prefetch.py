@@ -68,13 +68,13 @@ def test_a_slow_taker_finds_a_frame_that_is_new():
     """
     pace = ProcessingTimes()
     for _ in range(40):
-        pace.extracted(0.02)
-        pace.worked(0.1)
+        pace.add_extraction(0.02)
+        pace.add_registration(0.1)
     assert pace.pause_s(0.0) == pytest.approx(0.08, abs=1e-3)
     assert pace.pause_s(0.05) == pytest.approx(0.03, abs=1e-3)
     assert pace.pause_s(0.5) == 0.0
     for _ in range(40):
-        pace.worked(0.013)
+        pace.add_registration(0.013)
     assert pace.pause_s(0.0) == 0.0
 
 

@@ -1,4 +1,4 @@
-"""The map's answers against a carried pose that began wrong: when they win, and when not."""
+"""The map's registrations against a carried pose that began wrong: when they win, and when not."""
 
 import numpy as np
 import pytest
@@ -13,11 +13,11 @@ ASIDE = np.array([-2.6, 1.4, 0.3])  # of the carried pose, as after a slew that 
 
 
 def _run(
-    answers: list[np.ndarray], carried: list[np.ndarray], rotation: np.ndarray | None = None
+    registrations: list[np.ndarray], carried: list[np.ndarray], rotation: np.ndarray | None = None
 ) -> list[bool]:
     said, run = [], Rejoining()
-    for k, (answer, place) in enumerate(zip(answers, carried, strict=True)):
-        run = run.with_answer(
+    for k, (answer, place) in enumerate(zip(registrations, carried, strict=True)):
+        run = run.with_registration(
             Pose(np.eye(3), answer), COVARIANCE, k * 100_000_000, Pose(np.eye(3), place), rotation,
             CONFIG,
         )  # fmt: skip
@@ -44,17 +44,17 @@ def test_a_match_that_moves_otherwise_never_wins():
     sliding = [p + ASIDE + np.array([0.0, -0.35 * k, 0.0]) for k, p in enumerate(carried)]
     scattered = [p + np.random.default_rng(k).normal(0, 3.0, 3) for k, p in enumerate(carried)]
     stuck = [carried[0] + ASIDE] * 40
-    for answers in (sliding, scattered, stuck):
-        assert not any(_run(answers, carried))
+    for registrations in (sliding, scattered, stuck):
+        assert not any(_run(registrations, carried))
 
 
 @pytest.mark.parametrize(("rotation", "wins"), [(None, False), (np.eye(3), True)])
 def test_a_hover_shows_nothing_new_without_the_autopilots_attitude(rotation, wins):
-    answers = _way(0.0, 40, 0.05)
-    assert any(_run(answers, [p + ASIDE for p in answers], rotation)) is wins
+    registrations = _way(0.0, 40, 0.05)
+    assert any(_run(registrations, [p + ASIDE for p in registrations], rotation)) is wins
 
 
 def test_an_attitude_that_the_autopilot_refutes_never_wins():
-    answers = _way(10.0, 20)
+    registrations = _way(10.0, 20)
     tilted = np.array([[1.0, 0, 0], [0, 0.94, -0.34], [0, 0.34, 0.94]])
-    assert not any(_run(answers, [p + ASIDE for p in answers], tilted))
+    assert not any(_run(registrations, [p + ASIDE for p in registrations], tilted))

@@ -22,7 +22,7 @@ from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
-from localizer.training.loop.train import Trainer, perturbed  # noqa: E402
+from localizer.training.loop.train import Trainer, perturbed_poses  # noqa: E402
 from localizer.training.losses import Batch, alignment_loss, project, sample  # noqa: E402
 from localizer.training.models.tiny import ModelConfig  # noqa: E402
 
@@ -97,7 +97,7 @@ def ideal_features(batch: Batch, stride: int) -> tuple[torch.Tensor, torch.Tenso
 def test_lm_walks_to_the_true_pose_on_ideal_features(batch: Batch) -> None:
     batch = replace(batch, visible=torch.ones_like(batch.visible))
     anchors, query = ideal_features(batch, 2)
-    start = perturbed(batch, 3.0, torch.Generator().manual_seed(0))
+    start = perturbed_poses(batch, 3.0, torch.Generator().manual_seed(0))
     trust = torch.ones(anchors.shape[:2])
     everywhere = torch.ones(query.shape[0], *query.shape[2:])
     _, begin = alignment_loss(batch, (anchors, trust), (query, everywhere), 2, start, 1)

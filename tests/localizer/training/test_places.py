@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene
-from localizer.synth.visits.texture import regrown
+from localizer.synth.visits.texture import with_new_texture
 from localizer.training.places.changes import coarse_mesh
 
 N, CELL = 256, 0.3
@@ -26,7 +26,7 @@ def likeness(a: np.ndarray, b: np.ndarray) -> float:
 def test_soft_ground_gets_another_texture_and_hard_ground_keeps_its_own(ground):
     albedo, lasting = ground
     for seed in range(4):
-        fresh = regrown(albedo, lasting, CELL, np.random.default_rng(seed))
+        fresh = with_new_texture(albedo, lasting, CELL, np.random.default_rng(seed))
         left, right = np.s_[:, : N // 2 - 20], np.s_[:, N // 2 + 20 :]
         assert likeness(albedo[right], fresh[right]) > 0.99
         assert likeness(albedo[left], fresh[left]) < 0.6

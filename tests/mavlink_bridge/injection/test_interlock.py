@@ -455,6 +455,18 @@ def test_without_gnss_it_begins_and_says_that_nothing_was_compared(monkeypatch, 
         assert flight.vision()[0][0] - begun_ns < 5 * SECOND
 
 
+@pytest.mark.parametrize("gnss", [0.0, None])
+def test_a_vehicle_met_in_flight_is_judged_with_its_first_gnss_report(monkeypatch, gnss):
+    """Its heartbeat may come before GPS_RAW_INT: good GNSS was told to be missing."""
+    flight = on_gnss(monkeypatch)
+    flight.gnss_north_m, flight.armed = None, True
+    flight.run(1.5)
+    flight.gnss_north_m = gnss
+    flight.run(5.0)
+    told = [] if gnss is not None else ["injecting"]
+    assert [a.values[0] for a in flight.told(AlertId.ARMED_WITHOUT_GNSS)] == told
+
+
 def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each event once, in its order, and nothing else."""
     flight = on_gnss(monkeypatch, switch=SWITCH)

@@ -53,11 +53,13 @@ def test_every_row_shows_the_world_as_it_was_at_its_own_time(supersample: float)
 def test_vibration_is_as_strong_as_said_and_a_function_of_time() -> None:
     vibration, pose = Vibration(0.05, seed=2), Pose.identity()
     times = np.arange(0, 4_000_000_000, 1_300_000)
-    turns = np.degrees([so3_log(vibration.shaken(pose, int(t)).rotation) for t in times])
+    turns = np.degrees([so3_log(vibration.vibrating(pose, int(t)).rotation) for t in times])
     np.testing.assert_allclose(np.sqrt((turns**2).mean(axis=0)), 0.05, rtol=0.1)
-    again = Vibration(0.05, seed=2).shaken(pose, int(times[77]))
-    np.testing.assert_array_equal(again.rotation, vibration.shaken(pose, int(times[77])).rotation)
-    assert Vibration(0.0, seed=2).shaken(pose, 5) is pose
+    again = Vibration(0.05, seed=2).vibrating(pose, int(times[77]))
+    np.testing.assert_array_equal(
+        again.rotation, vibration.vibrating(pose, int(times[77])).rotation
+    )
+    assert Vibration(0.0, seed=2).vibrating(pose, 5) is pose
 
 
 def test_stamps_are_off_by_what_was_drawn_and_never_run_backwards() -> None:

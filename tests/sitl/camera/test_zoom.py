@@ -32,7 +32,7 @@ def test_what_it_shows_lies_where_the_longer_camera_has_it(factor: float) -> Non
     lens = ZoomLens(CAMERA)
     lens.set(Zooming(1.0, factor, 0, 10))
     wanted, _ = longer(CAMERA, factor).project(ray)
-    assert dot_at(lens.picture(image, 20)) == pytest.approx(tuple(wanted), abs=0.3)
+    assert dot_at(lens.apply(image, 20)) == pytest.approx(tuple(wanted), abs=0.3)
 
 
 def test_it_moves_between_its_begin_and_its_end() -> None:
@@ -49,4 +49,4 @@ def test_the_scenarios_table_is_near_the_lens_and_not_the_same() -> None:
     assert case.is_normal
     (unreported,) = load_loop_cases(["zooms-untold"])
     assert not unreported.is_normal
-    assert unreported.earns
+    assert unreported.needs_shadow_check

@@ -3,7 +3,7 @@ import pytest
 from companion.reporting.verdicts import advice, compared
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
-from sitl.demo.criteria import ComputingRates, FlightFigures, headline, judge
+from sitl.demo.criteria import ComputingRates, FlightFigures, check_criteria, headline
 
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
@@ -16,7 +16,7 @@ def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0, level=100.0, target
 
 
 def _missed(**changes):
-    return [c.name for c in judge(_judged(**changes)) if not c.ok]
+    return [c.name for c in check_criteria(_judged(**changes)) if not c.ok]
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ GOOD_PACE = {"sent_hz": 10.0, "wanted_hz": 10, "taken": 1.0, "latency_ms": 150.0
     ],
 )
 def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(changes, said):
-    text = ComputingRates(**(GOOD_PACE | changes)).complaint()
+    text = ComputingRates(**(GOOD_PACE | changes)).slow_reason()
     assert text is not None
     assert said in text
     assert "did not keep up" in text
@@ -88,11 +88,11 @@ def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(c
 
 @pytest.mark.parametrize("changes", [{}, {"latency_ms": None}, {"sent_hz": 9.6, "taken": 0.97}])
 def test_a_computer_that_keeps_up_is_not_blamed(changes):
-    assert ComputingRates(**(GOOD_PACE | changes)).complaint() is None
+    assert ComputingRates(**(GOOD_PACE | changes)).slow_reason() is None
 
 
 def test_every_target_says_what_a_miss_means_and_where_to_look():
-    names = {c.name for map_ in (True, False) for c in judge(_judged(), satellite=map_)}
+    names = {c.name for map_ in (True, False) for c in check_criteria(_judged(), satellite=map_)}
     known = [advice(name) for name in names]
     assert advice("something else") not in known
     assert len({a.look for a in known}) == len(known)
@@ -109,5 +109,5 @@ def test_every_target_says_what_a_miss_means_and_where_to_look():
     ],
 )
 def test_a_flight_over_a_satellite_map_needs_claims_that_hold(changes, missed):
-    found = judge(_judged(**changes), satellite=True)
+    found = check_criteria(_judged(**changes), satellite=True)
     assert [c.name for c in found if not c.ok] == missed

@@ -8,7 +8,7 @@ import pytest
 
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.inspection.kind import objects
+from localizer.map.inspection.kind import object_mask
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import TopView, render_top_view
 from sitl.demo.satellite import build_satellite_map
@@ -49,7 +49,7 @@ def test_ground_stays_and_roofs_lean_away_from_the_satellite(
 
     survey, mosaic = seen_from_above(small_assets.map_cache), seen_from_above(tmp_path / "map")
     above_m = survey.height - mosaic.height
-    built = objects(survey.height, GSD_M)
+    built = object_mask(survey.height, GSD_M)
     margin = REACH_PX + 60
     inner = np.zeros_like(built)
     inner[margin:-margin, margin:-margin] = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sitl.embedded.control.controller import Carrot, ControlLimits, attitude_control
+from sitl.embedded.control.controller import ControlLimits, SetPoint, attitude_control
 from sitl.embedded.physics import dynamics
 from sitl.embedded.physics.dynamics import GRAVITY, MASS
 from sitl.embedded.physics.rotation import euler, quaternion
@@ -64,14 +64,14 @@ def test_attitude_control_reaches_a_lean():
 
 def test_carrot_keeps_speed_and_acceleration_limits_and_stops_at_the_end():
     limits = ControlLimits(10.0, 2.5, 1.5, 2.5, 1.0)
-    carrot = Carrot((0.0, 0.0, 0.0), (200.0, 0.0, 0.0))
+    set_point = SetPoint((0.0, 0.0, 0.0), (200.0, 0.0, 0.0))
     speeds = [0.0]
     for _ in range(6000):
-        carrot.move(carrot.position, limits, 0.01)
-        speeds.append(carrot.velocity[0])
-        if carrot.arrived:
+        set_point.move(set_point.position, limits, 0.01)
+        speeds.append(set_point.velocity[0])
+        if set_point.arrived:
             break
-    assert carrot.position == (200.0, 0.0, 0.0)
+    assert set_point.position == (200.0, 0.0, 0.0)
     assert max(speeds) == pytest.approx(10.0, rel=0.01)
     assert np.diff(speeds[:-1]).max() <= 2.5 * 0.01 + 1e-9
     assert len(speeds) * 0.01 == pytest.approx(200 / 10 + 10 / 2.5, rel=0.05)

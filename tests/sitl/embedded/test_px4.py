@@ -91,9 +91,9 @@ def px4(bench: Callable[..., Any]) -> Callable[[dict[str, float]], Any]:
 def test_integers_travel_as_bytes() -> None:
     table = Px4Parameters()
     raw = struct.unpack("<f", struct.pack("<i", 5))[0]
-    assert table.received("EKF2_EV_CTRL", raw) == 5.0
+    assert table.decode_value("EKF2_EV_CTRL", raw) == 5.0
     table.set("EKF2_EV_CTRL", 5)
-    assert struct.pack("<f", table.sent("EKF2_EV_CTRL")) == struct.pack("<i", 5)
+    assert struct.pack("<f", table.encode_value("EKF2_EV_CTRL")) == struct.pack("<i", 5)
     assert "EK3_SRC1_POSXY" not in table
     assert "VISO_TYPE" not in list(table)
 

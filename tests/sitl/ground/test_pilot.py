@@ -55,13 +55,13 @@ def test_track_brackets_a_time_and_forgets_the_oldest():
     track: SampleTrack[Any] = SampleTrack(limit=10)
     for t in range(100):
         track.add(SimpleNamespace(time_ns=10 * t))
-    both = track.around(985)
+    both = track.neighbours(985)
     assert both is not None
     before, after = both
     assert (before.time_ns, after.time_ns) == (980, 990)
-    assert track.around(991) is None
-    assert track.around(0) is None
-    assert len(track.all()) <= 20
+    assert track.neighbours(991) is None
+    assert track.neighbours(0) is None
+    assert len(track.samples()) <= 20
     track.add(SimpleNamespace(time_ns=5))
     assert track.newest.time_ns == 990
 

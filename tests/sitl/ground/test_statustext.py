@@ -12,7 +12,7 @@ def _taken(*messages):
     for k, (message, component) in enumerate(messages):
         codec.srcComponent = component
         decoded = mavlink.MAVLink(None).parse_char(message.pack(codec))
-        log.take(decoded, k)
+        log.add(decoded, k)
     return [(line.text, line.component, line.time_ns) for line in log.lines]
 
 

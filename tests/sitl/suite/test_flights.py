@@ -74,7 +74,7 @@ def _check(
         row = run_case(row.case, row.vehicle, seed=1)
         failed = row.error or [f.what for f in row.findings if not f.ok]
         if row.slow and not row.ok and row.record is not None:
-            pytest.skip(f"twice too slow a machine ({row.record.starved}): {failed}")
+            pytest.skip(f"twice too slow a machine ({row.record.pace_text}): {failed}")
         assert row.ok, failed
 
 

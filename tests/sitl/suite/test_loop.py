@@ -17,16 +17,16 @@ from sitl.errors import SimulationError
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop import runner
 from sitl.suite.loop.case import Expectation, LoopCase, load_loop_cases
-from sitl.suite.loop.judge import (
-    Held,
+from sitl.suite.loop.evaluation import (
+    LoopExpectationResult,
     LoopRecord,
     LoopSample,
     LoopText,
     RestartTimes,
+    evaluate,
     false_alarms,
     figures,
-    judge,
-    untold_s,
+    longest_unreported_s,
 )
 from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
@@ -43,12 +43,12 @@ def flight(errors_m: list[float], level: str = "ok", age_s: float = 0.5) -> tupl
 
 
 def test_an_error_with_every_light_green_is_untold() -> None:
-    assert untold_s(flight([0.5] * 4 + [20.0] * 11), 10.0) == pytest.approx(5.0)
+    assert longest_unreported_s(flight([0.5] * 4 + [20.0] * 11), 10.0) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("told", [{"level": "failed"}, {"age_s": 5.0}, {"findings": ("gnss",)}])
 def test_a_bad_health_a_finding_or_a_silent_companion_tells_it(told: dict[str, Any]) -> None:
-    assert untold_s(tuple(replace(s, **told) for s in flight([20.0] * 11)), 10.0) == 0.0
+    assert longest_unreported_s(tuple(replace(s, **told) for s in flight([20.0] * 11)), 10.0) == 0.0
 
 
 FROZEN = text(alert(AlertId.VIDEO_FROZEN, seconds=5.0))
@@ -70,20 +70,20 @@ def test_every_expectation_can_fail() -> None:
         reports=(AlertId.VIDEO_FROZEN,),
         silent=True,
     )
-    good = {h.what: h.ok for h in judge(record(flight([0.5] * 4)), expect)}
+    good = {h.what: h.ok for h in evaluate(record(flight([0.5] * 4)), expect)}
     assert [what for what, ok in good.items() if not ok] == ["no warning"]
     landed = tuple(replace(s, mode="LAND", level="failed") for s in flight([9.0] * 4))
-    bad = judge(record(landed, errors=(0.2, 7.0)), replace_says(expect))
+    bad = evaluate(record(landed, errors=(0.2, 7.0)), replace_says(expect))
     assert [h.ok for h in bad] == [True, False, False, False, False, False, False]
-    assert not judge(record((), errors=()), Expectation())[0].ok
+    assert not evaluate(record((), errors=()), Expectation())[0].ok
 
 
 @pytest.mark.parametrize(("injects_s", "ok"), [(4.9, True), (5.1, False), (float("inf"), False)])
 def test_who_is_back_too_late_or_never_is_missed(injects_s: float, ok: bool) -> None:
     expect = Expectation(back_within_s=5.0)
     flown = replace(record(flight([0.5] * 4)), back=RestartTimes(1.0, 2.0, injects_s))
-    assert judge(flown, expect)[-1].ok is ok
-    assert not judge(record(flight([0.5] * 4)), expect)[-1].ok
+    assert evaluate(flown, expect)[-1].ok is ok
+    assert not evaluate(record(flight([0.5] * 4)), expect)[-1].ok
 
 
 @pytest.mark.parametrize(("degraded_s", "ok"), [(9.0, True), (4.0, False)])
@@ -91,8 +91,8 @@ def test_the_warning_must_come_before_what_it_warns_of(degraded_s: float, ok: bo
     dim, lost = alert(AlertId.LOW_CONTRAST, gray=1.8), alert(AlertId.LOST, seconds=1.0)
     texts = (LoopText(degraded_s, 191, 3, text(lost)), LoopText(5.0, 191, 4, text(dim)))
     expect = Expectation(warns_first=AlertId.LOW_CONTRAST)
-    assert judge(LoopRecord(flight([0.5] * 4), texts, (0.2,)), expect)[-1].ok is ok
-    assert not judge(record(flight([0.5] * 4)), expect)[-1].ok
+    assert evaluate(LoopRecord(flight([0.5] * 4), texts, (0.2,)), expect)[-1].ok is ok
+    assert not evaluate(record(flight([0.5] * 4)), expect)[-1].ok
 
 
 def replace_says(expect: Expectation) -> Expectation:
@@ -106,10 +106,10 @@ def test_texts_that_cycle_are_counted_figures_aside() -> None:
         for at_s, component in ((1, 191), (3, 191), (4, 1), (5, 191))
     )
     cycling = LoopRecord(flight([0.5] * 4), texts, (0.2,))
-    held = {h.what: h for h in judge(cycling, Expectation(repeats=2))}
+    held = {h.what: h for h in evaluate(cycling, Expectation(repeats=2))}
     assert not held["reports nothing more than 2 times"].ok
     assert held["reports nothing more than 2 times"].seen == "3 times overloaded"
-    assert all(h.ok for h in judge(cycling, Expectation(repeats=3)))
+    assert all(h.ok for h in evaluate(cycling, Expectation(repeats=3)))
 
 
 def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
@@ -149,7 +149,9 @@ def test_the_rate_of_false_alarms_has_its_exact_interval() -> None:
 
 
 def test_what_was_missed_stands_first_and_the_json_is_strict() -> None:
-    missed = replace(row(()), name="z", held=(Held("told", False, "untold for 9 s"),))
+    missed = replace(
+        row(()), name="z", held=(LoopExpectationResult("told", False, "untold for 9 s"),)
+    )
     lost = LoopRow("a", "ardupilot", 1, (), error="FlightError: no arducopter")
     lines = markdown([row(()), missed, lost]).splitlines()
     assert lines[2].startswith("| a | ardupilot, 1 |")
@@ -162,7 +164,10 @@ def test_what_was_missed_stands_first_and_the_json_is_strict() -> None:
 
 
 def test_the_flights_of_several_runs_make_one_table(tmp_path: Path) -> None:
-    rows = [row(("1.0 s: x",)), replace(row(None), held=(Held("told", False, "no"),))]
+    rows = [
+        row(("1.0 s: x",)),
+        replace(row(None), held=(LoopExpectationResult("told", False, "no"),)),
+    ]
     rows.append(LoopRow("b", "ardupilot", 1, (), figures(LoopRecord((), (), ()), 10.0)))
     path = tmp_path / "loop.json"
     path.write_text(json.dumps(as_data(rows), allow_nan=False), encoding="utf-8")
@@ -213,7 +218,7 @@ def test_alerts_are_judged_by_their_time_and_listed() -> None:
         back.model_copy(update={"from_s": 1.1}),
         back.model_copy(update={"absent": True}),
     )
-    held = judge(record(flight([0.5] * 4)), Expectation(alerts=(back, late, absent)))[-3:]
+    held = evaluate(record(flight([0.5] * 4)), Expectation(alerts=(back, late, absent)))[-3:]
     assert [(h.ok, h.listed) for h in held] == [(True, True), (False, True), (False, False)]
     table = markdown([replace(row(None), held=held[:1])])
     assert "| all; bridge: video frozen 1.0 s |" in table

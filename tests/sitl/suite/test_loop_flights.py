@@ -14,8 +14,8 @@ from localizer.synth.visits.visit import Visit
 from localizer.synth.world import build_visits
 from sitl.demo.assets import FlightAssets
 from sitl.suite.loop.case import LoopCase, load_loop_cases
+from sitl.suite.loop.evaluation import evaluate
 from sitl.suite.loop.flight import LoopAssets, fly
-from sitl.suite.loop.judge import judge
 
 # At 45 m instead of 80: the climb is flown in real time.
 FLOWN = tuple(case.model_copy(update={"height_m": 45.0}) for case in load_loop_cases() if case.ci)
@@ -45,7 +45,7 @@ def test_nothing_wrong_is_believed_untold(
         record = fly(case, assets, "embedded", 5, tmp_path / case.name)
         missed = [
             f"{held.what}: {held.seen}"
-            for held in judge(record, case.expect, denied=case.deny)
+            for held in evaluate(record, case.expect, denied=case.deny)
             if not held.ok
         ]
         assert missed == []

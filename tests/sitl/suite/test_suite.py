@@ -22,7 +22,7 @@ from sitl.suite.checks import Check
 from sitl.suite.flight import bridge_config, longest_stall, slowest_pace
 from sitl.suite.record import CaseRecord, Doctor, Text, VehicleSample
 from sitl.suite.report import markdown, summary, write_report
-from sitl.suite.runner import ReportRow, judge
+from sitl.suite.runner import ReportRow, evaluate
 
 SHIPPED = load_cases()
 
@@ -113,7 +113,7 @@ def test_the_shipped_scenarios_cover_the_reference_tables() -> None:
     [(0.2, True, False), (0.249, True, False), (0.251, False, False), (0.14, True, True)],
 )
 def test_the_median_is_held_against_the_reference(error: float, ok: bool, better: bool) -> None:
-    finding = expectation(check="reference", median=0.2).judge(record(error))
+    finding = expectation(check="reference", median=0.2).evaluate(record(error))
     assert (finding.ok, finding.better) == (ok, better)
 
 
@@ -122,16 +122,16 @@ def test_limits_of_error_and_motion_within_a_span() -> None:
     flown.errors[100] = (4.0, 3.0, 4.0)
     flown.samples[100] = replace(flown.samples[100], north_m=3.0)
     for limit, ok in ((4.9, False), (5.1, True)):
-        assert expectation(check="max_error", at_most=limit).judge(flown).ok == ok
-    assert not expectation(check="max_error", at_least=5.1).judge(flown).ok
-    assert expectation(check="max_error", from_s=5, at_most=0.3).judge(flown).ok
-    assert expectation(check="median_below", metres=0.2).judge(flown).ok
-    assert not expectation(check="median_below", metres=0.19).judge(flown).ok
-    assert not expectation(check="moved", at_most=2.9).judge(flown).ok
-    assert expectation(check="moved", from_s=11, at_most=0.1).judge(flown).ok
+        assert expectation(check="max_error", at_most=limit).evaluate(flown).ok == ok
+    assert not expectation(check="max_error", at_least=5.1).evaluate(flown).ok
+    assert expectation(check="max_error", from_s=5, at_most=0.3).evaluate(flown).ok
+    assert expectation(check="median_below", metres=0.2).evaluate(flown).ok
+    assert not expectation(check="median_below", metres=0.19).evaluate(flown).ok
+    assert not expectation(check="moved", at_most=2.9).evaluate(flown).ok
+    assert expectation(check="moved", from_s=11, at_most=0.1).evaluate(flown).ok
     for check in ("max_error", "moved", "injected"):
         limits = {"at_most": 9.0} if check != "injected" else {}
-        assert not expectation(check=check, from_s=99, **limits).judge(flown).ok
+        assert not expectation(check=check, from_s=99, **limits).evaluate(flown).ok
 
 
 def jumping(taken_s: float, peak: float) -> CaseRecord:
@@ -147,14 +147,14 @@ def jumping(taken_s: float, peak: float) -> CaseRecord:
 )
 def test_a_told_jump_must_be_taken_at_once_and_without_overshoot(taken_s, peak, clean):
     jump = expectation(check="jump", at_s=4, north_m=10, settled_s=0.5)
-    assert jump.judge(jumping(taken_s, peak)).ok == clean
+    assert jump.evaluate(jumping(taken_s, peak)).ok == clean
 
 
 def test_an_untold_jump_must_be_refused_for_a_while_and_then_taken() -> None:
     unreported = expectation(check="jump_refused", at_s=4, north_m=10, after_s=5, before_s=9)
-    assert unreported.judge(jumping(11.0, 13.0)).ok
-    assert not unreported.judge(jumping(4.3, 10.0)).ok
-    assert not unreported.judge(record()).ok
+    assert unreported.evaluate(jumping(11.0, 13.0)).ok
+    assert not unreported.evaluate(jumping(4.3, 10.0)).ok
+    assert not unreported.evaluate(record()).ok
 
 
 def test_texts_are_looked_for_by_sender_and_time() -> None:
@@ -164,15 +164,15 @@ def test_texts_are_looked_for_by_sender_and_time() -> None:
         Text(6.0, "bridge", statustext(alert(AlertId.POSITION_JUMP, metres=7.0))),
     ]
     said = {"check": "text", "contains": "LAND"}
-    assert expectation(**said).judge(flown).ok
-    assert not expectation(**said, to_s=4).judge(flown).ok
+    assert expectation(**said).evaluate(flown).ok
+    assert not expectation(**said, to_s=4).evaluate(flown).ok
     jump = {"check": "alert", "alert": "position_jump"}
-    assert expectation(**jump).judge(flown).ok
-    assert not expectation(**jump, to_s=4).judge(flown).ok
-    assert not expectation(check="alert", alert="ekf_follows").judge(flown).ok
-    assert not expectation(**said, absent=True).judge(flown).ok
-    assert not expectation(check="no_warning").judge(flown).ok
-    assert expectation(check="no_warning", from_s=5.5).judge(flown).ok
+    assert expectation(**jump).evaluate(flown).ok
+    assert not expectation(**jump, to_s=4).evaluate(flown).ok
+    assert not expectation(check="alert", alert="ekf_follows").evaluate(flown).ok
+    assert not expectation(**said, absent=True).evaluate(flown).ok
+    assert not expectation(check="no_warning").evaluate(flown).ok
+    assert expectation(check="no_warning", from_s=5.5).evaluate(flown).ok
 
 
 def test_modes_counts_and_source_sets() -> None:
@@ -181,15 +181,17 @@ def test_modes_counts_and_source_sets() -> None:
         replace(s, mode="LAND" if s.at_s > 15 else "GUIDED", source_set=2 if s.at_s > 6 else 1)
         for s in flown.samples
     ]
-    assert expectation(check="mode", mode="LAND").judge(flown).ok
-    assert expectation(check="mode", mode="GUIDED", at_s=10).judge(flown).ok
-    assert not expectation(check="mode", mode="GUIDED").judge(flown).ok
-    assert expectation(check="source_set", number=2, from_s=5, by_s=7).judge(flown).ok
-    assert not expectation(check="source_set", number=2, from_s=5, by_s=6).judge(flown).ok
-    assert not expectation(check="source_set", number=2, from_s=7, by_s=9).judge(flown).ok
-    assert not expectation(check="source_set", number=3, from_s=5, by_s=7).judge(flown).ok
-    assert expectation(check="injected", from_s=2, to_s=4, at_least=20, at_most=20).judge(flown).ok
-    assert not expectation(check="injected", at_most=0).judge(flown).ok
+    assert expectation(check="mode", mode="LAND").evaluate(flown).ok
+    assert expectation(check="mode", mode="GUIDED", at_s=10).evaluate(flown).ok
+    assert not expectation(check="mode", mode="GUIDED").evaluate(flown).ok
+    assert expectation(check="source_set", number=2, from_s=5, by_s=7).evaluate(flown).ok
+    assert not expectation(check="source_set", number=2, from_s=5, by_s=6).evaluate(flown).ok
+    assert not expectation(check="source_set", number=2, from_s=7, by_s=9).evaluate(flown).ok
+    assert not expectation(check="source_set", number=3, from_s=5, by_s=7).evaluate(flown).ok
+    assert (
+        expectation(check="injected", from_s=2, to_s=4, at_least=20, at_most=20).evaluate(flown).ok
+    )
+    assert not expectation(check="injected", at_most=0).evaluate(flown).ok
 
 
 def test_a_vehicle_whose_clock_ran_slow_owes_fewer_messages() -> None:
@@ -200,31 +202,31 @@ def test_a_vehicle_whose_clock_ran_slow_owes_fewer_messages() -> None:
         for s in slow.samples
     ]
     idle.samples = [replace(s, injected=int(0.5 * s.injected)) for s in idle.samples]
-    assert wanted.judge(record()).ok
-    assert wanted.judge(slow).ok
-    assert "0.90 of real time" in wanted.judge(slow).what
-    assert not wanted.judge(idle).ok
+    assert wanted.evaluate(record()).ok
+    assert wanted.evaluate(slow).ok
+    assert "0.90 of real time" in wanted.evaluate(slow).what
+    assert not wanted.evaluate(idle).ok
     slow.samples = [replace(s, injected=s.injected // 2) for s in slow.samples]
-    assert not wanted.judge(slow).ok
+    assert not wanted.evaluate(slow).ok
 
 
 def test_arming_and_doctor() -> None:
     flown = record()
     refused = expectation(check="arming_refused", any_of=["not healthy"])
-    assert not refused.judge(flown).ok
+    assert not refused.evaluate(flown).ok
     flown.refusals = ["Arm: VisOdom: not healthy"]
-    assert refused.judge(flown).ok
+    assert refused.evaluate(flown).ok
     flown.refusals = ["Arm: Fence"]
-    assert not refused.judge(flown).ok
+    assert not refused.evaluate(flown).ok
     diagnosed = expectation(check="doctor", finds=["A", "B"])
-    assert not diagnosed.judge(flown).ok
+    assert not diagnosed.evaluate(flown).ok
     for doctor, ok in (
         (Doctor(("B", "A"), (), 2, 0), True),
         (Doctor(("A",), (), 2, 0), False),
         (Doctor(("A", "B"), ("clock 40 ms",), 2, 1), False),
     ):
         flown.doctor = doctor
-        assert diagnosed.judge(flown).ok == ok
+        assert diagnosed.evaluate(flown).ok == ok
 
 
 # --- report ---------------------------------------------------------------------------------------
@@ -232,7 +234,7 @@ def test_arming_and_doctor() -> None:
 
 def row(name: str, flown: CaseRecord | None, error: str = "") -> ReportRow:
     case = next(c for c in SHIPPED if c.name == name)
-    return ReportRow(case, "embedded", flown, judge(case, flown) if flown else (), error)
+    return ReportRow(case, "embedded", flown, evaluate(case, flown) if flown else (), error)
 
 
 def test_the_report_holds_every_flight(tmp_path: Path) -> None:
@@ -266,7 +268,7 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
 def test_the_commands_exit_code_is_for_scripts(tmp_path, monkeypatch, error, code):
     def flown(cases: Any, kinds: Any, *_: Any) -> list[ReportRow]:
         return [
-            ReportRow(c, k, record(error), judge(c, record(error))) for k in kinds for c in cases
+            ReportRow(c, k, record(error), evaluate(c, record(error))) for k in kinds for c in cases
         ]
 
     monkeypatch.setattr(cli, "run_suite", flown)

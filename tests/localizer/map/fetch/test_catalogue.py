@@ -11,14 +11,14 @@ from pyproj import CRS
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
-from localizer.map.fetch.area import Area, around, utm_zone
+from localizer.map.fetch.area import Area, area_around, utm_zone
 from localizer.map.fetch.catalogue import CatalogueSource, choose, load_sources
 from localizer.map.fetch.cloud import degree_files
 from localizer.map.fetch.raster import FetchGrid
 from localizer.map.fetch.web_map import wms_url
 
-BERN = around(np.array([[46.948, 7.447]]), 300.0)
-SAHARA = around(np.array([[23.0, 5.0]]), 300.0)
+BERN = area_around(np.array([[46.948, 7.447]]), 300.0)
+SAHARA = area_around(np.array([[23.0, 5.0]]), 300.0)
 MINE = {
     "name": "mine", "title": "my town", "kind": "wms", "role": "imagery",
     "url": "https://example.org/wms", "layer": "photo", "licence": "CC0", "attribution": "me",

@@ -18,8 +18,8 @@ from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile, plan_files
 from localizer.map.fetch.fetch import fetch, make_plan
+from localizer.map.fetch.http_client import HttpClient, RequestLimits
 from localizer.map.fetch.mosaic import check_piece
-from localizer.map.fetch.polite import HttpClient, RequestLimits
 from localizer.map.fetch.raster import Piece
 from tests.localizer.map.fetch.loopback import (
     CRS,

@@ -25,7 +25,7 @@ from localizer.errors import GeoreferenceError, LocalizerError, MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.geoid import geoid_separation
 from localizer.map.building.build import build_cache
-from localizer.map.building.isolation import call_apart
+from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.importers.georeference import Georeference, read_georeference
@@ -717,7 +717,7 @@ def fail():
 )
 def test_what_a_process_does_is_a_named_error_here(what, limits, says):
     with pytest.raises(MapSourceError, match=says):
-        call_apart(what, rules=ImportRules(**limits), what="its part")
+        call_in_process(what, rules=ImportRules(**limits), what="its part")
 
 
 def test_limits_and_doubts_are_named():

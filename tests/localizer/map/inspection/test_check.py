@@ -17,9 +17,9 @@ from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.importers.rules import ImportRules
-from localizer.map.inspection.alignment import alignment_of
-from localizer.map.inspection.check import Grade, MapUse, check_map, seams_of
-from localizer.map.inspection.mosaic import Mosaic, mosaic_of
+from localizer.map.inspection.alignment import measure_alignment
+from localizer.map.inspection.check import Grade, MapUse, check_map, find_seams
+from localizer.map.inspection.mosaic import Mosaic, render_mosaic
 from localizer.map.inspection.usable import usable_part
 from tests.localizer.map.conftest import write_tileset
 
@@ -56,7 +56,7 @@ def village(east_m=0.0, north_m=0.0, shadow_m=(4.0, 5.0), grey=False) -> Mosaic:
 
 @pytest.mark.parametrize(("east", "north"), [(0.0, 0.0), (4.0, -3.0), (-6.0, 2.0)])
 def test_a_moved_picture_is_measured_and_shadows_are_no_shift(east, north):
-    found = alignment_of(village(east, north))
+    found = measure_alignment(village(east, north))
     assert found.known
     assert (found.east_m, found.north_m) == pytest.approx((east, north), abs=0.5)
 
@@ -64,8 +64,8 @@ def test_a_moved_picture_is_measured_and_shadows_are_no_shift(east, north):
 def test_without_houses_or_without_colour_nothing_is_said():
     flat = village()
     flat.height[:] = 0.0
-    assert not alignment_of(flat).known
-    assert not alignment_of(village(4.0, 0.0, grey=True)).known
+    assert not measure_alignment(flat).known
+    assert not measure_alignment(village(4.0, 0.0, grey=True)).known
 
 
 def test_a_sound_map_is_good(cache):
@@ -105,11 +105,11 @@ def test_texels_are_judged_by_the_height_that_is_flown(cache):
 
 
 def test_seams_show_where_tiles_do_not_meet(cache):
-    mosaic = mosaic_of(cache, 200_000)
-    assert max(s.height_m for s in seams_of(cache, mosaic)) < 0.2
+    mosaic = render_mosaic(cache, 200_000)
+    assert max(s.height_m for s in find_seams(cache, mosaic)) < 0.2
     column = round(mosaic.pixel(0.0, 0.0)[1])
     mosaic.height[:, column:] += 2.0
-    seen = [s for s in seams_of(cache, mosaic) if s.height_m > 0.5]
+    seen = [s for s in find_seams(cache, mosaic) if s.height_m > 0.5]
     assert all(s.seen for s in seen)
     assert seen
     assert {s.ends[0][1] for s in seen} == {column}
@@ -132,7 +132,7 @@ def test_the_command_says_it_in_words_pictures_and_its_exit_code(cache, tmp_path
 
 def test_of_a_map_with_bad_edges_the_usable_middle_is_named(cache):
     """Until then a map that failed by its edges was only told to fail."""
-    mosaic = mosaic_of(cache, 200_000)
+    mosaic = render_mosaic(cache, 200_000)
     faulty = np.isnan(mosaic.height)
     rows, columns = faulty.shape
     assert usable_part(mosaic, faulty, 120.0, cache.frame).is_whole

@@ -35,7 +35,9 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True)
 class RequestLimits:
-    """rate_per_s: requests a second to one host; most_bytes: limit of all answers together."""
+    """Limits of a client. rate_per_s: requests a second to one host; most_bytes: sum of all
+    answers.
+    """
 
     rate_per_s: float = 4.0
     most_bytes: int = 4 << 30
@@ -61,17 +63,17 @@ class _Request:
 
 
 class HttpClient:
-    """Sends GET and POST requests from any thread, within limits. `MapFetchError` for a refusal or
-    an exceeded limit. sleep, clock: seconds.
+    """Sends GET and POST requests from any thread, within limits. `MapFetchError` for a refused
+    request or an exceeded limit. sleep, clock: in seconds; replaced in tests.
     """
 
     def __init__(
         self,
-        manners: RequestLimits | None = None,
+        limits: RequestLimits | None = None,
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._manners = manners or RequestLimits()
+        self._manners = limits or RequestLimits()
         self._sleep, self._clock = sleep, clock
         self._pool = urllib3.PoolManager(num_pools=8, maxsize=8, headers={"User-Agent": _AGENT})
         self._lock = threading.Lock()
@@ -81,12 +83,12 @@ class HttpClient:
 
     @property
     def bytes(self) -> int:
-        """Received until now."""
+        """Number of bytes received so far."""
         return self._bytes
 
     @property
     def requests(self) -> int:
-        """Sent until now, repeated ones too."""
+        """Number of requests sent so far, with repeated ones."""
         return self._requests
 
     def get(
@@ -114,7 +116,9 @@ class HttpClient:
             there = urljoin(request.url, answer.headers.get("location", ""))
             body = request.body if answer.status in _KEEPS_METHOD else None
             request = replace(request, url=there, body=body)
-        raise MapFetchError(f"{shown(request.url)}: redirected more than {_MOST_REDIRECTS} times")
+        raise MapFetchError(
+            f"{safe_url(request.url)}: redirected more than {_MOST_REDIRECTS} times"
+        )
 
     def _patiently(self, request: _Request, missing: Collection[int]) -> HttpAnswer:
         url = request.url
@@ -133,9 +137,9 @@ class HttpClient:
                 return answer
             why = f"status {answer.status}"
             if answer.status not in _AGAIN:
-                raise MapFetchError(f"{shown(url)}: {why}: {_first_words(answer.data)}")
+                raise MapFetchError(f"{safe_url(url)}: {why}: {_first_words(answer.data)}")
             wait_s = max(wait_s, _told_wait_s(answer.headers))
-        raise MapFetchError(f"{shown(url)}: given up after {_TRIES} tries: {why}")
+        raise MapFetchError(f"{safe_url(url)}: given up after {_TRIES} tries: {why}")
 
     def _wait_turn(self, host: str) -> None:
         with self._lock:
@@ -158,7 +162,9 @@ class HttpClient:
                 data += block
                 self._count(len(block))
                 if len(data) > _MOST_ANSWER:
-                    raise MapFetchError(f"{shown(url)}: an answer of over {_MOST_ANSWER >> 20} MiB")
+                    raise MapFetchError(
+                        f"{safe_url(url)}: an answer of over {_MOST_ANSWER >> 20} MiB"
+                    )
         finally:
             reply.release_conn()
         kind = reply.headers.get("content-type", "").split(";")[0].strip().lower()
@@ -175,14 +181,14 @@ class HttpClient:
                 )
 
 
-def shown(url: str) -> str:
-    """A URL without possible keys, for messages."""
+def safe_url(url: str) -> str:
+    """A URL without its query, which may contain keys, for messages."""
     parts = urlsplit(url)
     return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
 
 
 def _told_wait_s(headers: Mapping[str, str]) -> float:
-    """Retry-After: seconds, or a date; bounded."""
+    """Seconds of a Retry-After header (a number or a date), bounded."""
     told = headers.get("retry-after", "")
     try:
         seconds = float(told)

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
-from localizer.map.fetch.polite import HttpClient, RequestLimits
+from localizer.map.fetch.http_client import HttpClient, RequestLimits
 from localizer.map.fetch.terms import require_allowed
 from tests.localizer.map.fetch.loopback import serving
 

@@ -25,11 +25,12 @@ _FALSE_M = 5.0
 
 @dataclass(frozen=True)
 class LoopSample:
-    """State of the recorded part at a time, seconds since its start.
+    """State of the flight at one time, seconds since the start of the recorded part.
 
-    error_m: the EKF's horizontal error, infinite while it reports no position. level, health: the
-    companion's health; age_s: of that report; findings: active findings of its monitor; rate_hz:
-    localized frames. mode: the autopilot's.
+    error_m: horizontal EKF error, infinite while the EKF reports no position. north_m, east_m: true
+    position from home. mode: of the autopilot. level, health: level and text of the companion's
+    health; age_s: age of that report. findings: active findings of its monitor. rate_hz: localized
+    frames per second.
     """
 
     at_s: float
@@ -44,8 +45,10 @@ class LoopSample:
     rate_hz: float = 0.0
 
     @property
-    def is_told(self) -> bool:
-        """Whether the operator is shown that something is wrong."""
+    def is_reported(self) -> bool:
+        """Whether the operator sees that something is wrong: a health worse than ok, an outdated
+        health report, or a finding.
+        """
         return self.level != "ok" or self.age_s > _STALE_S or bool(self.findings)
 
 
@@ -85,11 +88,11 @@ class RestartTimes:
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """Record of a flight. fix_errors_m: horizontal, of every injected position.
+    """Record of a flight. fix_errors_m: horizontal error of every injected position.
 
-    pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
-    back: where the companion was killed or hung; None elsewhere. shadow: the health when the
-    recorded part began; None where injection was forced.
+    pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`. back:
+    restart times after a kill or hang; None without one. shadow: the health at the start of the
+    recorded part; None if injection was forced.
     """
 
     samples: tuple[LoopSample, ...]
@@ -103,10 +106,12 @@ class LoopRecord:
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """Figures of a flight, metres and seconds. max_error_m: of the EKF, horizontal, while it
-    reports a position (it reports none for blind_s); untold_s: see `untold_s`; false: of `sent`
-    injected positions, those with an error above 5 m, the largest max_fix_m; told_s: with an alert;
-    rate_hz: median of localized frames.
+    """Figures of a flight, metres and seconds.
+
+    max_error_m: horizontal, of the EKF, while it reports a position. blind_s: time without one.
+    untold_s: see `longest_unreported_s`. false: number of the `sent` injected positions with an
+    error above 5 m; max_fix_m: the largest error of an injected position. told_s: time in which the
+    operator sees that something is wrong. rate_hz: median of localized frames per second.
     """
 
     max_error_m: float
@@ -121,9 +126,9 @@ class LoopFigures:
 
 
 @dataclass(frozen=True)
-class Held:
+class LoopExpectationResult:
     """Result of one expectation: its text, whether it holds, and the observed value. listed: the
-    table shows the value of one that holds, too.
+    table shows the value even if the expectation holds.
     """
 
     what: str
@@ -132,11 +137,11 @@ class Held:
     listed: bool = False
 
 
-def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
-    """The longest time (s) with an EKF error above beyond_m and no alert."""
+def longest_unreported_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
+    """The longest time (s) with an EKF error above beyond_m and nothing that tells the operator."""
     longest, begun = 0.0, None
     for sample in samples:
-        if sample.error_m <= beyond_m or sample.is_told:
+        if sample.error_m <= beyond_m or sample.is_reported:
             begun = None
             continue
         begun = sample.at_s if begun is None else begun
@@ -145,27 +150,28 @@ def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
 
 
 def figures(record: LoopRecord, beyond_m: float) -> LoopFigures:
-    """Figures of a flight."""
+    """Compute the figures of a flight. beyond_m: EKF error that must be reported."""
     samples, fixes = record.samples, np.asarray(record.fix_errors_m)
     spans = [(s, after.at_s - s.at_s) for s, after in pairwise(samples)]
     known = [s.error_m for s in samples if math.isfinite(s.error_m)]
     return LoopFigures(
         max_error_m=max(known, default=math.nan),
         blind_s=sum(length for s, length in spans if not math.isfinite(s.error_m)),
-        untold_s=untold_s(samples, beyond_m),
+        untold_s=longest_unreported_s(samples, beyond_m),
         false=int(np.sum(fixes > _FALSE_M)),
         sent=len(fixes),
         max_fix_m=float(fixes.max()) if len(fixes) else math.nan,
-        told_s=sum(length for s, length in spans if s.is_told),
+        told_s=sum(length for s, length in spans if s.is_reported),
         rate_hz=float(np.median([s.rate_hz for s in samples])) if samples else 0.0,
         seconds=samples[-1].at_s if samples else 0.0,
     )
 
 
 def false_alarms(record: LoopRecord, *, denied: bool = False) -> tuple[str, ...]:
-    """All alerts of a flight without a fault, in order of time.
+    """All warnings, findings and health levels worse than ok of a flight without a fault, in order
+    of time.
 
-    denied: GNSS was switched off, and that it is lost is true.
+    denied: GNSS was switched off, so the alert GNSS_LOST is true and is left out.
     """
     told = [
         (t.at_s, t.text)
@@ -182,11 +188,15 @@ def false_alarms(record: LoopRecord, *, denied: bool = False) -> tuple[str, ...]
     return tuple(f"{at_s:.1f} s: {text}" for at_s, text in sorted(told))
 
 
-def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> tuple[Held, ...]:
-    """Check all expectations. denied: GNSS was switched off at the start."""
+def evaluate(
+    record: LoopRecord, expect: Expectation, *, denied: bool = False
+) -> tuple[LoopExpectationResult, ...]:
+    """Check all expectations. denied: GNSS was switched off at the start, so the alert GNSS_LOST is
+    no false alarm.
+    """
     samples, flown = record.samples, figures(record, expect.beyond_m)
     held = [
-        Held(
+        LoopExpectationResult(
             f"beyond {expect.beyond_m:g} m reported within {expect.told_within_s:g} s",
             bool(samples) and flown.untold_s <= expect.told_within_s,
             f"unreported for {flown.untold_s:.1f} s at most; error up to {flown.max_error_m:.1f} m",
@@ -194,25 +204,39 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
     ]
     for mode in expect.never_modes:
         seen = [s.at_s for s in samples if s.mode == mode]
-        held.append(Held(f"never {mode}", not seen, f"from {seen[0]:.0f} s" if seen else "never"))
+        held.append(
+            LoopExpectationResult(
+                f"never {mode}", not seen, f"from {seen[0]:.0f} s" if seen else "never"
+            )
+        )
     if expect.max_error_m is not None:
         ok = flown.max_error_m <= expect.max_error_m
-        held.append(Held(f"EKF within {expect.max_error_m:g} m", ok, f"{flown.max_error_m:.1f} m"))
+        held.append(
+            LoopExpectationResult(
+                f"EKF within {expect.max_error_m:g} m", ok, f"{flown.max_error_m:.1f} m"
+            )
+        )
     if expect.false_fixes is not None:
         ok = flown.false <= expect.false_fixes and (flown.sent > 0 or not expect.injects)
-        held.append(Held("false fixes injected", ok, f"{flown.false} of {flown.sent}"))
+        held.append(
+            LoopExpectationResult("false fixes injected", ok, f"{flown.false} of {flown.sent}")
+        )
     if record.shadow is not None:
-        held.append(Held("shadow check passed", record.shadow.ready, record.shadow.shadow))
+        held.append(
+            LoopExpectationResult("shadow check passed", record.shadow.ready, record.shadow.shadow)
+        )
     if expect.back_within_s is not None:
         back = record.back or RestartTimes(math.inf, math.inf, math.inf)
         ok = back.injects_s <= expect.back_within_s
         found = f"estimate after {back.estimates_s:.1f} s, tracks {back.tracks_s:.1f}"
         found += f", injects {back.injects_s:.1f}"
-        held.append(Held(f"back within {expect.back_within_s:g} s", ok, found))
+        held.append(LoopExpectationResult(f"back within {expect.back_within_s:g} s", ok, found))
     if expect.ends_tracking:
         last = samples[-1] if samples else None
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
-        held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
+        held.append(
+            LoopExpectationResult("tracks at the end", ok, last.health if last else "no samples")
+        )
     held += [_reported(record.texts, of) for of in expect.reports]
     held += [_timed(record.texts, of) for of in expect.alerts]
     if expect.warns_first is not None:
@@ -221,35 +245,43 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         held.append(_repeated(record.texts, expect.repeats))
     if expect.silent:
         told = false_alarms(record, denied=denied)
-        held.append(Held("no warning", not told, "; ".join(told) or "none"))
+        held.append(LoopExpectationResult("no warning", not told, "; ".join(told) or "none"))
     return tuple(held)
 
 
-def _repeated(texts: Sequence[LoopText], most: int) -> Held:
-    """Texts that cycle are read by nobody: an overloaded computer is well and ill by turns."""
+def _repeated(texts: Sequence[LoopText], most: int) -> LoopExpectationResult:
+    """Check that no alert was raised more than `most` times, because operators ignore texts that
+    alternate.
+    """
     said = Counter(t.alert.words for t in texts if t.alert is not None)
     words, times = said.most_common(1)[0] if said else ("nothing", 0)
-    return Held(f"reports nothing more than {most} times", times <= most, f"{times} times {words}")
+    return LoopExpectationResult(
+        f"reports nothing more than {most} times", times <= most, f"{times} times {words}"
+    )
 
 
-def _reported(texts: Sequence[LoopText], of: AlertId) -> Held:
+def _reported(texts: Sequence[LoopText], of: AlertId) -> LoopExpectationResult:
     found = [t for t in texts if t.alert is of]
     at = f"at {found[0].at_s:.1f} s" if found else "never"
-    return Held(f"reports {of.words}", bool(found), at)
+    return LoopExpectationResult(f"reports {of.words}", bool(found), at)
 
 
-def _timed(texts: Sequence[LoopText], of: AlertExpectation) -> Held:
+def _timed(texts: Sequence[LoopText], of: AlertExpectation) -> LoopExpectationResult:
     plain = (
         Text(t.at_s, "vehicle" if t.component == _AUTOPILOT else "bridge", t.text) for t in texts
     )
-    found = of.judge_texts(plain)
+    found = of.evaluate_texts(plain)
     span = "never" if of.absent else f"from {of.from_s:g} to {of.to_s:g} s"
-    return Held(f"{of.alert.words} {span}", found.ok, found.what, listed=not of.absent)
+    return LoopExpectationResult(
+        f"{of.alert.words} {span}", found.ok, found.what, listed=not of.absent
+    )
 
 
-def _warned(texts: Sequence[LoopText], of: AlertId) -> Held:
+def _warned(texts: Sequence[LoopText], of: AlertId) -> LoopExpectationResult:
     told = [t.at_s for t in texts if t.alert is of]
     worse = [t.at_s for t in texts if t.alert in (AlertId.DEGRADED, AlertId.BRIDGING, AlertId.LOST)]
     warned, ended = min(told, default=math.inf), min(worse, default=math.inf)
     seen = f"at {warned:.1f} s, worse at {ended:.1f} s"
-    return Held(f"reports {of.words} before localization is worse", warned < ended, seen)
+    return LoopExpectationResult(
+        f"reports {of.words} before localization is worse", warned < ended, seen
+    )

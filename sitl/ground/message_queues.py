@@ -1,4 +1,4 @@
-"""Passes the autopilot's answers to the threads that wait for them."""
+"""Passes the autopilot's messages to the threads that wait for them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from typing import Any
 from sitl.ground.vehicle_record import from_autopilot
 
 
-class Answers:
-    """Message queues by type: one thread fills them, any thread waits."""
+class AutopilotQueues:
+    """Queues of the autopilot's messages: one thread adds messages, any thread waits for types."""
 
     def __init__(self) -> None:
         self._boxes: list[tuple[frozenset[str], queue.SimpleQueue[Any]]] = []
 
-    def take(self, message: Any) -> None:
-        """Put a message into the queues of its type."""
+    def add(self, message: Any) -> None:
+        """Put a message into every queue that expects its type; other components' messages are
+        ignored.
+        """
         if from_autopilot(message):
             for kinds, box in self._boxes:
                 if message.get_type() in kinds:
