@@ -154,7 +154,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               {"hertz": "Hz", "needed": "Hz"},
               "the rate of sent fixes over 3 s is below 4 Hz (message gps_input: 4.65 Hz)",
               "the rate is above this minimum", f"{_SENT}; the EKF may stop using them",
-              "compare with landmarks; after landing check the computer's load"),
+              "compare with landmarks; on the ground check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
               "EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED (ArduPilot)",
               "the flag is cleared", f"{_SENT}; the EKF uses none yet",
@@ -162,17 +162,18 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.EKF_NO_SOURCE, WARNING, "the EKF has no position source", {},
               "EKF_STATUS_REPORT has the flag EKF_CONST_POS_MODE",
               "the flag is cleared", f"{_SENT}; the EKF uses none",
-              f"{_TAKE_OVER}; {_PARAMETERS}"),
+              f"{_TAKE_OVER}; on the ground {_PARAMETERS}"),
     condition(A.EKF_NO_POSITION, WARNING, "the EKF reports no local position", {},
               "for 3 s no LOCAL_POSITION_NED is received for the times of the sent fixes",
               "LOCAL_POSITION_NED is received",
-              f"{_SENT}; whether the EKF uses them is unknown", f"{_TAKE_OVER}; {_PARAMETERS}"),
+              f"{_SENT}; whether the EKF uses them is unknown",
+              f"{_TAKE_OVER}; on the ground {_PARAMETERS}"),
     condition(A.EKF_OFF_FIXES, WARNING, "the EKF is {metres:.1f} m from what is sent",
               {"metres": "m"},
               "the median distance of the EKF's position from the sent fixes over 3 s is above "
               "2 m + 5 sigma", "the distance is smaller",
               f"{_SENT}; source set, EKF origin or yaw is wrong",
-              f"{_LANDMARKS}; {_TAKE_OVER}; after landing {_PARAMETERS}"),
+              f"{_LANDMARKS}; {_TAKE_OVER}; on the ground {_PARAMETERS}"),
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
               "the horizontal test ratio in EKF_STATUS_REPORT is above 1", "it is 1 or less",
               f"{_SENT}; the EKF does not use them",
@@ -183,7 +184,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               "than `bridge.injection.delay_ms` when it is made",
               "that age is below 90 % of (delay_ms + 10 ms) for 15 s",
               f"{_SENT}; the EKF uses them as if they were newer",
-              "compare with landmarks; after landing raise delay_ms and the autopilot's delay "
+              "compare with landmarks; on the ground raise delay_ms and the autopilot's delay "
               "parameter"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
@@ -191,7 +192,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               "250 ms, PX4 300 ms)",
               "it is below 90 % of the limit for 15 s",
               "fixes are extrapolated by at most 0.5 s and sent; older ones are not sent",
-              "compare with landmarks; after landing use a faster computer or a smaller "
+              "compare with landmarks; on the ground use a faster computer or a smaller "
               "`localizer.width`"),
     event(A.FIXES_IN_TIME, INFO, "fixes are in time again", {},
           "no late fix for 15 s (up to 60 s if it recurs)", "delay_ms is right again",

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from mavlink_bridge.alerts.ids import AlertId
-from tests.companion.integrity_monitor.simulated import Flight, Path
+from tests.companion.integrity_monitor.simulated import Flight, Path, monitor
 
 BEGINS_S = 8.0
 CLAIM = 0.1
@@ -51,8 +49,8 @@ def flown(
     def seen(at_s: float) -> tuple[float, float]:
         return float(np.interp(at_s, times, lie[:, 0])), float(np.interp(at_s, times, lie[:, 1]))
 
-    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(alert_limit_m))
-    flight = Flight(monitor, path, seen, noise_m=0.05, seed=seed, tilt_rad=tilt_rad)
+    limited = monitor(alert_limit_m=alert_limit_m)
+    flight = Flight(limited, path, seen, noise_m=0.05, seed=seed, tilt_rad=tilt_rad)
     flight.fly(BEGINS_S)
     flight.claimed_m, flight.by_odometry = 20.0, True
     return flight.fly(until_s)
