@@ -178,7 +178,7 @@ class IntegrityChecks:
     ) -> VisionFix | None:
         """Return the fix if it may be injected, with a new reset count if earlier fixes were wrong;
         None holds it. A fix of the odometry that only its protection level holds is marked
-        `position_withheld`; its velocity gets the scale error that the IMU has shown.
+        `position_withheld`; each of the odometry gets the scale error that the IMU has shown.
 
         attitude: the autopilot's at the fix's time, None if unknown; held: whether another check
         holds the fix.
@@ -194,7 +194,9 @@ class IntegrityChecks:
         self._level = level = protection_level(
             fix, moving, self._config.protection, known_m, height_m
         )
-        fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
+        scale = None if fix.scale_sigma is None else max(fix.scale_sigma, self._scale.wrong_by)
+        levels = (level.horizontal_m, level.vertical_m)
+        fix = replace(fix, protection_m=levels, scale_sigma=scale)
         self._jump_held = not admitted
         # The jump has a line of its own; how the place moves after it is judged again.
         before, self._newest = self._newest, fix
@@ -205,8 +207,7 @@ class IntegrityChecks:
             moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
             if not moves_right:
                 return None
-            scale = max(fix.scale_sigma or 0.0, self._scale.wrong_by)
-            return replace(fix, position_withheld=True, scale_sigma=scale)
+            return replace(fix, position_withheld=True)
         if held:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The

@@ -64,7 +64,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               f"{_TAKE_OVER}; check the rate of ATTITUDE", lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
               "the horizontal sigma of a fix is above 10 m", "it is 10 m or less",
-              "the position is too uncertain", _TAKE_OVER, lead=_NOT_SENT),
+              "the position is too uncertain; the velocity of odometry is sent", _TAKE_OVER,
+              lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
               "the yaw guard blocks: in three of five fixes vision's yaw is over 3.5 deg off the "
@@ -144,8 +145,10 @@ INJECTION: tuple[AlertSpec, ...] = (
           "median of three comparisons; "
           "at most five times", f"{_SENT}; the next one increments `reset_counter` again", _NONE),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "3 s after the first fix is sent; also 1.5 s after the end of an alert from "
-          "`fix_rate_low` to `ekf_rejects_fixes` (up to 60 s if it recurs)",
+          "3 s after the first fix is sent; also 3.5 s or more after an increment of "
+          "`reset_counter`, when the EKF is within 3 sigma + 1 m; after the end of `ekf_jump`; and "
+          "1.5 s after the end of an alert from `fix_rate_low` to `ekf_rejects_fixes` (up to 60 s "
+          "if it recurs)",
           "the EKF's position is that of the fixes", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},

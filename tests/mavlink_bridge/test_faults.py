@@ -345,6 +345,47 @@ def test_a_jump_that_the_ekf_missed_is_announced_again(flight, taken_at):
     assert len(again) == flight.end.counters["jumps_repeated"] == (taken_at or 6) - 1
 
 
+@pytest.mark.parametrize("follows_after_s", [0.2, 6.0, None])
+def test_after_each_relocalization_it_is_said_once_that_the_ekf_follows(flight, follows_after_s):
+    """The pages let the pilot wait for it; it came after the first fix of the flight only.
+
+    follows_after_s: from the jump to where the EKF is at the new place; None: never.
+    """
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    for place in (1, 2):
+        flight.north_m, flight.reset_count = 10.0 * place, place
+        flight.run(follows_after_s or 0.0)
+        assert len(flight.told(AlertId.EKF_FOLLOWS)) == place
+        flight.ekf_north_m = flight.north_m if follows_after_s else 0.0
+        flight.run(2.5)  # what the EKF was compared with is in part from before
+        assert len(flight.told(AlertId.EKF_FOLLOWS)) == place
+        flight.run(30.0)
+        assert len(flight.told(AlertId.EKF_FOLLOWS)) == (place + 1 if follows_after_s else 1)
+        if follows_after_s is None:
+            assert flight.told(AlertId.EKF_OFF_FIXES)
+            break
+
+
+def test_an_ekf_that_still_swings_about_the_new_place_does_not_follow(flight: Flight) -> None:
+    """After a full loss it swung by 4 m for 12 s: it was said in between, and twice."""
+    flight.north_m, flight.ekf_north_m, flight.reset_count = 10.0, 7.5, 1
+    flight.run(12.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    flight.ekf_north_m = 9.5
+    flight.run(6.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 2
+
+
+def test_that_the_ekf_follows_is_said_after_its_reset_is_confirmed(flight: Flight) -> None:
+    flight.end.inhibit(AlertId.EKF_JUMP)
+    flight.north_m = flight.ekf_north_m = 10.0
+    flight.run(12.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    flight.end.clear(AlertId.EKF_JUMP)
+    flight.run(10.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 2
+
+
 def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight: Flight) -> None:
     """A hundred targets at once, and a ground station that orders without end."""
     for i in range(100):
