@@ -1,7 +1,7 @@
 """Drift of the visual odometry over unseen stretches, and whether its covariance is honest.
 
     python -m benchmarks.odometry MAP [--seen CACHE] [--terrain WORLD] [--json out.json]
-    python -m benchmarks.odometry --report out.json more.json [--json rows.json]
+    python -m benchmarks.odometry --report out.json more.json [--json kept.json]
 
 MAP is a tile cache whose geometry is known; the camera sees the cache --seen (the same place on
 another day), under made light. Depth "map": from MAP's geometry; "ground": the map has neither
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.odometry.flights import DEPTHS, FlownScene, FlownStretch, Flyer, OdometryStep
 from benchmarks.odometry.report import fitted_growth, rows
@@ -144,10 +145,11 @@ def main() -> None:
     if args.report:
         kept = [f for path in args.report for f in read(path)]
         together = rows([replace(f, place="all") for f in kept])
-        for row in together:
-            print(json.dumps(row))
-        if args.json:
-            args.json.write_text(json.dumps(together, indent=1))
+        cells = [
+            [f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()]
+            for row in together
+        ]
+        show_figures(args.json, tuple(together[0]), cells)
         return
     if args.map is None:
         parser.error("MAP is missing")

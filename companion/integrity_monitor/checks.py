@@ -179,9 +179,9 @@ class IntegrityChecks:
         holds it.
 
         Its reset count is increased if earlier fixes were wrong. A fix of the odometry that only
-        its protection level holds is marked `position_withheld`; its velocity gets the scale error
-        that the IMU has shown. attitude: the autopilot's at the fix's time, None if unknown; held:
-        whether another check holds the fix.
+        its protection level holds is marked `position_withheld`; each fix of the odometry gets the
+        scale error that the IMU has shown. attitude: the autopilot's at the fix's time, None if
+        unknown; held: whether another check holds the fix.
         """
         self._tilt.add(fix, attitude)
         verdict = self._verdict
@@ -194,7 +194,9 @@ class IntegrityChecks:
         self._level = level = protection_level(
             fix, moving, self._config.protection, position_error_m, height_m
         )
-        fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
+        scale = None if fix.scale_sigma is None else max(fix.scale_sigma, self._scale.scale_error)
+        levels = (level.horizontal_m, level.vertical_m)
+        fix = replace(fix, protection_m=levels, scale_sigma=scale)
         self._jump_held = not admitted
         # The jump has a line of its own; how the place moves after it is judged again.
         before, self._newest = self._newest, fix
@@ -205,8 +207,7 @@ class IntegrityChecks:
             moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
             if not moves_right:
                 return None
-            scale = max(fix.scale_sigma or 0.0, self._scale.scale_error)
-            return replace(fix, position_withheld=True, scale_sigma=scale)
+            return replace(fix, position_withheld=True)
         if held:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The

@@ -60,15 +60,20 @@ class OpenVinoSession:
     def run(self, outputs: list[str], inputs: dict[str, NDArray[np.uint8]]) -> list[Any]:
         """The named outputs; the arrays belong to the caller."""
         (image,) = inputs.values()
-        found = self._request(image.shape).infer(inputs, share_inputs=True)
+        request, shapes = self._request(image.shape)
+        found = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+        for name, array in found.items():  # the network writes into them: no copy
+            request.set_tensor(name, self._openvino.Tensor(array, shared_memory=True))
+        request.infer(inputs, share_inputs=True, share_outputs=True)
         return [found[name] for name in outputs]
 
-    def _request(self, shape: tuple[int, ...]) -> Any:
-        """This thread's inference request for images of a shape."""
+    def _request(self, shape: tuple[int, ...]) -> tuple[Any, dict[str, tuple[int, ...]]]:
+        """This thread's inference request for images of a shape, and its outputs' shapes."""
         network = self._network(shape)
         if getattr(self._mine, "network", None) is not network:
             self._mine.network, self._mine.request = network, network.create_infer_request()
-        return self._mine.request
+            self._mine.shapes = {o.get_any_name(): tuple(o.shape) for o in network.outputs}
+        return self._mine.request, self._mine.shapes
 
     def _network(self, shape: tuple[int, ...]) -> Any:
         with self._lock:

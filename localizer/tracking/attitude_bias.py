@@ -221,9 +221,11 @@ class AttitudeBiasEstimator:
             self.bias = without_observation(self.bias, place, time_ns)
 
     def learn(self, observation: AttitudeObservation) -> None:
-        """Add an observation."""
+        """Add an observation; without a reported attitude it only counts as made."""
         reported = self._rotation_at(observation.time_ns)
-        if self.bias is not None and self._config is not None and reported is not None:
+        if reported is None:
+            self.skip_ground(observation.pose.translation, observation.time_ns)
+        elif self.bias is not None and self._config is not None:
             self.bias = with_observation(self.bias, self._config, reported, observation)
 
 

@@ -64,7 +64,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               f"{_TAKE_OVER}; check the rate of ATTITUDE", lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
               "the horizontal sigma of a fix is above 10 m", "it is 10 m or less",
-              "the position is too uncertain", _TAKE_OVER, lead=_NOT_SENT),
+              "the position is too uncertain; the velocity of odometry is sent", _TAKE_OVER,
+              lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
               "the yaw guard blocks: in three of five fixes vision's yaw is over 3.5 deg off the "
@@ -144,14 +145,16 @@ INJECTION: tuple[AlertSpec, ...] = (
           "median of three comparisons; "
           "at most five times", f"{_SENT}; the next one increments `reset_counter` again", _NONE),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "3 s after the first fix is sent; also 1.5 s after the end of an alert from "
-          "`fix_rate_low` to `ekf_rejects_fixes` (up to 60 s if it recurs)",
+          "3 s after the first fix is sent; also 3.5 s or more after an increment of "
+          "`reset_counter`, when the EKF is within 3 sigma + 1 m; after the end of `ekf_jump`; and "
+          "1.5 s after the end of an alert from `fix_rate_low` to `ekf_rejects_fixes` (up to 60 s "
+          "if it recurs)",
           "the EKF's position is that of the fixes", _NONE),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
               "the rate of sent fixes over 3 s is below 4 Hz (message gps_input: 4.65 Hz)",
               "the rate is above this minimum", f"{_SENT}; the EKF may stop using them",
-              "compare with landmarks; after landing check the computer's load"),
+              "compare with landmarks; on the ground check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
               "EKF_STATUS_REPORT has the flag EKF_UNINITIALIZED (ArduPilot)",
               "the flag is cleared", f"{_SENT}; the EKF uses none yet",
@@ -159,17 +162,18 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.EKF_NO_SOURCE, WARNING, "the EKF has no position source", {},
               "EKF_STATUS_REPORT has the flag EKF_CONST_POS_MODE",
               "the flag is cleared", f"{_SENT}; the EKF uses none",
-              f"{_TAKE_OVER}; {_PARAMETERS}"),
+              f"{_TAKE_OVER}; on the ground {_PARAMETERS}"),
     condition(A.EKF_NO_POSITION, WARNING, "the EKF reports no local position", {},
               "for 3 s no LOCAL_POSITION_NED is received for the times of the sent fixes",
               "LOCAL_POSITION_NED is received",
-              f"{_SENT}; whether the EKF uses them is unknown", f"{_TAKE_OVER}; {_PARAMETERS}"),
+              f"{_SENT}; whether the EKF uses them is unknown",
+              f"{_TAKE_OVER}; on the ground {_PARAMETERS}"),
     condition(A.EKF_OFF_FIXES, WARNING, "the EKF is {metres:.1f} m from what is sent",
               {"metres": "m"},
               "the median distance of the EKF's position from the sent fixes over 3 s is above "
               "2 m + 5 sigma", "the distance is smaller",
               f"{_SENT}; source set, EKF origin or yaw is wrong",
-              f"{_LANDMARKS}; {_TAKE_OVER}; after landing {_PARAMETERS}"),
+              f"{_LANDMARKS}; {_TAKE_OVER}; on the ground {_PARAMETERS}"),
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
               "the horizontal test ratio in EKF_STATUS_REPORT is above 1", "it is 1 or less",
               f"{_SENT}; the EKF does not use them",
@@ -180,7 +184,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               "than `bridge.injection.delay_ms` when it is made",
               "that age is below 90 % of (delay_ms + 10 ms) for 15 s",
               f"{_SENT}; the EKF uses them as if they were newer",
-              "compare with landmarks; after landing raise delay_ms and the autopilot's delay "
+              "compare with landmarks; on the ground raise delay_ms and the autopilot's delay "
               "parameter"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
@@ -188,7 +192,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               "250 ms, PX4 300 ms)",
               "it is below 90 % of the limit for 15 s",
               "fixes are extrapolated by at most 0.5 s and sent; older ones are not sent",
-              "compare with landmarks; after landing use a faster computer or a smaller "
+              "compare with landmarks; on the ground use a faster computer or a smaller "
               "`localizer.width`"),
     event(A.FIXES_IN_TIME, INFO, "fixes are in time again", {},
           "no late fix for 15 s (up to 60 s if it recurs)", "delay_ms is right again",

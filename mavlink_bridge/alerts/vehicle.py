@@ -71,13 +71,16 @@ VEHICLE: tuple[AlertSpec, ...] = (
     event(A.SECOND_COMPANION, WARNING, "another companion is component {component}",
           {"component": "id"}, "a heartbeat with this program's own ids is received",
           f"{_SENT}; another program uses the same ids and may send fixes too",
-          "stop one of them"),
+          "take over; stop one of them"),
     event(A.DUPLICATE_SYSTEM_ID, WARNING, "two autopilots have system id {system}",
           {"system": "id"},
-          "heartbeats of a second autopilot, or boot times that run back 40 times in 5 s",
-          f"{_SENT}; the data of both autopilots are mixed", "change the system id of one"),
+          "heartbeats of a second autopilot or of another make, another firmware version, or boot "
+          "times that run back 40 times in 5 s",
+          f"{_SENT}; the data of both autopilots are mixed", "take over; on the ground change the "
+          "system id of one"),
     event(A.AUTOPILOT_IGNORED, WARNING, "autopilot {system} ignored, using {used}",
-          {"system": "id", "used": "id"}, "heartbeats of an autopilot with another system id",
+          {"system": "id", "used": "id"}, "heartbeats of an autopilot with another system id, "
+          "while `bridge.system_id` is not set",
           f"{_SENT}; the messages of this autopilot are ignored",
           "set `bridge.system_id` to your vehicle's"),
     event(A.ARMING_ALTERNATES, WARNING, "system {system} armed, disarmed in turn", {"system": "id"},

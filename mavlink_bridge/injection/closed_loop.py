@@ -43,9 +43,13 @@ class LoopVerdict:
 
 
 class ClosedLoopCheck:
-    """Compares sent positions with the EKF's; one thread. message: kind of the sent messages."""
+    """Compares sent positions with the EKF's; one thread. message: kind of the sent messages.
+
+    jumping: the EKF was not yet seen at the positions after the last announced jump.
+    """
 
     def __init__(self, message: InjectionMessage) -> None:
+        self.jumping = False
         self._message = message
         self._sent: deque[tuple[int, float, float, float]] = deque(maxlen=256)
         self._pending: deque[tuple[int, float, float, float]] = deque(maxlen=256)
@@ -68,7 +72,7 @@ class ClosedLoopCheck:
         """Add a sent position: valid at stamp_ns, metres north and east of the EKF origin."""
         if self._reset_counter not in (None, reset_counter):
             self._jump_ns = now_ns + _TAKES_NS
-            self._announced_ns = now_ns
+            self._announced_ns, self.jumping = now_ns, True
         self._reset_counter = reset_counter
         if not self._sent or now_ns - self._sent[-1][0] > _SETTLE_NS:
             self._began_ns = now_ns
@@ -98,7 +102,7 @@ class ClosedLoopCheck:
         reason = self._reason(rate, state, difference, sigma)
         after_jump = now_ns - self._announced_ns > _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
         if after_jump and difference is not None and _is_there(difference, sigma):
-            self._repeats = 0  # another jump may be missed as often
+            self.jumping, self._repeats = False, 0  # another jump may be missed as often
         return LoopVerdict(reason is None, reason, difference)
 
     def queue_lengths(self) -> dict[str, int]:

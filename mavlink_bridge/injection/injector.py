@@ -240,8 +240,9 @@ class Injector:
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
-            if fix.position_withheld:
+            if fix.position_withheld or fix.horizontal_sigma_m > self._config.max_sigma_m:
                 self.motion.add(fix, now_ns, context)
+            if fix.position_withheld:
                 continue
             last = self._propagator.fix
             self._pace.add(fix.time_ns, None if last is None else last.time_ns, now_ns)

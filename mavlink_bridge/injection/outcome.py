@@ -88,9 +88,14 @@ class InjectionOutcome:
                 self.compared_ns = fix.time_ns
 
     def check_ekf(self, state: VehicleState, now_ns: int) -> bool:
-        """Check and report whether the EKF follows. True if a jump must be announced again."""
+        """Check and report whether the EKF follows: also after each jump, when it is settled.
+        True if a jump must be announced again.
+        """
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
-        if self.verdict is not None and (self.verdict.reason or not self.ekf_ok_inhibited_by):
+        unsettled = bool(self.ekf_ok_inhibited_by) or self._loop.jumping
+        if unsettled:
+            self._notifier.notify("loop", None)  # what was reported is of before
+        if self.verdict is not None and (self.verdict.reason or not unsettled):
             follows = alert(AlertId.EKF_FOLLOWS)
             self._notifier.notify_settled("loop", self.verdict.reason, follows, now_ns)
         if not self._loop.is_jump_missed():

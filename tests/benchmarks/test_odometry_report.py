@@ -1,10 +1,16 @@
 """What the odometry's benchmark makes of known errors."""
 
+import json
+from dataclasses import asdict
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from benchmarks.odometry.__main__ import main
 from benchmarks.odometry.flights import FlownStretch, OdometryStep
 from benchmarks.odometry.report import fitted_growth, rows
+from benchmarks.site.forms import tables_of
 
 SIGMA = np.diag([0.05, 0.05, 0.05]) ** 2
 
@@ -57,3 +63,14 @@ def test_what_was_not_carried_on_is_counted():
     assert row["carried_to_the_end"] == 0
     assert row["usable_percent"] == 50
     assert row["end_m_p50"] == pytest.approx(30)  # its error counts all the same
+
+
+def test_the_report_of_several_runs_can_be_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    runs, kept = [tmp_path / "1.json", tmp_path / "2.json"], tmp_path / "kept.json"
+    for run in runs:
+        flown = [asdict(f) for f in stretches(0.01, 0.03, 2, told=True)]
+        run.write_text(json.dumps({"flown": flown}))
+    monkeypatch.setattr("sys.argv", ["", "--report", *map(str, runs), "--json", str(kept)])
+    main()
+    table, _ = tables_of([kept], "")
+    assert [row[:4] for row in table.rows] == [("all", "map", c, "4") for c in ("day", "all")]

@@ -5,11 +5,10 @@ import pytest
 
 from companion.conversions import CameraExtrinsics, vehicle_prior, vision_fix
 from companion.geometry import ned_from_world
-from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
+from tests.companion.estimates import estimated
 
 ORIGIN = Geodetic(47.3, 8.5, 450.0)
 FRAME = LocalFrame(ORIGIN)
@@ -50,10 +49,7 @@ def test_fix_of_the_prior_is_the_vehicle_again(seed):
     gimbal = _gimbal(rng.uniform(-1.5, -0.2), rng.uniform(-3, 3))
     vehicle = FRAME.position(rng.uniform(-2000, 2000, 3))
     prior = _prior(_state(vehicle), attitude, gimbal)
-    estimate = PoseEstimate(
-        prior.world_from_camera, prior.covariance, 0.9, TrackingState.TRACKING,
-        RegistrationStatus.OK, True, 5, 1, Camera.from_fov(640, 480, 60),
-    )  # fmt: skip
+    estimate = estimated(prior.world_from_camera, covariance=prior.covariance, quality=0.9)
     fix = vision_fix(estimate, INSTALLATION, attitude, gimbal, 0)
     seen = FRAME.enu_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height_m)
     true = FRAME.enu_from_geodetic(vehicle.latitude_deg, vehicle.longitude_deg, vehicle.height_m)
@@ -66,10 +62,7 @@ def test_fix_of_the_prior_is_the_vehicle_again(seed):
 
 def test_without_the_gimbal_the_attitude_is_unknown_not_guessed():
     prior = _prior(_state(ORIGIN), _attitude(0, 0, 0), _gimbal(-1.5, 0))
-    estimate = PoseEstimate(
-        prior.world_from_camera, prior.covariance, 0.9, TrackingState.TRACKING,
-        RegistrationStatus.OK, True, 5, 1, Camera.from_fov(640, 480, 60),
-    )  # fmt: skip
+    estimate = estimated(prior.world_from_camera, covariance=prior.covariance, quality=0.9)
     fix = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), None, 3)
     assert fix.quaternion is None
     assert fix.yaw_rad is None

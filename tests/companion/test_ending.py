@@ -21,13 +21,12 @@ from companion.flight.recorder import RecordKeeper
 from companion.supervision.pulse import Pulse
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
-from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from tests.companion.estimates import DOWN, estimated
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
-DOWN = np.diag([1.0, -1.0, -1.0])
+TRACKED = estimated(Pose(DOWN, np.array([5.0, 6.0, 80.0])), variance=0.04)
 
 
 class Hang:
@@ -58,13 +57,6 @@ def ends(stop: Callable[[], Any]) -> bool:
     return not ending.is_alive()
 
 
-def tracked() -> PoseEstimate:
-    return PoseEstimate(
-        Pose(DOWN, np.array([5.0, 6.0, 80.0])), np.eye(6) * 0.04, 1.0, TrackingState.TRACKING,
-        RegistrationStatus.OK, True, 5, 0, Camera.from_fov(640, 480, 60),
-    )  # fmt: skip
-
-
 def test_a_thread_that_hangs_is_named_and_one_that_ends_is_not(hang, caplog, monkeypatch):
     hanging = threading.Thread(target=lambda: hang.over.wait(120.0), name="stuck", daemon=True)
     hanging.start()
@@ -81,8 +73,8 @@ def test_a_map_on_a_dead_disk_keeps_the_targets_end_waiting_no_longer(hang: Hang
     """Record and link to the autopilot are closed after the targets: they never were."""
     reporter = TargetReporter(TargetConfig(), hang, lambda _: None)
     reporter.start()
-    reporter.add_estimate(tracked())
-    reporter.begin(Click(1, tracked(), (320.0, 240.0)))
+    reporter.add_estimate(TRACKED)
+    reporter.begin(Click(1, TRACKED, (320.0, 240.0)))
     assert hang.reached.wait(60.0)
     assert ends(reporter.stop)
 
@@ -96,7 +88,7 @@ def test_a_last_fix_on_a_dead_disk_is_left_there(hang, tmp_path, monkeypatch):
     memory = FixMemory(path, PriorConfig(), autopilot, extrinsics, hang)
     bundle: Any = None
     memory.start()
-    memory.add_estimate(tracked(), bundle)
+    memory.add_estimate(TRACKED, bundle)
     assert hang.reached.wait(60.0)
     assert ends(memory.stop)
     assert path.exists()  # the same disk would be waited for once more

@@ -56,6 +56,9 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     # Only what is fresh: nothing that waited during the loss.
     assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
     assert max(flight.queue_lengths().values()) <= 256
+    flight.reboot()
+    flight.run(10.0)
+    assert not flight.told(AlertId.TIMESYNC_UNANSWERED)  # a link that was gone owes no answers
 
 
 def test_reboot_and_another_origin_during_the_loss(flight: Flight) -> None:
@@ -119,17 +122,6 @@ def test_a_clock_that_is_not_compared_any_more_is_told(flight: Flight) -> None:
     assert flight.alerts[-1] == cleared(AlertId.TIMESYNC_UNANSWERED)
 
 
-def test_a_link_that_was_gone_owes_no_answers(flight: Flight) -> None:
-    flight.run(20.0)
-    flight.link.open = False
-    flight.run(40.0)
-    flight.link.open = True
-    flight.run(10.0)
-    flight.reboot()
-    flight.run(10.0)
-    assert not flight.told(AlertId.TIMESYNC_UNANSWERED)
-
-
 @pytest.mark.parametrize("step_s", [-0.4, 0.4, 7.0, -40.0])
 def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
     """Up to 1 s back is a step, more is what a reboot looks like; both are followed."""
@@ -178,16 +170,6 @@ def test_no_position_from_an_origin_on_another_continent(monkeypatch: pytest.Mon
     flight.run(15.0)
     assert flight.vision() == []
     assert flight.told(AlertId.EKF_ORIGIN_FAR)
-
-
-def test_late_fixes_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fixes come 50 ms after exposure here; the parameter says 20."""
-    late = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=20))
-    late.run(30.0)
-    assert late.told(*LATE) == [alert(AlertId.FIXES_LATE, age_ms=50.0, limit_ms=20.0)]
-    fine = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=60))
-    fine.run(30.0)
-    assert not fine.told(*LATE)
 
 
 def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(monkeypatch):
@@ -363,6 +345,47 @@ def test_a_jump_that_the_ekf_missed_is_announced_again(flight, taken_at):
     assert len(again) == flight.end.counters["jumps_repeated"] == (taken_at or 6) - 1
 
 
+@pytest.mark.parametrize("follows_after_s", [0.2, 6.0, None])
+def test_after_each_relocalization_it_is_said_once_that_the_ekf_follows(flight, follows_after_s):
+    """The pages let the pilot wait for it; it came after the first fix of the flight only.
+
+    follows_after_s: from the jump to where the EKF is at the new place; None: never.
+    """
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    for place in (1, 2):
+        flight.north_m, flight.reset_count = 10.0 * place, place
+        flight.run(follows_after_s or 0.0)
+        assert len(flight.told(AlertId.EKF_FOLLOWS)) == place
+        flight.ekf_north_m = flight.north_m if follows_after_s else 0.0
+        flight.run(2.5)  # what the EKF was compared with is in part from before
+        assert len(flight.told(AlertId.EKF_FOLLOWS)) == place
+        flight.run(30.0)
+        assert len(flight.told(AlertId.EKF_FOLLOWS)) == (place + 1 if follows_after_s else 1)
+        if follows_after_s is None:
+            assert flight.told(AlertId.EKF_OFF_FIXES)
+            break
+
+
+def test_an_ekf_that_still_swings_about_the_new_place_does_not_follow(flight: Flight) -> None:
+    """After a full loss it swung by 4 m for 12 s: it was said in between, and twice."""
+    flight.north_m, flight.ekf_north_m, flight.reset_count = 10.0, 7.5, 1
+    flight.run(12.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    flight.ekf_north_m = 9.5
+    flight.run(6.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 2
+
+
+def test_that_the_ekf_follows_is_said_after_its_reset_is_confirmed(flight: Flight) -> None:
+    flight.end.inhibit(AlertId.EKF_JUMP)
+    flight.north_m = flight.ekf_north_m = 10.0
+    flight.run(12.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 1
+    flight.end.clear(AlertId.EKF_JUMP)
+    flight.run(10.0)
+    assert len(flight.told(AlertId.EKF_FOLLOWS)) == 2
+
+
 def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight: Flight) -> None:
     """A hundred targets at once, and a ground station that orders without end."""
     for i in range(100):
@@ -379,17 +402,14 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
     flight.link.congested = True
     begun_ns = flight.now_ns
     order = mavlink.MAVLink_command_long_message(1, 100, 2004, 0, 0.5, 0.5, 0, 0, 0, 0, 0)
-    station = mavlink.MAVLink(None, 255, 190)
     for _ in range(50):
-        for message in flight.reader.feed(order.pack(station)):
-            flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.say(order, 255, 190)
         flight.run(0.1)
     kinds = {m.get_type() for t, m, _ in flight.link.sent if t > begun_ns}
     assert "VISION_POSITION_ESTIMATE" in kinds
     assert not kinds & {"COMMAND_ACK", "CAMERA_TRACKING_GEO_STATUS"}
     flight.link.congested = False
-    for message in flight.reader.feed(order.pack(station)):
-        flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+    flight.say(order, 255, 190)
     assert flight.link.sent[-1][1].get_type() == "COMMAND_ACK"
 
 
@@ -409,13 +429,11 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
 def test_a_second_vehicle_and_a_second_companion_are_told_once(
     flight: Flight, system: int, component: int, autopilot: int, said: Alert | None
 ) -> None:
-    stranger = mavlink.MAVLink(None, system, component)
-    beat = mavlink.MAVLink_heartbeat_message(2, autopilot, 81, 4, 4, 3).pack(stranger)
+    beat = mavlink.MAVLink_heartbeat_message(2, autopilot, 81, 4, 4, 3)
     flight.alerts.clear()
     for _ in range(3):
         kept = flight.link.kept
-        for message in flight.reader.feed(beat):
-            flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.say(beat, system, component)
         assert flight.link.kept == kept
         flight.run(1.0)
         assert flight.link.kept == kept + 1  # by the vehicle's own heartbeat
@@ -426,15 +444,12 @@ def test_a_second_vehicle_and_a_second_companion_are_told_once(
 @pytest.mark.parametrize("ahead_s", [-50, 500])
 def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int) -> None:
     """Only their boot times tell them apart. Nothing of the other's attitude may be injected."""
-    other = mavlink.MAVLink(None, 1, 1)
     flight.alerts.clear()
     for step in range(1000):
         flight.run(0.01)
         if step % 4 == 1:
             boot_ms = flight.boot_ns(flight.now_ns) // MS + ahead_s * 1000
-            attitude = mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
-            for message in flight.reader.feed(attitude.pack(other)):
-                flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+            flight.say(mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0))
     told = flight.told(AlertId.DUPLICATE_SYSTEM_ID)
     assert told == [alert(AlertId.DUPLICATE_SYSTEM_ID, system=1)]
     assert {m.yaw for _, m in flight.vision()}.isdisjoint({-1.0})

@@ -19,23 +19,17 @@ from companion.offline.record import read_record
 from companion.reporting.pictures import map_pictures
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import TlogRecorder
+from tests.companion.console.record_of import write_rows
 
 MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
 S = 1_000_000_000
-
-
-def _rows(path, columns, rows):
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="0")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 @pytest.fixture
 def source(tmp_path):
     (tmp_path / "snapshots").mkdir()
     states = ["tracking"] * 11 + ["lost"] * 10
-    _rows(
+    write_rows(
         tmp_path / "estimates.csv", ESTIMATE_COLUMNS,
         [
             {"exposure_time_ns": (10 + i) * S, "qx": 1.0, "state": s, "status": "OK",
@@ -44,9 +38,9 @@ def source(tmp_path):
         ],
     )  # fmt: skip
     target = {"exposure_time_ns": 12 * S, "target_id": "car"}
-    _rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
+    write_rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
     event = {"time_ns": 15 * S, "level": "warning", "text": "GNSS lost"}
-    _rows(tmp_path / "events.csv", EVENT_COLUMNS, [event])
+    write_rows(tmp_path / "events.csv", EVENT_COLUMNS, [event])
     image = np.full((48, 64, 3), 90, np.uint8)
     cv2.imwrite(str(tmp_path / "snapshots" / f"{14 * S}.jpg"), image)
     manifest = {"monotonic_ns": 10 * S, "utc_ns": 1000 * S, "config": {"camera": {"model": MODEL}}}
@@ -101,7 +95,7 @@ def test_with_the_map_the_picture_has_its_edges_and_the_autopilot_its_track(
         rows = list(csv.DictReader(file))
     cache = TileCache.open(small_assets.map_cache)
     up = float(cache.index.box_min[0, 2]) + 60.0
-    _rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [r | {"up_m": up} for r in rows])
+    write_rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [r | {"up_m": up} for r in rows])
     at, codec = cache.frame.origin, mavlink.MAVLink(None, 1, 1)
     place = (round(at.latitude_deg * 1e7), round(at.longitude_deg * 1e7), 0)
     log = TlogRecorder(tmp_path / "flight.tlog")
@@ -134,11 +128,11 @@ def test_the_heading_is_where_the_top_of_the_picture_points(source):
 def test_what_no_browser_reads_is_not_sent(tmp_path, value):
     numbers = ("qw", "qx", "sigma_east_m", "latitude_deg", "quality", "hpl_m", "latency_ms")
     row = {"exposure_time_ns": S, "state": "tracking"} | dict.fromkeys(numbers, value)
-    _rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [row])
+    write_rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [row])
     spoilt = ("latitude_deg", "sigma_up_m", "cov_en") if value != "-1e308" else ()
     target = {"exposure_time_ns": S, "target_id": "car"} | dict.fromkeys(spoilt, value)
-    _rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
-    _rows(tmp_path / "events.csv", EVENT_COLUMNS, [])
+    write_rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
+    write_rows(tmp_path / "events.csv", EVENT_COLUMNS, [])
     (tmp_path / "record.json").write_text(json.dumps({"utc_ns": "x", "monotonic_ns": None}))
     source = ReplaySource(read_record(tmp_path))
     asyncio.run(source.order({"share": 0.0}))
@@ -147,9 +141,9 @@ def test_what_no_browser_reads_is_not_sent(tmp_path, value):
 
 
 def test_an_address_that_is_none_is_one_line(tmp_path):
-    _rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [])
+    write_rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [])
     for name, columns in (("targets.csv", TARGET_COLUMNS), ("events.csv", EVENT_COLUMNS)):
-        _rows(tmp_path / name, columns, [])
+        write_rows(tmp_path / name, columns, [])
     for listen in ("nonsense", "127.0.0.1:99999"):
         with pytest.raises(ConfigError, match="--console") as told:
             show_record(tmp_path, tmp_path, listen)

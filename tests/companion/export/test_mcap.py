@@ -23,8 +23,9 @@ from companion.export.mcap_export import export_mcap
 from companion.flight.recorder import RecordKeeper
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
-from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
+from localizer.types import Frame, TargetFix
 from mavlink_bridge.link.tlog import TlogRecorder
+from tests.companion.estimates import estimated
 
 BEGIN_NS = 5_000_000_000
 DOWN = Pose(np.diag([1.0, -1.0, -1.0]), np.array([12.5, -3.25, 80.0]))
@@ -66,10 +67,10 @@ def flight(tmp_path, small_assets):
         keeper.open(config, record, lambda _: None)
         recorder, camera = keeper.recorder, config.camera.model.camera()
         covariance = np.diag([0.04, 0.09, 0.25, 1e-4, 1e-4, 1e-4])
-        first = PoseEstimate(
-            DOWN, covariance, 0.8, TrackingState.TRACKING, RegistrationStatus.OK, True,
-            BEGIN_NS, 0, camera, {"register": 9.5, "latency": 90.0},
-        )  # fmt: skip
+        stage_ms = {"register": 9.5, "latency": 90.0}
+        first = estimated(
+            DOWN, BEGIN_NS, covariance=covariance, quality=0.8, camera=camera, stage_ms=stage_ms
+        )
         later_ns = BEGIN_NS + 100_000_000
         refused = replace(first, accepted=False, exposure_time_ns=later_ns, sequence=1)
         recorder.estimate(first, (2.5, 2.0))

@@ -11,13 +11,12 @@ import pytest
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.conversions import CameraExtrinsics, vision_fix
 from companion.flight.calibration_observer import CalibrationObserver, middle_depth_m
-from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import PoseEstimate, TrackingState
+from tests.companion.estimates import DOWN, estimated
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
-DOWN = np.diag([1.0, -1.0, -1.0])  # a camera straight down whose top is north, in ENU
 EXTRINSICS = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
 
 
@@ -27,10 +26,7 @@ def bundle(depth: np.ndarray) -> Any:
 
 def estimate(time_s: float, *, state: str = "TRACKING") -> PoseEstimate:
     pose = Pose(DOWN, np.array([0.0, 0.0, 80.0]))
-    return PoseEstimate(
-        pose, np.eye(6) * 0.04, 1.0, TrackingState[state], RegistrationStatus.OK, True,
-        round(time_s * 1e9), 0, Camera.from_fov(640, 480, 60),
-    )  # fmt: skip
+    return estimated(pose, round(time_s * 1e9), variance=0.04, state=TrackingState[state])
 
 
 def test_four_a_second_of_what_the_map_confirmed() -> None:

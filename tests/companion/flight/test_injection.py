@@ -7,17 +7,15 @@ import pytest
 
 from companion.conversions import CameraExtrinsics
 from companion.flight.injection import FixInjection
-from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.geometry.pose import Pose
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import TrackingState
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
+from tests.companion.estimates import estimated
 
 LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
 DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
 BRIDGING = TrackingState.BRIDGING
-CAMERA = Camera.from_fov(640, 480, 60)
 INSTALLATION = CameraExtrinsics(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zeros(3))
 
 
@@ -40,11 +38,8 @@ class FakeBridge:
 
 
 def _estimate(state, accepted=True):
-    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
-    return PoseEstimate(
-        pose, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, accepted, 5, 0, CAMERA,
-        scale_sigma=0.2 if state is BRIDGING else None,
-    )  # fmt: skip
+    scale_sigma = 0.2 if state is BRIDGING else None
+    return estimated(state=state, accepted=accepted, scale_sigma=scale_sigma)
 
 
 @pytest.mark.parametrize(

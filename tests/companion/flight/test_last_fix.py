@@ -16,16 +16,15 @@ from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
 from companion.flight.last_fix import FixMemory, LastFix, read_last_fix
 from companion.flight.priors import local_near
-from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import PoseEstimate
 from mavlink_bridge.link.clock import boot_id
 from mavlink_bridge.messages import Origin, VehicleState
+from tests.companion.estimates import DOWN, estimated
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
 INSTALLATION = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
-DOWN = np.diag([1.0, -1.0, -1.0])
 AUTOPILOT: Any = SimpleNamespace(rotation=lambda _: DOWN, velocity=np.array([1.0, 0.0, 0.0]))
 SECOND = 10**9
 BEGUN = LastFix(boot_id(), 100 * SECOND, 47.0, 8.0, 580.0, 0.3, (10.0, 20.0, -80.0))
@@ -43,10 +42,7 @@ def memory(path: Path, local: tuple[float, float, float] | None = (13.0, 24.0, -
 
 
 def tracked(time_ns: int) -> PoseEstimate:
-    return PoseEstimate(
-        Pose(DOWN, np.array([5.0, 6.0, 80.0])), np.eye(6) * 0.04, 1.0, TrackingState.TRACKING,
-        RegistrationStatus.OK, True, time_ns, 0, Camera.from_fov(640, 480, 60),
-    )  # fmt: skip
+    return estimated(Pose(DOWN, np.array([5.0, 6.0, 80.0])), time_ns, variance=0.04)
 
 
 def test_the_way_that_the_ekf_flew_since_is_added(tmp_path: Path) -> None:

@@ -32,13 +32,11 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.types import (
     Frame,
-    PoseEstimate,
-    RegistrationStatus,
     TargetFix,
-    TrackingState,
     Visibility,
 )
 from mavlink_bridge.link.clock import utc_us
+from tests.companion.estimates import estimated
 
 FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
 CAMERA = Camera.from_fov(64, 48, 60)
@@ -48,11 +46,8 @@ CAR = TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5)
 def test_what_is_recorded_can_be_read_back(tmp_path):
     recorder = Recorder(RecordConfig(folder=tmp_path, snapshot_interval_s=1.0), FRAME)
     pose = Pose(so3_exp([2.0, 0.5, -0.3]), np.array([1.25, -3.5, 120.0]))
-    estimate = PoseEstimate(
-        pose, np.eye(6) * 0.04, 0.8, TrackingState.TRACKING, RegistrationStatus.OK, True,
-        1_700_000_000_123_456_789, 7, CAMERA, {"register": 12.5},
-    )  # fmt: skip
-    recorder.estimate(estimate)
+    said = {"quality": 0.8, "sequence": 7, "camera": CAMERA, "stage_ms": {"register": 12.5}}
+    recorder.estimate(estimated(pose, 1_700_000_000_123_456_789, variance=0.04, **said))
     recorder.target(replace(CAR, velocity=np.array([1.0, 2.0, 0.0])))
     recorder.target(replace(CAR, pixel=None, visibility=Visibility.OUTSIDE))
     recorder.event("warning", 'a, "quoted" text\nof two lines')
@@ -79,10 +74,8 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
 def _estimates(count):
     for n in range(count):
         pose = Pose(so3_exp([2.0, 0.5, -0.3 * n]), np.array([1.25, -3.5 + n, 120.0]))
-        yield PoseEstimate(
-            pose, np.eye(6) * 0.04, 0.8, TrackingState.TRACKING, RegistrationStatus.OK, n != 1,
-            1_700_000_000_123_456_789 + n * 10**8, n, CAMERA, {},
-        )  # fmt: skip
+        time_ns = 1_700_000_000_123_456_789 + n * 10**8
+        yield estimated(pose, time_ns, variance=0.04, accepted=n != 1, sequence=n, camera=CAMERA)
 
 
 def test_the_accepted_estimates_are_a_trajectory_as_convert_makes_it(tmp_path):

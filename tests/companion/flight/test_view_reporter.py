@@ -13,12 +13,12 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler
 from localizer.map.cache.pick import BundleHits
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import PoseEstimate
 from mavlink_bridge.camera.messages import camera_fov_status
 from mavlink_bridge.config import CameraConfig
+from tests.companion.estimates import estimated
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
-CAMERA = Camera.from_fov(640, 480, 60)
 # OpenCV axes of a camera at the horizon that looks north, in ENU.
 NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -26,10 +26,7 @@ NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 def estimate(pitch_deg: float, *, accepted: bool = True, time_ns: int = 5) -> PoseEstimate:
     """100 m above the origin, looking north and `pitch_deg` above the horizon."""
     rotation = matrix_from_euler(math.radians(pitch_deg), 0.0, 0.0) @ NORTH
-    return PoseEstimate(
-        Pose(rotation, np.array([0.0, 0.0, 100.0])), np.eye(6), 1.0, TrackingState.TRACKING,
-        RegistrationStatus.OK, accepted, time_ns, 0, CAMERA,
-    )  # fmt: skip
+    return estimated(Pose(rotation, np.array([0.0, 0.0, 100.0])), time_ns, accepted=accepted)
 
 
 def flat(origin, directions):

@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 
 from companion.ground.vital_signs import VitalSigns
-from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import TrackingState
+from tests.companion.estimates import estimated
 
 SECOND = 10**9
-CAMERA = Camera(640, 480, 600.0, 600.0, 320.0, 240.0)
 
 
 def estimate(time_ns, *, accepted=True, state=TrackingState.TRACKING, sigma=0.3):
     covariance = np.diag([sigma**2, sigma**2, 1.0, 0.0, 0.0, 0.0])
-    pose = Pose(np.eye(3), np.zeros(3))
-    return PoseEstimate(
-        pose, covariance, 0.8, state, RegistrationStatus.OK, accepted, time_ns, 0, CAMERA
-    )
+    said = {"covariance": covariance, "quality": 0.8, "state": state, "accepted": accepted}
+    return estimated(time_ns=time_ns, **said)
 
 
 def test_what_a_good_flight_says():

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.integrity_monitor.checks import IntegrityChecks
+from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.config import IntegrityMonitorConfig
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import (
@@ -46,12 +47,33 @@ def leg(at_s: float) -> tuple[float, float]:
     return north + (1.25 * t * t if t < 4.0 else 20.0 + 10.0 * (t - 4.0)), east
 
 
+def swung(at_s: float) -> tuple[float, float]:
+    """To and fro by 12 m with 12 s: what shows a delay within half a minute."""
+    return 6.0 * np.sin(2 * np.pi * at_s / 12.0), 0.0
+
+
+def beside(path: Path, by: Path) -> Path:
+    """A path moved (north, east) by the time."""
+
+    def moved(at_s: float) -> tuple[float, float]:
+        (north, east), (more_north, more_east) = path(at_s), by(at_s)
+        return north + more_north, east + more_east
+
+    return moved
+
+
+def monitor(**limits: float) -> IntegrityChecks:
+    """With the shipped limits, but for those given."""
+    return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(**limits))
+
+
 @dataclass
 class Flight:
     """Flies `path` (seconds to north, east) level, and steps the monitor; a fix every 0.1 s.
 
     seen: the path that vision sees; GNSS: its offset (north, m), None without a receiver. moved:
-    when only the position was held, by_odometry; claims: the scale sigma of each of these.
+    when only the position was held, by_odometry; claims: the scale sigma of each of these. silent:
+    no fix comes between these seconds.
     """
 
     monitor: IntegrityChecks
@@ -72,6 +94,7 @@ class Flight:
     claims: list[float] = field(default_factory=list)
     seed: int = 1
     by_odometry: bool = False
+    silent: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
@@ -177,6 +200,8 @@ class Flight:
         )
 
     def _offer(self, fix: VisionFix) -> None:
+        if self.silent[0] <= self.at_s < self.silent[1]:
+            return
         admitted = self.monitor.admit(fix, self.state(), self.attitude_at(fix.time_ns))
         if admitted is not None and not admitted.position_withheld:
             self.passed.append(admitted)
@@ -185,6 +210,11 @@ class Flight:
         if admitted is not None:
             self.moved.append(self.at_s)
             self.claims.append(admitted.scale_sigma or 0.0)
+
+
+def taken(flight: Flight, since_s: float) -> float:
+    """When the first fix passed after a time."""
+    return next((f.time_ns * 1e-9 for f in flight.passed if f.time_ns >= second(since_s)), np.inf)
 
 
 def jumps(flight: Flight) -> list[float]:

@@ -11,8 +11,6 @@ import pytest
 
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from localizer.geometry.pose import matrix_from_quaternion, so3_exp
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import VehicleState, VisionFix
@@ -23,17 +21,15 @@ from tests.companion.integrity_monitor.simulated import (
     LONGITUDE,
     Flight,
     Path,
+    beside,
     hover,
     jumps,
     leg,
+    monitor,
     outside,
     second,
+    swung,
 )
-
-
-def monitor(**limits: float) -> IntegrityChecks:
-    """With the shipped limits."""
-    return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(**limits))
 
 
 def frozen(path: Path, since_s: float) -> Path:
@@ -103,18 +99,12 @@ def test_fog_is_no_frozen_video() -> None:
 
 
 def test_low_light_is_told_after_2_s_and_ends_after_5_s_and_holds_nothing() -> None:
+    """And a hover, a start and 10 m/s that are filmed in light tell nothing."""
     dark = Filmed(Flight(monitor(), leg, noise_m=0.03), leg, lambda s: 0.02 if 8 <= s < 14 else 1.0)
     flight = dark.fly(22.0)
     assert 10.0 <= flight.told(AlertId.LOW_CONTRAST) <= 10.4
     assert 19.0 <= flight.ended(AlertId.LOW_CONTRAST) <= 19.4
     assert {one.id for _, one in flight.lines} == {AlertId.LOW_CONTRAST}
-    assert flight.held == []
-
-
-def test_a_filmed_flight_is_left_alone() -> None:
-    """Hover, start, 10 m/s."""
-    flight = Filmed(Flight(monitor(), leg, noise_m=0.03), leg).fly(14.0)
-    assert flight.lines == []
     assert flight.held == []
 
 
@@ -132,11 +122,7 @@ def test_what_moves_again_is_believed_again_with_a_reset() -> None:
 
 def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
     """Held and told at once; what comes back in time is not."""
-
-    def relocalized(at_s: float) -> tuple[float, float]:
-        north, east = hover(at_s)
-        return north + (60.0 if 10.0 <= at_s < 13.0 else 0.0), east
-
+    relocalized = beside(hover, lambda at_s: (60.0 if 10.0 <= at_s < 13.0 else 0.0, 0.0))
     flight = Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(20.0)
     assert flight.told(AlertId.POSITION_JUMP) < 10.2
     assert min(flight.held) == pytest.approx(10.0)
@@ -146,11 +132,7 @@ def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
 
 def test_a_jump_within_the_alert_limit_passes_if_it_is_announced() -> None:
     """A relocalization after bridging; without a word it is held."""
-
-    def relocalized(at_s: float) -> tuple[float, float]:
-        north, east = hover(at_s)
-        return north + (8.0 if at_s >= 10.0 else 0.0), east
-
+    relocalized = beside(hover, lambda at_s: (8.0 if at_s >= 10.0 else 0.0, 0.0))
     assert Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(12.0).held == []
     assert Flight(monitor(), hover, relocalized).fly(12.0).held != []
 
@@ -190,11 +172,7 @@ def test_a_lag_that_ends_leaves_no_doubt() -> None:
 
 def test_a_step_aside_is_settled_where_the_place_is_found_anew() -> None:
     """2 m across the way: a second likely place beside the first, and who knows which is true."""
-
-    def aside(at_s: float) -> tuple[float, float]:
-        north, east = leg(at_s)
-        return north, east + (2.0 if at_s >= 12.0 else 0.0)
-
+    aside = beside(leg, lambda at_s: (0.0, 2.0 if at_s >= 12.0 else 0.0))
     flight = Flight(monitor(), leg, aside, noise_m=0.1, claimed_m=0.1, reset_at_s=20.0).fly(24.0)
     assert flight.told(AlertId.POSITION_STEP) <= 12.5
     assert 20.0 <= flight.ended(AlertId.POSITION_STEP) <= 20.2
@@ -238,8 +216,7 @@ def test_a_receiver_that_lags_is_left_alone_and_a_dragged_one_is_told_at_speed()
 
 def test_our_own_gps_input_is_no_gnss() -> None:
     """Agreement or not with what we fed ourselves is no evidence."""
-    own = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(gnss_is_ours=True))
-    assert Flight(own, gnss_north_m=lambda _: 20.0).fly(10.0).lines == []
+    assert Flight(monitor(gnss_is_ours=True), gnss_north_m=lambda _: 20.0).fly(10.0).lines == []
 
 
 class Twice(Flight):
@@ -275,6 +252,10 @@ def test_a_height_that_was_off_in_one_flight_is_watched_anew_in_the_next() -> No
     assert not [at_s for at_s in flight.held if 27.0 < at_s < 50.0]
 
 
+def climb(at_s: float) -> float:
+    return min(5.0 * max(at_s - 10.0, 0.0), 100.0)
+
+
 @dataclass
 class InAir(Flight):
     """Climbs at 5 m/s by 100 m; the barometer's altitude is of the standard atmosphere, which is
@@ -284,13 +265,8 @@ class InAir(Flight):
     celsius: float = 15.0
 
     def state(self) -> VehicleState:
-        climbed_m = self.height_m(self.at_s)
-        standard = climbed_m * 288.15 / (self.celsius + 273.15)
+        standard = climb(self.at_s) * 288.15 / (self.celsius + 273.15)
         return replace(super().state(), pressure_altitude_m=500.0 + standard)
-
-
-def climb(at_s: float) -> float:
-    return min(5.0 * max(at_s - 10.0, 0.0), 100.0)
 
 
 @pytest.mark.parametrize("celsius", [-25.0, 0.0, 45.0])
@@ -306,13 +282,7 @@ def test_a_climb_through_cold_or_hot_air_is_no_finding(celsius: float) -> None:
 @pytest.mark.parametrize("celsius", [-25.0, 45.0])
 def test_a_climb_that_vision_makes_half_is_withheld_in_any_air(celsius: float) -> None:
     """It saw 50 m of 100: another place's ground."""
-
-    class Halved(InAir):
-        def state(self) -> VehicleState:
-            standard = climb(self.at_s) * 288.15 / (self.celsius + 273.15)
-            return replace(super().state(), pressure_altitude_m=500.0 + standard)
-
-    flight = Halved(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
+    flight = InAir(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
     assert flight.told(AlertId.HEIGHT_MISMATCH) < 21.0
     assert max(flight.held) > 59.0
 
@@ -407,11 +377,6 @@ def test_a_camera_that_is_mounted_wrong_is_told_and_injection_does_not_begin(off
             watched.add_observation(looking(flight, 0.0))
         assert flight.ended(AlertId.BORESIGHT) < 27.0
         assert watched.inhibiting == set()
-
-
-def swung(at_s: float) -> tuple[float, float]:
-    """To and fro by 12 m with 12 s: what shows a delay within half a minute."""
-    return 6.0 * np.sin(2 * np.pi * at_s / 12.0), 0.0
 
 
 def test_a_frozen_picture_is_no_evidence_of_its_stamps() -> None:

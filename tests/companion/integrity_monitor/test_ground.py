@@ -9,12 +9,18 @@ import pytest
 
 from companion.calibration_watch.ground import GroundView
 from companion.calibration_watch.observation import CalibrationObservation
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig, ProtectionConfig
+from companion.integrity_monitor.config import ProtectionConfig
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import VehicleState, VisionFix
-from tests.companion.integrity_monitor.simulated import HEIGHT, LATITUDE, LONGITUDE, Flight, second
+from tests.companion.integrity_monitor.simulated import (
+    HEIGHT,
+    LATITUDE,
+    LONGITUDE,
+    Flight,
+    monitor,
+    second,
+)
 from tests.companion.integrity_monitor.test_checks import Filmed
 from tests.companion.integrity_monitor.test_tilt import Tilted, never, valley
 
@@ -93,8 +99,7 @@ def stands(at_s: float) -> tuple[float, float]:
 def test_a_video_that_freezes_below_take_off_is_told() -> None:
     """The check was off below 3 m above take-off: an aircraft on the ground stands still."""
     for relative_m, is_told in ((-40.0, True), (0.4, False)):
-        watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-        flight = Seen(watched, stands, stands, noise_m=0.02, relative_m=relative_m)
+        flight = Seen(monitor(), stands, stands, noise_m=0.02, relative_m=relative_m)
         told_s = Filmed(flight, stands).fly(12.0).told(AlertId.VIDEO_FROZEN)
         assert (told_s < 12.0) is is_told
 
@@ -108,7 +113,7 @@ def test_a_video_that_freezes_below_take_off_is_told() -> None:
     ],
 )
 def test_how_long_a_hover_may_look_still_goes_by_the_zoom(fov_deg, depth_m, within_s, not_before_s):
-    watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(horizontal_fov_deg=FOV_DEG))
+    watched = monitor(horizontal_fov_deg=FOV_DEG)
     view = sighting(0.0, depth_m, fov_deg)
     flight = Filmed(Seen(watched, stands, stands, noise_m=0.02, view=view), stands).fly(12.0)
     assert not_before_s <= flight.told(AlertId.VIDEO_FROZEN) <= within_s
@@ -116,10 +121,8 @@ def test_how_long_a_hover_may_look_still_goes_by_the_zoom(fov_deg, depth_m, with
 
 def test_a_tilt_over_a_valley_below_take_off_is_in_the_level() -> None:
     """4 degrees at 30 m above a valley, 50 m below take-off, had no share in the level."""
-    watched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    flight = Tilted(watched, noise_m=0.05, claimed_m=0.2, vision_deg=valley, above_m=-50.0)
-    unwatched = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    plain = Tilted(unwatched, noise_m=0.05, claimed_m=0.2, vision_deg=never, above_m=-50.0)
+    flight = Tilted(monitor(), noise_m=0.05, claimed_m=0.2, vision_deg=valley, above_m=-50.0)
+    plain = Tilted(monitor(), noise_m=0.05, claimed_m=0.2, vision_deg=never, above_m=-50.0)
     for tenth in range(1, 120):
         for one in (flight, plain):
             one.monitor.add_observation(sighting(0.1 * tenth, 30.0))

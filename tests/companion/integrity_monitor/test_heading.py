@@ -8,12 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import from_euler
-from tests.companion.integrity_monitor.simulated import Flight, hover, jumps, second
+from tests.companion.integrity_monitor.simulated import (
+    Flight,
+    Path,
+    beside,
+    hover,
+    jumps,
+    monitor,
+    taken,
+)
 
 Angle = Callable[[float], float]
 SIGMA_DEG = 0.1
@@ -24,22 +30,18 @@ def nothing(at_s: float) -> float:
     return 0.0
 
 
-def away(at_s: float) -> tuple[float, float]:
-    """A hover 120 m north of home."""
-    north, east = hover(at_s)
-    return north + 120.0, east
+away = beside(hover, lambda _: (120.0, 0.0))  # from home
 
 
 @dataclass
 class Headed(Flight):
     """A flight whose fixes have a heading, which is north; by the time, degrees: what vision's, the
-    gyros' and the autopilot's are off. silent: no fix comes between these seconds.
+    gyros' and the autopilot's are off.
     """
 
     vision_deg: Angle = nothing
     gyros_deg: Angle = nothing
     autopilot_deg: Angle = nothing
-    silent: tuple[float, float] = (0.0, 0.0)
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
         """As it is, and with its two headings."""
@@ -54,29 +56,13 @@ class Headed(Flight):
         q = from_euler(0.0, 0.0, float(yaw))
         return replace(fix, quaternion=q, attitude_sigma_rad=float(np.radians(SIGMA_DEG)))
 
-    def _offer(self, fix: VisionFix) -> None:
-        if not self.silent[0] <= self.at_s < self.silent[1]:
-            super()._offer(fix)
 
-
-def headed(seen: Callable[[float], tuple[float, float]], **options: object) -> Headed:
+def headed(seen: Path, **options: object) -> Headed:
     """With the shipped limits."""
-    return Headed(
-        IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits()),
-        away,
-        seen,
-        noise_m=0.1,
-        at_s=8.0,
-        **options,
-    )  # type: ignore[arg-type]
+    return Headed(monitor(), away, seen, noise_m=0.1, at_s=8.0, **options)  # type: ignore[arg-type]
 
 
-def taken(flight: Flight, since_s: float) -> float:
-    """When the first fix passed after a time."""
-    return next((f.time_ns * 1e-9 for f in flight.passed if f.time_ns >= second(since_s)), np.inf)
-
-
-def turns(degrees: float, until_s: float) -> tuple[Callable[[float], tuple[float, float]], Angle]:
+def turns(degrees: float, until_s: float) -> tuple[Path, Angle]:
     """What a frame shows that turns about home at 12 s, and by how much it is turned."""
 
     def angle(at_s: float) -> float:
@@ -119,11 +105,7 @@ def test_gyros_are_trusted_for_a_minute() -> None:
 )
 def test_a_place_found_after_a_loss_of_six_seconds_is_taken_after_its_time(options):
     """The wind took it 25 m aside, and the EKF does not know."""
-
-    def blown(at_s: float) -> tuple[float, float]:
-        north, east = away(at_s)
-        return north, east + (25.0 if at_s >= 18.0 else 0.0)
-
+    blown = beside(away, lambda at_s: (0.0, 25.0 if at_s >= 18.0 else 0.0))
     flight = headed(blown, silent=(12.0, 18.0), **options).fly(25.0)
     assert 23.0 <= taken(flight, 12.0) < 23.4
     assert jumps(flight) == [taken(flight, 12.0)]

@@ -8,29 +8,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.messages import VehicleState, VisionFix
-from tests.companion.integrity_monitor.simulated import Flight, Path, jumps, leg, second
+from mavlink_bridge.messages import VehicleState
+from tests.companion.integrity_monitor.simulated import (
+    Flight,
+    Path,
+    beside,
+    jumps,
+    leg,
+    monitor,
+    swung,
+    taken,
+)
 
 Velocity = tuple[float, float]
 
 
-def monitor() -> IntegrityChecks:
-    """With the shipped limits."""
-    return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-
-
 @dataclass
 class Reckoned(Flight):
-    """A flight whose EKF knows its velocity with an error (north, east, m/s), by the time.
-
-    silent: no fix comes between these seconds.
-    """
+    """A flight whose EKF knows its velocity with an error (north, east, m/s), by the time."""
 
     error: Callable[[float], Velocity] = lambda at_s: (0.0, 0.0)
-    silent: tuple[float, float] = (0.0, 0.0)
 
     def state(self) -> VehicleState:
         """As it is, but for the velocity."""
@@ -39,19 +37,10 @@ class Reckoned(Flight):
         off = self.error(self.at_s)
         return replace(state, local_velocity_ned=(north + off[0], east + off[1], down))
 
-    def _offer(self, fix: VisionFix) -> None:
-        if not self.silent[0] <= self.at_s < self.silent[1]:
-            super()._offer(fix)
-
 
 def cruise(at_s: float) -> tuple[float, float]:
     """10 m/s northwards."""
     return 10.0 * at_s, 0.0
-
-
-def swung(at_s: float) -> tuple[float, float]:
-    """To and fro by 12 m with 12 s."""
-    return 6.0 * np.sin(2 * np.pi * at_s / 12.0), 0.0
 
 
 def turned(path: Path, from_s: float, until_s: float, degrees: float = 5.0) -> Path:
@@ -80,11 +69,6 @@ def drifting(since_s: float) -> Callable[[float], Velocity]:
     return error
 
 
-def taken(flight: Flight, since_s: float) -> float:
-    """When the first fix passed after a time."""
-    return next((f.time_ns * 1e-9 for f in flight.passed if f.time_ns >= second(since_s)), np.inf)
-
-
 @pytest.mark.parametrize(("until_s", "seed"), [(16.0, 1), (16.0, 2), (19.5, 3)])
 def test_a_turned_frame_never_passes_by_waiting_and_the_right_one_passes_at_once(until_s, seed):
     """`frame-rotates` (ArduPilot) ended in LAND: what a held position may be off grew while it was
@@ -102,11 +86,7 @@ def test_a_turned_frame_never_passes_by_waiting_and_the_right_one_passes_at_once
 
 def test_a_right_place_is_taken_though_the_ekf_drifts() -> None:
     """What passed before was 8 m aside: after 5 s the right one is believed, and announced."""
-
-    def relocalized(at_s: float) -> tuple[float, float]:
-        north, east = cruise(at_s)
-        return north, east + (8.0 if at_s < 12.0 else 0.0)
-
+    relocalized = beside(cruise, lambda at_s: (0.0, 8.0 if at_s < 12.0 else 0.0))
     flight = Reckoned(monitor(), cruise, relocalized, error=drifting(12.0)).fly(20.0)
     assert 17.0 <= taken(flight, 12.0) < 17.3
     assert jumps(flight) == [taken(flight, 12.0)]
@@ -114,10 +94,7 @@ def test_a_right_place_is_taken_though_the_ekf_drifts() -> None:
 
 def test_a_right_place_is_taken_in_the_end_though_the_ekf_stands() -> None:
     """An EKF without positions may give up its velocity: it contradicts for 10 s, not for good."""
-
-    def relocalized(at_s: float) -> tuple[float, float]:
-        north, east = cruise(at_s)
-        return north, east + (20.0 if at_s < 12.0 else 0.0)
+    relocalized = beside(cruise, lambda at_s: (0.0, 20.0 if at_s < 12.0 else 0.0))
 
     def gives_up(at_s: float) -> Velocity:
         return (-10.0, 0.0) if at_s >= 14.0 else (0.0, 0.0)
@@ -132,11 +109,8 @@ def test_what_alternates_proves_nothing_and_the_right_one_passes_each_time() -> 
     def is_wrong(at_s: float) -> bool:
         return int(at_s) % 2 == 0
 
-    def alternates(at_s: float) -> tuple[float, float]:
-        north, east = cruise(at_s)
-        return north, east + (12.0 if at_s >= 12.0 and is_wrong(at_s) else 0.0)
-
-    flight = Reckoned(monitor(), cruise, alternates, noise_m=0.1, claimed_m=0.1).fly(24.0)
+    aside = beside(cruise, lambda at_s: (0.0, 12.0 if at_s >= 12.0 and is_wrong(at_s) else 0.0))
+    flight = Reckoned(monitor(), cruise, aside, noise_m=0.1, claimed_m=0.1).fly(24.0)
     wrong = {tenth / 10 for tenth in range(120, 240) if is_wrong(tenth / 10)}
     next_turn = {13.0, 15.0, 17.0, 19.0, 21.0, 23.0}
     assert {round(at_s, 1) for at_s in flight.held} == wrong | next_turn
@@ -182,11 +156,7 @@ def test_one_fix_far_off_is_no_step(path: Path) -> None:
     """`frame-rotates` (ArduPilot, vision only): "position stepped 2 m" at take-off in 3 of 5: two
     fixes of sigma 0.3 m, 1.9 m apart, once in 8000. What is a step lasts.
     """
-
-    def once(at_s: float) -> tuple[float, float]:
-        north, east = path(at_s)
-        return north, east + (1.2 if abs(at_s - 12.0) < 0.05 else 0.0)
-
+    once = beside(path, lambda at_s: (0.0, 1.2 if abs(at_s - 12.0) < 0.05 else 0.0))
     flight = Flight(monitor(), path, once, noise_m=0.05, claimed_m=0.1).fly(16.0)
     assert flight.lines == []
     assert flight.held == []

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
+from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
@@ -18,7 +18,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import CalibrationError
 from mavlink_bridge.injection.restart_memory import RestartMemory
 from mavlink_bridge.messages import VehicleState
-from tests.companion.integrity_monitor.simulated import Flight
+from tests.companion.integrity_monitor.simulated import Flight, monitor
 from tests.companion.integrity_monitor.test_checks import looking
 
 LONG = {AlertId.FOCAL_LENGTH: (5.0, CalibrationError.LONG)}
@@ -49,7 +49,7 @@ def integrity_monitor(
 ) -> tuple[IntegrityMonitor, list[AlertId]]:
     """Over a vehicle on the ground. What it forbids with each turn."""
     inhibited: list[AlertId] = []
-    flight = Flight(IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits()))
+    flight = Flight(monitor())
     bridge: Any = SimpleNamespace(
         injecting=injecting, state=VehicleState, inertial_since=lambda _: (),
         report_alert=lambda _: None, attitude_at=lambda _: None, gimbal_at=flight.gimbal_at,
@@ -98,21 +98,21 @@ def test_what_flies_is_not_taken_back_by_a_restart() -> None:
 
 def test_evidence_ends_what_was_kept() -> None:
     """The camera looks where it is said to: 4 degrees off was another, or wrong."""
-    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    monitor.restore({AlertId.BORESIGHT: (4.0, CalibrationError.YAW)})
-    flight = Flight(monitor, noise_m=0.05)
+    watched = monitor()
+    watched.restore({AlertId.BORESIGHT: (4.0, CalibrationError.YAW)})
+    flight = Flight(watched, noise_m=0.05)
     for quarter in range(1, 160):
         flight.fly(0.25 * quarter)
-        monitor.add_observation(looking(flight, 0.0))
+        watched.add_observation(looking(flight, 0.0))
     assert flight.ended(AlertId.BORESIGHT) < 40.0
-    assert not monitor.inhibiting
+    assert not watched.inhibiting
 
 
 def test_without_evidence_it_stands() -> None:
-    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    monitor.restore(LONG)
-    Flight(monitor, noise_m=0.05).fly(40.0)
-    assert monitor.inhibiting == {AlertId.FOCAL_LENGTH}
+    watched = monitor()
+    watched.restore(LONG)
+    Flight(watched, noise_m=0.05).fly(40.0)
+    assert watched.inhibiting == {AlertId.FOCAL_LENGTH}
 
 
 @pytest.mark.parametrize(

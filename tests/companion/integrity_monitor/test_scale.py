@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from mavlink_bridge.alerts.ids import AlertId
-from tests.companion.integrity_monitor.simulated import Flight, Path
+from tests.companion.integrity_monitor.simulated import Flight, Path, monitor
 
 BEGINS_S = 8.0
 CLAIM = 0.1
@@ -39,6 +37,7 @@ def flown(
     tilt_rad: float = 0.003,
     until_s: float = 40.0,
     within_s: float = 5.0,
+    alert_limit_m: float = 10.0,
 ) -> Flight:
     """With odometry from 8 s on, whose scale goes from 1 to `factor` within some seconds."""
     times = np.arange(0.0, 100.0, 0.02)
@@ -50,18 +49,18 @@ def flown(
     def seen(at_s: float) -> tuple[float, float]:
         return float(np.interp(at_s, times, lie[:, 0])), float(np.interp(at_s, times, lie[:, 1]))
 
-    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
-    flight = Flight(monitor, path, seen, noise_m=0.05, seed=seed, tilt_rad=tilt_rad)
+    limited = monitor(alert_limit_m=alert_limit_m)
+    flight = Flight(limited, path, seen, noise_m=0.05, seed=seed, tilt_rad=tilt_rad)
     flight.fly(BEGINS_S)
     flight.claimed_m, flight.by_odometry = 20.0, True
     return flight.fly(until_s)
 
 
-@pytest.mark.parametrize("factor", [1.3, 1.5, 0.7])
-def test_a_stop_or_a_turn_shows_the_wrong_scale(factor: float) -> None:
+@pytest.mark.parametrize(("factor", "limit_m"), [(1.3, 10), (1.5, 10), (0.7, 10), (1.3, 200)])
+def test_a_stop_or_a_turn_shows_the_wrong_scale(factor: float, limit_m: float) -> None:
     """Within the first two corners the claim is as wide as the error, or output is held."""
-    flight = flown(square(), factor)
-    widest = max(flight.claims)
+    flight = flown(square(), factor, alert_limit_m=limit_m)
+    widest = max([*flight.claims, *(fix.scale_sigma or 0.0 for fix in flight.passed)])
     held = flight.told(AlertId.VISION_IMU_MISMATCH) < 40.0
     assert held or widest == pytest.approx(abs(1.0 - 1.0 / factor), rel=0.3)
 

@@ -13,14 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.sources import SourceSettings, open_source
 from localizer.geometry.camera import Camera
 from localizer.types import Image
 from mavlink_bridge.alerts.ids import AlertId
 from sitl.camera.stream import VideoSender
-from tests.companion.integrity_monitor.simulated import Flight, leg, second
+from tests.companion.integrity_monitor.simulated import Flight, leg, monitor, second
 from tests.companion.sources.paced_sender import (
     CAMERA,
     Watch,
@@ -87,7 +85,7 @@ def test_a_stream_that_does_not_show_the_present_is_told(ground, wrong, told, wi
     with fresh noise and a fresh stamp, as behind an encoder that goes on.
     """
     rng = np.random.default_rng(4)
-    flight = Flight(IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits()), leg, noise_m=0.03)
+    flight = Flight(monitor(), leg, noise_m=0.03)
     with streamed() as through:
         for k in range(round(21.0 * HZ)):
             at_s = k / HZ

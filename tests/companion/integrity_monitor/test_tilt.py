@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.checks import IntegrityChecks, IntegrityLimits
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.tilt import TiltCheck
 from mavlink_bridge.alerts.catalogue import cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 from mavlink_bridge.quaternion import from_euler
-from tests.companion.integrity_monitor.simulated import Flight, leg, outside, second
+from tests.companion.integrity_monitor.simulated import Flight, leg, monitor, outside, second
 
 Angle = Callable[[float], float]
 LEVEL = Attitude(0, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0))
@@ -60,9 +59,8 @@ def low(vision_deg: Angle = never, gimbal_deg: float = 0.5, above_m: float = 30.
         north, east = leg(at_s)
         return north + above_m * np.tan(np.radians(vision_deg(at_s))), east
 
-    monitor = IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
     return Tilted(
-        monitor, leg, seen, noise_m=0.05, claimed_m=0.2, vision_deg=vision_deg,
+        monitor(), leg, seen, noise_m=0.05, claimed_m=0.2, vision_deg=vision_deg,
         gimbal_deg=gimbal_deg, above_m=above_m,
     )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,13 +17,9 @@ from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
-from tests.companion.integrity_monitor.simulated import Flight, hover, leg, second
+from tests.companion.integrity_monitor.simulated import Flight, Path, hover, leg, monitor, second
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (120, 160, 3)).astype(np.uint8)
-
-
-def monitor() -> IntegrityChecks:
-    return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits())
 
 
 class Answering(Flight):
@@ -59,28 +56,29 @@ def test_an_ekf_that_refuses_is_told_again_as_long_as_it_does() -> None:
     assert flight.held == []  # what it refuses does no harm; silence would
 
 
-@pytest.mark.parametrize("ratio", [float("nan"), float("inf"), None])
-def test_a_ratio_that_says_nothing_is_no_refusal(ratio: float | None) -> None:
-    known = None if ratio is None or np.isnan(ratio) else ratio
-    assert flown(hover, 6.0, ratio=lambda _: known).lines == []
-
-
-def test_a_refusal_of_a_second_is_none() -> None:
-    """A gust, a turn: the ratio passes 1 now and then."""
-    assert flown(hover, 12.0, ratio=lambda at_s: 1.5 if 5.0 <= at_s < 6.5 else 0.3).lines == []
+@pytest.mark.parametrize(
+    ("path", "answers"),
+    [
+        (hover, {"ratio": lambda _: None}),
+        (hover, {"ratio": lambda _: float("inf")}),
+        (hover, {"ratio": lambda at_s: 1.5 if 5.0 <= at_s < 6.5 else 0.3}),  # a gust, a turn
+        # Out of a hover with 2.5 m/s^2, and a metre of an EKF's own correction.
+        (leg, {"leap_m": lambda at_s: 1.0 if at_s >= 8.0 else 0.0}),
+    ],
+)
+def test_what_is_neither_a_refusal_nor_a_jump_is_not_told(path: Path, answers: Any) -> None:
+    assert flown(path, 12.0, **answers).lines == []
 
 
 def test_a_reset_of_the_ekf_is_unconfirmed_until_the_imu_has_agreed_for_a_while() -> None:
-    flight = flown(leg, 30.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
+    """Meanwhile nobody says that the EKF follows."""
+    flight = flown(leg, 14.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
+    assert flight.monitor.inhibiting == {AlertId.EKF_JUMP}
+    flight.fly(30.0)
     assert flight.lines[0][1].id is AlertId.EKF_JUMP
     assert list(flight.lines[0][1].values) == [pytest.approx(15.0, abs=0.5)]
     assert flight.lines[0][0] == pytest.approx(12.0, abs=0.15)
     assert 21.5 <= flight.ended(AlertId.EKF_JUMP) <= 24.0
-
-
-def test_while_it_is_unconfirmed_nobody_says_that_the_ekf_follows() -> None:
-    flight = flown(leg, 14.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
-    assert flight.monitor.inhibiting == {AlertId.EKF_JUMP}
 
 
 @dataclass
@@ -95,29 +93,19 @@ def departs(at_s: float) -> tuple[float, float]:
     return leg(at_s - 20.0) if at_s >= 20.0 else leg(0.0)
 
 
-def test_an_ekf_that_begins_on_the_ground_is_no_jump_when_it_is_armed() -> None:
+@pytest.mark.parametrize(("leaps_s", "until_s", "told"), [(8.0, 30.0, False), (20.5, 22.0, True)])
+def test_an_ekf_that_begins_before_arming_is_no_jump_and_one_that_leaps_after_it_is(
+    leaps_s: float, until_s: float, told: bool
+) -> None:
     """From its origin onto the first position 300 m away: told at the moment of arming, and "the
     EKF follows" was not said for the first ten seconds of flight.
     """
     flight = Waiting(monitor(), departs, noise_m=0.05)
-    flight.leap_m = lambda at_s: 300.0 if at_s >= 8.0 else 0.0
-    flight.fly(30.0)
-    assert flight.lines == []
-    assert not flight.monitor.inhibiting
-
-
-def test_an_ekf_that_jumps_right_after_arming_is_told() -> None:
-    flight = Waiting(monitor(), departs, noise_m=0.05)
-    flight.leap_m = lambda at_s: 300.0 if at_s >= 20.5 else 0.0
-    flight.fly(22.0)
-    ((_, alert),) = flight.lines
-    assert alert.id is AlertId.EKF_JUMP
-    assert list(alert.values) == [pytest.approx(300.0, abs=0.5)]
-
-
-def test_hard_flight_is_no_jump() -> None:
-    """Out of a hover with 2.5 m/s^2, and a metre of an EKF's own correction."""
-    assert flown(leg, 12.0, leap_m=lambda at_s: 1.0 if at_s >= 8.0 else 0.0).lines == []
+    flight.leap_m = lambda at_s: 300.0 if at_s >= leaps_s else 0.0
+    flight.fly(until_s)
+    jump = alert(AlertId.EKF_JUMP, metres=pytest.approx(300.0, abs=0.5))
+    assert [one for _, one in flight.lines] == ([jump] if told else [])
+    assert flight.monitor.inhibiting == ({AlertId.EKF_JUMP} if told else set())
 
 
 @pytest.mark.parametrize("stamp", [lambda _: 5.0, lambda at_s: 20.0 - at_s])
@@ -181,13 +169,18 @@ class Faulty:
         pass
 
 
-@pytest.fixture
-def faulty() -> tuple[IntegrityMonitor, Any]:
-    """A monitor whose clock goes on by its period at each turn, and its bridge."""
-    times = iter(range(second(10.0), second(100.0), second(0.1)))
+def watching(clock: Callable[[], int]) -> tuple[IntegrityMonitor, Any]:
+    """A monitor by this clock, and its bridge."""
     bridge: Any = Faulty(Flight(monitor()))
     config, limits = IntegrityMonitorConfig(), IntegrityLimits()
-    return IntegrityMonitor(config, limits, bridge, clock=lambda: next(times)), bridge
+    return IntegrityMonitor(config, limits, bridge, clock=clock), bridge
+
+
+@pytest.fixture
+def faulty() -> tuple[IntegrityMonitor, Any]:
+    """Its clock goes on by the monitor's period at each turn."""
+    times = iter(range(second(10.0), second(100.0), second(0.1)))
+    return watching(lambda: next(times))
 
 
 FIX = VisionFix(second(1.0), 47.0, 8.0, 500.0)
@@ -306,10 +299,7 @@ def clock() -> Hand:
 
 def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock: Hand) -> None:
     """Its last findings stood for ever: fixes passed, and neither health nor a text said a word."""
-    bridge: Any = Faulty(Flight(monitor()))
-    integrity_monitor = IntegrityMonitor(
-        IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
-    )
+    integrity_monitor, bridge = watching(clock)
     integrity_monitor.run_checks()
     clock.now_ns += second(1.9)  # a busy computer
     assert integrity_monitor.check(FIX) is not None
@@ -333,7 +323,7 @@ def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock:
 def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> None:
     """The localization thread waited for it for ever, and the health behind it."""
     stuck, on = threading.Event(), threading.Event()
-    bridge: Any = Faulty(Flight(monitor()))
+    integrity_monitor, bridge = watching(clock)
 
     def hangs(time_ns: int) -> tuple[InertialSample, ...]:
         stuck.set()
@@ -341,9 +331,6 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
         return ()
 
     bridge.inertial_since = hangs
-    integrity_monitor = IntegrityMonitor(
-        IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
-    )
     integrity_monitor.start()
     try:
         assert stuck.wait(30.0)
@@ -358,10 +345,7 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
 
 def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Hand) -> None:
     """Its last level went out with every heartbeat, for ever."""
-    bridge: Any = Faulty(Flight(monitor()))
-    integrity_monitor = IntegrityMonitor(
-        IntegrityMonitorConfig(), IntegrityLimits(), bridge, clock=clock
-    )
+    integrity_monitor, bridge = watching(clock)
     turned_ns = clock.now_ns
     integrity_monitor.watch(lambda: {"health": turned_ns})
     for _ in range(39):

@@ -31,13 +31,13 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, so3_exp
 from localizer.map.cache.cache import TileCache
-from localizer.types import PoseEstimate, RegistrationStatus, TargetFix, TrackingState
+from localizer.types import TargetFix
+from tests.companion.estimates import DOWN, estimated
 from tests.companion.targets import scene as flat
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 80.0, 60.0)
 SECOND = 10**9
 RATE = 10
-DOWN = np.diag([1.0, -1.0, -1.0])
 PLACE = Geodetic(47.4, 8.5, 500.0)
 SCENE = KlvContext(LocalFrame(PLACE), flat.cast, 47.0, "survey 7")
 
@@ -95,10 +95,7 @@ def fields_of(packet):
 
 def estimate(time_ns, east=0.0, accepted=True, tilt=0.0):
     pose = Pose(so3_exp([tilt, 0.0, 0.0]) @ DOWN, np.array([east, 0.0, 100.0]))
-    return PoseEstimate(
-        pose, np.eye(6) * 1e-4, 0.8, TrackingState.TRACKING, RegistrationStatus.OK, accepted,
-        time_ns, 0, CAMERA,
-    )  # fmt: skip
+    return estimated(pose, time_ns, quality=0.8, accepted=accepted, camera=CAMERA)
 
 
 def test_the_fields_of_a_picture_are_where_it_was_taken_and_what_it_shows():

@@ -21,17 +21,16 @@ from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_f
 from companion.live.publisher import Publisher
 from companion.live.shared import SharedMemoryReader
 from companion.live.shown import ConsoleData, Instruments
-from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.types import Frame, PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import Frame
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
+from tests.companion.estimates import CAMERA, estimated
 
-CAMERA = Camera.from_fov(640, 480, 60.0)
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 400.0))
 
 
@@ -104,10 +103,8 @@ class Console:
 
 
 def _estimate(number):
-    return PoseEstimate(
-        Pose(np.eye(3), np.array([1.0, 2.0, 3.0])), np.eye(6), 0.5, TrackingState.TRACKING,
-        RegistrationStatus.OK, True, number, number, CAMERA, {}, number,
-    )  # fmt: skip
+    pose = Pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    return estimated(pose, number, variance=1.0, quality=0.5, sequence=number, last_fix_ns=number)
 
 
 def _give(publisher, shown, number):

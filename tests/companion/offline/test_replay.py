@@ -34,6 +34,7 @@ from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
+from tests.companion.sources.paced_sender import free_port
 
 FRAMES_AT_LEAST = 6
 
@@ -88,12 +89,6 @@ class Autopilot(threading.Thread):
         self._codec.seq = (self._codec.seq + 1) % 256
 
 
-def _free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
-
-
 def at_the_engines_pace(submit):
     """`DualThreadEngine.submit` that holds the feed until every thread has done with the frame,
     however busy the machine is: a frame that is dropped, or registered to a reference of a second
@@ -125,7 +120,7 @@ def record(small_assets, tmp_path_factory):
     (sequence / "images" / "timestamps.txt").unlink()  # of another clock
     cache = TileCache.open(small_assets.map_cache)
     row = read_poses(sequence / "poses.txt")[0]
-    pose, port = world_from_camera(row, cache.frame), _free_port()
+    pose, port = world_from_camera(row, cache.frame), free_port()
     model = Camera.from_json(sequence / "camera.json").to_dict()
     config = parse_config(
         {

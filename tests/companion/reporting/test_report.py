@@ -1,6 +1,5 @@
 """One HTML file about a flight: what it says, and that it needs nothing else."""
 
-import csv
 import json
 import os
 import re
@@ -28,16 +27,10 @@ from companion.reporting.record import record_report, worst_frames
 from companion.reporting.report import report_of, write_page
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.alerts.ids import AlertId
+from tests.companion.console.record_of import write_rows
 
 MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
 START_NS = 1_000_000_000
-
-
-def _rows(path, columns, rows):
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="0")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _estimate(i, state="tracking", accepted=1, **more):
@@ -61,11 +54,11 @@ def record(small_assets, tmp_path):
         "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg,
         "height_m": origin.height_m,
     }  # fmt: skip
-    _rows(folder / "estimates.csv", ESTIMATE_COLUMNS, rows)
+    write_rows(folder / "estimates.csv", ESTIMATE_COLUMNS, rows)
     targets = [
         {"exposure_time_ns": START_NS, "target_id": n, "sigma_horizontal_m": 1} for n in "AB"
     ]
-    _rows(folder / "targets.csv", TARGET_COLUMNS, targets)
+    write_rows(folder / "targets.csv", TARGET_COLUMNS, targets)
     events = [
         {
             "time_ns": START_NS,
@@ -75,7 +68,7 @@ def record(small_assets, tmp_path):
         },
         {"time_ns": START_NS + 2_500_000_000, "level": "warning", "text": "<script>alert(1)"},
     ]
-    _rows(folder / "events.csv", EVENT_COLUMNS, events)
+    write_rows(folder / "events.csv", EVENT_COLUMNS, events)
     for i in range(25):
         picture = np.full((48, 64, 3), 10 * i, np.uint8)
         name = f"{START_NS + i * 100_000_000}.jpg"
@@ -196,7 +189,7 @@ def test_a_record_keeps_no_reader_waiting(record):
 
 
 def test_a_flight_that_localized_nothing_has_a_report(record):
-    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, [])
+    write_rows(record / "estimates.csv", ESTIMATE_COLUMNS, [])
     assert "never localized" in render(record_report(record))
 
 
@@ -263,9 +256,9 @@ def test_numbers_that_are_none_cost_their_own_figure(record, value):
         _estimate(i, latency_ms=value, quality=value, qw=value, sigma_east_m=value)
         for i in range(9)
     ]
-    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, rows)
+    write_rows(record / "estimates.csv", ESTIMATE_COLUMNS, rows)
     target = {"exposure_time_ns": START_NS, "target_id": "A", "east_m": value}
-    _rows(record / "targets.csv", TARGET_COLUMNS, [target])
+    write_rows(record / "targets.csv", TARGET_COLUMNS, [target])
     (record / "snapshots" / "\N{SUPERSCRIPT TWO}.jpg").write_bytes(b"")
     (record / "snapshots" / f"{'9' * 40}.jpg").write_bytes(b"")
     assert "nan ms" in render(report_of(record))
@@ -281,10 +274,12 @@ def test_nothing_of_a_record_becomes_markup(record):
         json.dumps({"level": "ended", "text": HOSTILE + "\ud800", "shadow": HOSTILE})
     )
     target = {"exposure_time_ns": START_NS, "target_id": HOSTILE}
-    _rows(record / "targets.csv", TARGET_COLUMNS, [target])
+    write_rows(record / "targets.csv", TARGET_COLUMNS, [target])
     event = {"time_ns": START_NS, "level": HOSTILE, "text": HOSTILE}
-    _rows(record / "events.csv", EVENT_COLUMNS, [event])
-    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, [_estimate(0, HOSTILE, 1, status=HOSTILE)])
+    write_rows(record / "events.csv", EVENT_COLUMNS, [event])
+    write_rows(
+        record / "estimates.csv", ESTIMATE_COLUMNS, [_estimate(0, HOSTILE, 1, status=HOSTILE)]
+    )
     record = record.rename(record.with_name("<img src=x onerror=alert(1)>"))
     page = write_page(record).read_text(encoding="utf-8")
     assert "<img src=x" not in page

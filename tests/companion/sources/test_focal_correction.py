@@ -23,12 +23,11 @@ from localizer.types import (
     Frame,
     PoseEstimate,
     PosePrior,
-    RegistrationStatus,
-    TrackingState,
 )
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.assets import FlightAssets
+from tests.companion.estimates import estimated
 
 CAMERA = Camera(320, 240, 251.0, 251.0, 160.0, 120.0)
 PERIOD_NS, COUNT = 250_000_000, 9
@@ -77,10 +76,7 @@ def test_on_rendered_pictures_it_finds_the_lens(small_assets: FlightAssets) -> N
 
 
 def estimate(time_ns: int, factor: float, sigma: float = 0.003) -> PoseEstimate:
-    return PoseEstimate(
-        Pose.identity(), np.eye(6), 0.8, TrackingState.TRACKING, RegistrationStatus.OK, True,
-        time_ns, 0, CAMERA, focal=FocalFit(factor, sigma),
-    )  # fmt: skip
+    return estimated(time_ns=time_ns, quality=0.8, camera=CAMERA, focal=FocalFit(factor, sigma))
 
 
 class Lens:

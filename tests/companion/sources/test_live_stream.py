@@ -132,39 +132,30 @@ def test_a_stream_of_another_shape_is_an_error_that_names_both(url: str) -> None
     assert watch.states[-2:] == [StreamState.FAILED, StreamState.CLOSED]
 
 
-def test_a_stream_that_changes_its_size_in_flight_goes_on_with_the_scaled_camera(url: str) -> None:
-    half = CAMERA.resized(160, 120)
+def test_a_stream_that_changes_in_flight_is_scaled_or_reported_until_it_fits(url: str) -> None:
+    """Half the size goes on with the scaled camera; another shape gives no frame."""
+    half, wide = CAMERA.resized(160, 120), Camera.from_fov(320, 180, 70.0)
     with Watch(url, stall_timeout_s=0.4, retry_max_s=0.5) as watch:
         with PacedSender(url):
             watch.wait_for(5)
+        assert watch.frames[0][0].camera == CAMERA
         with PacedSender(url, camera=half):
             watch.wait_until(lambda: watch.states[-1] is StreamState.SCALED)
             watch.wait_until(lambda: watch.frames[-1][0].camera == half)
-    frame, _ = watch.frames[-1]
-    assert frame.image.shape == (120, 160, 3)
-    assert watch.frames[0][0].camera == CAMERA
-    text = watch.text(StreamState.SCALED)
-    assert "160x120" in text
-    assert "320x240" in text
-    assert watch.error is None
-
-
-def test_a_stream_that_changes_its_shape_in_flight_is_reported_until_it_fits(url: str) -> None:
-    wide = Camera.from_fov(320, 180, 70.0)
-    with Watch(url, stall_timeout_s=0.4, retry_max_s=0.5) as watch:
-        with PacedSender(url):
-            watch.wait_for(5)
+        assert watch.frames[-1][0].image.shape == (120, 160, 3)
         with PacedSender(url, camera=wide):
             watch.wait_until(lambda: watch.states[-1] is StreamState.MISFIT)
-            text = watch.text(StreamState.MISFIT)
-            assert "320x180" in text
+        for state, size in ((StreamState.SCALED, "160x120"), (StreamState.MISFIT, "320x180")):
+            text = watch.text(state)
+            assert size in text
             assert "320x240" in text
+        fitting = len(watch.frames)
         with PacedSender(url, first=500):
             watch.wait_until(lambda: watch.states[-1] is StreamState.LIVE)
-            before = len(watch.frames)
-            watch.wait_for(before + 3)
+            watch.wait_for(len(watch.frames) + 3)
     assert watch.error is None
-    assert all(f.image.shape == (240, 320, 3) for f, _ in watch.frames)
+    assert all(f.image.shape == (240, 320, 3) for f, _ in watch.frames[fitting:])
+    assert {f.camera for f, _ in watch.frames} == {CAMERA, half}
     assert watch.source.counters.misfits > 0
 
 

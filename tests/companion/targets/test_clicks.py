@@ -9,12 +9,11 @@ import pytest
 from companion.config import TargetConfig
 from companion.targets.clicks import ClickPolicy
 from companion.targets.reporter import TargetReporter
-from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import TrackingState
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import TrackRequest
+from tests.companion.estimates import estimated
 
 
 class Ground:
@@ -37,9 +36,7 @@ class Ground:
         self.reporter.stop()
 
     def sees(self, time_ns, state=TrackingState.TRACKING):
-        estimate = PoseEstimate(
-            NADIR, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, True, time_ns, 0, CAMERA
-        )
+        estimate = estimated(time_ns=time_ns, state=state)
         self.clicks.add_estimate(estimate)
         self.reporter.add_estimate(estimate)
 
@@ -51,8 +48,6 @@ class Ground:
         return sleep_until(lambda: len({t.fix.target_id for t in self.targets}) >= count, 30.0)
 
 
-CAMERA = Camera.from_fov(640, 480, 60)
-NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
 MS = 1_000_000
 
 

@@ -10,7 +10,6 @@ import pytest
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
 from companion.targets.target_manager import Click, TargetEstimate, TargetManager
-from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits
 from localizer.targets.limits import (
@@ -22,16 +21,13 @@ from localizer.targets.limits import (
 )
 from localizer.targets.track import TargetSettings, TargetTrack, pixel_of
 from localizer.types import (
-    PoseEstimate,
-    RegistrationStatus,
     TargetFix,
     TargetSurface,
-    TrackingState,
 )
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.ids import AlertId
+from tests.companion.estimates import DOWN, estimated
 
-CAMERA = Camera.from_fov(640, 480, 60)
 SIGMA = np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) ** 2
 SECOND = 10**9
 FRAMES = 60  # at 10 Hz
@@ -41,11 +37,8 @@ CONFIRMING = 5  # frames of half a second
 
 def estimate_at(k):
     """Flies east at 10 m/s and 100 m, looks north and down by 38 degrees."""
-    pose = Pose(so3_exp([0.9, 0.0, 0.0]) @ np.diag([1.0, -1.0, -1.0]), np.array([k, -100.0, 100.0]))
-    return PoseEstimate(
-        pose, SIGMA, 1.0, TrackingState.TRACKING, RegistrationStatus.OK, True,
-        SECOND + k * SECOND // 10, 0, CAMERA,
-    )  # fmt: skip
+    pose = Pose(so3_exp([0.9, 0.0, 0.0]) @ DOWN, np.array([k, -100.0, 100.0]))
+    return estimated(pose, SECOND + k * SECOND // 10, covariance=SIGMA)
 
 
 class Ground:

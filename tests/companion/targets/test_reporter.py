@@ -8,25 +8,19 @@ from companion.targets.detections import Detection
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
 from localizer.errors import MapCacheError
-from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits
-from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from localizer.types import PoseEstimate
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
+from tests.companion.estimates import estimated
 
-CAMERA = Camera.from_fov(640, 480, 60)
-NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
 MS = 1_000_000
 
 
 def _estimate(time_ns: int, accepted: bool = True) -> PoseEstimate:
-    return PoseEstimate(
-        NADIR, np.eye(6) * 1e-4, 1.0, TrackingState.TRACKING, RegistrationStatus.OK, accepted,
-        time_ns, 0, CAMERA,
-    )  # fmt: skip
+    return estimated(time_ns=time_ns, accepted=accepted)
 
 
 def _ground(origin, directions):

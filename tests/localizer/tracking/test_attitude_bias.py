@@ -151,6 +151,9 @@ def test_ground_that_tells_nothing_is_looked_at_once_too():
     assert failed.is_due(place, 15.0)
     failed.skip_ground(place, STEP_NS)
     assert not failed.is_due(place, 15.0)
+    unreported = AttitudeBiasEstimator(CONFIG, lambda _: None)
+    unreported.learn(unsure)
+    assert not unreported.is_due(place, 15.0)
 
 
 def test_on_its_side_or_unreported_there_is_none():

@@ -491,15 +491,22 @@ def deltas(
     yaw: float = 0.0,
     late: int = 40 * MS,
     scale_sigma: float | None = 0.1,
+    sigma_m: float | None = None,
     **where: Any,
 ) -> list[tuple[int, Any]]:
-    """What is sent instead of positions that are withheld, on the way north."""
+    """What is sent instead of positions that are withheld, on the way north. sigma_m: they are not
+    withheld, and have this sigma.
+    """
     it, sent = injector(rate_hz=10, delay_ms=100), []
     period, vehicle = int(SECOND / fix_hz), context(**{"yaw": yaw, **where})
     for t in range(SECOND, 4 * SECOND, MS):
         if (t - late) % period == 0:
             north = speed * (t - late) / SECOND
-            how = {"position_withheld": True, "scale_sigma": scale_sigma}
+            how: dict[str, Any] = {
+                "position_withheld": sigma_m is None,
+                "scale_sigma": scale_sigma,
+                "position_covariance_ned": np.eye(3) * (sigma_m or 1.0) ** 2,
+            }
             it.submit(fix(t - late, north, yaw_rad=yaw, **how), t)
         assert it.step(t, vehicle) is None
         if (delta := it.motion.take_message()) is not None:
@@ -519,6 +526,14 @@ def test_of_a_withheld_position_only_its_change_is_sent_in_body_axes() -> None:
         assert delta.angle_delta == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
         # 2 m/s at confidence 0 and 0.1 m/s at 100: the tenth of 10 m/s, and the noise of 0.3 m/s
         assert delta.confidence == pytest.approx(100 * (2.0 - math.hypot(0.3, 1.0)) / 1.9, abs=0.5)
+
+
+def test_of_odometry_over_the_largest_sigma_the_change_is_sent() -> None:
+    """With an alert limit of 80 m the EKF was without input after 10 m of sigma: failsafe in 8 s,
+    no speed at the next position, and 16 deg of heading lost.
+    """
+    assert len(deltas(speed=10.0, sigma_m=11.0)) >= 28
+    assert deltas(speed=10.0, sigma_m=11.0, scale_sigma=None) == []  # not of odometry
 
 
 def test_no_change_of_position_is_sent_that_the_autopilot_would_believe_too_much() -> None:

@@ -159,10 +159,16 @@ def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
 
 
 def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(monkeypatch):
-    """The EKF would be left to positions that never reach it, and land."""
+    """The EKF would be left to positions that never reach it. Half a second is no news."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.run(20.0)
-    assert flight.end.sender.is_good(flight.now_ns)
+    for _ in range(5):
+        flight.link.full = True
+        flight.run(0.5)
+        assert flight.end.sender.is_good(flight.now_ns)
+        flight.link.full = False
+        flight.run(2.0)
+    assert told(flight, AlertId.LINK_FULL) == []
     assert flight.end.sender.reaches_ekf(flight.now_ns)
     flight.link.full = True
     flight.run(3.0)
@@ -179,18 +185,6 @@ def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(monkeypatch):
     assert flight.end.injection_fault is None
 
 
-def test_a_port_that_is_full_for_half_a_second_is_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = on_gnss(monkeypatch, switch=SWITCH)
-    flight.run(20.0)
-    for _ in range(5):
-        flight.link.full = True
-        flight.run(0.5)
-        assert flight.end.sender.is_good(flight.now_ns)
-        flight.link.full = False
-        flight.run(2.0)
-    assert told(flight, AlertId.LINK_FULL) == []
-
-
 def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.run(20.0)
@@ -198,15 +192,6 @@ def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.Mon
     flight.run(4.0)
     assert set(orders(flight)) == {2.0}
     assert told(flight, *SOURCES, AlertId.SOURCE_SET_HELD) == [AlertId.SOURCE_SET_SELECTED]
-
-
-def test_without_gnss_it_begins_and_says_that_nothing_was_compared(monkeypatch):
-    flight = on_gnss(monkeypatch)
-    flight.gnss_north_m = None
-    begun_ns = flight.now_ns
-    flight.run(15.0)
-    assert flight.vision()[0][0] - begun_ns < 5 * SECOND  # a restart under denial
-    assert told(flight, *SHADOW) == [AlertId.INJECTION_UNCHECKED]
 
 
 def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(monkeypatch):
@@ -331,25 +316,14 @@ def test_what_the_pilot_chooses_is_followed_and_not_undone(monkeypatch, echo):
     assert orders(flight)[begun:]
 
 
-def test_the_echo_of_our_own_order_is_nobodys_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True)
-    flight = on_gnss(monkeypatch, switch=switch)
-    flight.run(20.0)
-    flight.gnss_north_m = None
-    flight.run(4.0)
-    accept(flight, echo=True)
-    chosen(flight, 2)  # heard twice, the second time after the acknowledgement
-    flight.gnss_north_m = 0.0
-    flight.run(8.0)
-    assert orders(flight)[-1] == 1.0
-
-
 def test_a_receiver_that_returns_wrong_is_refused_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the echo of our own order is nobody's choice: it goes back once the receiver is right."""
     flight = on_gnss(monkeypatch, switch=SourceSwitchConfig(enabled=True, return_to_gnss=True))
     flight.run(20.0)
     flight.gnss_north_m = None
     flight.run(4.0)
     accept(flight, echo=True)
+    chosen(flight, 2)  # heard twice, the second time after the acknowledgement
     flight.gnss_north_m = 300.0
     flight.run(15.0)
     assert set(orders(flight)) == {2.0}
@@ -395,8 +369,8 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(monkeypatch
 
 def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
     enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
-    flight = Flight(monkeypatch, enable, mode="rc")
-    flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
+    flight = on_gnss(monkeypatch, enable=enable, mode="rc")
+    flight.north_m = 20.0
     flight.run(15.0)
     assert flight.vision() == []
     assert enable.command(31010, 1.0) == 0
@@ -411,8 +385,8 @@ def test_what_gps_input_told_the_receiver_is_no_word_for_vision(monkeypatch):
     """
     enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
     injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input")
-    flight = Flight(monkeypatch, enable, mode="rc", injection=injection, switch=SWITCH)
-    flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
+    flight = on_gnss(monkeypatch, enable=enable, mode="rc", injection=injection, switch=SWITCH)
+    flight.north_m = 20.0
     flight.run(10.0)
     enable.command(31010, 1.0)
     flight.run(1.0)
@@ -456,29 +430,29 @@ class Compared:
         return self._interlock.may_switch(now_ns)
 
 
-def test_a_go_that_comparisons_have_outlived_by_half_a_minute_is_none() -> None:
-    """A receiver that is jammed slowly spoils the score's end, and no more than its end."""
+@pytest.mark.parametrize(("gnss", "counts_until_s"), [(True, 130), (False, 700)])
+def test_a_go_is_forgotten(gnss: bool, counts_until_s: int) -> None:
+    """After half a minute of comparisons that are none, and ten minutes without GNSS: a receiver
+    that is jammed slowly spoils the score's end, and no more than its end.
+    """
     compared = Compared()
     assert compared.may_switch(100, go=True)
-    assert compared.may_switch(129, go=False)
-    assert not compared.may_switch(131, go=False)
-
-
-def test_a_go_is_forgotten_after_ten_minutes_without_gnss() -> None:
-    compared = Compared()
-    assert compared.may_switch(100, go=True)
-    assert compared.may_switch(699, go=False, gnss=False)
-    assert not compared.may_switch(701, go=False, gnss=False)
+    assert compared.may_switch(counts_until_s - 1, go=False, gnss=gnss)
+    assert not compared.may_switch(counts_until_s + 1, go=False, gnss=gnss)
 
 
 @pytest.mark.parametrize(("gnss", "text"), [(None, ["injecting"]), (0.0, [])])
-def test_arming_without_gnss_tells_whether_positions_flow(monkeypatch, gnss, text):
+def test_without_gnss_it_begins_and_says_that_nothing_was_compared(monkeypatch, gnss, text):
+    """A restart under denial. When it is armed it is told whether positions flow."""
     flight = on_gnss(monkeypatch)
-    flight.gnss_north_m = gnss
+    flight.gnss_north_m, begun_ns = gnss, flight.now_ns
     flight.run(10.0)
     flight.armed = True
     flight.run(5.0)
     assert [a.values[0] for a in flight.told(AlertId.ARMED_WITHOUT_GNSS)] == text
+    assert told(flight, *SHADOW) == ([AlertId.INJECTION_UNCHECKED] if gnss is None else [])
+    if gnss is None:
+        assert flight.vision()[0][0] - begun_ns < 5 * SECOND
 
 
 @pytest.mark.parametrize("gnss", [0.0, None])

@@ -398,7 +398,7 @@ def test_gnss_beside_the_auxiliary_position_is_not_told() -> None:
     assert "EKF2_GPS_CTRL" not in {f.name for f in findings}
 
 
-def test_px4_is_asked_for_its_own_failsafes(autopilot, monkeypatch):
+def test_px4_is_asked_for_its_own_failsafes_and_has_no_source_sets(autopilot, monkeypatch):
     link = DoctorFinding("connection", "px4", "a heartbeat", "", True, True)
     known = ([link], VehicleState(autopilot="px4"))
     monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
@@ -411,19 +411,9 @@ def test_px4_is_asked_for_its_own_failsafes(autopilot, monkeypatch):
     assert found["when vision ends"].startswith("LAND")
     assert "FS_EKF_ACTION" not in found
     assert "source switch" not in found
-
-
-def test_px4_has_no_source_sets_to_switch(autopilot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    link = DoctorFinding("connection", "px4", "a heartbeat", "", True, True)
-    known = ([link], VehicleState(autopilot="px4"))
-    monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
-    autopilot.autopilot, autopilot.parameters = mavlink.MAV_AUTOPILOT_PX4, {"EKF2_EV_CTRL": 1.0}
-    switched = config(autopilot.port).model_copy(
-        update={"switch": SourceSwitchConfig(enabled=True)}
-    )
+    switched = settings.model_copy(update={"switch": SourceSwitchConfig(enabled=True)})
     (finding,) = (f for f in examine(switched).findings if f.name == "source switch")
-    assert not finding.ok
-    assert finding.required
+    assert (finding.ok, finding.required) == (False, True)
 
 
 @pytest.mark.parametrize("message", ["global_position_sensor", "external_position_estimate"])

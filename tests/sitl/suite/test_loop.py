@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Output
+from sitl.__main__ import app
 from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
 from sitl.suite.checks import AlertExpectation
@@ -210,6 +212,34 @@ def test_a_resumed_run_flies_what_is_missing_and_what_was_not_flown(
     kept = {(row.name, row.seed, row.error) for row in read_rows(tmp_path / "loop.json")}
     assert kept == {(case.name, seed, "") for case in cases for seed in (1, 2)}
     assert len(run((1,), resume=False)) == 2
+
+
+def test_the_exit_code_is_that_of_the_flights_asked_for_whether_flown_now_or_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[int] = []
+
+    def fly(_case: LoopCase, _assets: Any, _kind: str, seed: int, out: Path) -> LoopRecord:
+        flown.append(seed)
+        out.mkdir(parents=True)
+        if seed == 3:
+            raise SimulationError("no arducopter")
+        return record(flight([0.5 if seed == 1 else 50.0] * 40))
+
+    monkeypatch.setattr(runner, "fly", fly)
+    monkeypatch.setattr(runner, "loop_assets", lambda *_: None)
+
+    def code(seeds: str, *options: str) -> int:
+        flown.clear()
+        command = ["loop", "--only", "frozen-hover", "--seeds", seeds, "--out", str(tmp_path)]
+        return CliRunner().invoke(app, [*command, *options]).exit_code
+
+    assert (code("1..2"), flown) == (1, [1, 2])
+    assert (code("1..2", "--resume"), flown) == (1, [])
+    assert (code("2", "--resume"), flown) == (1, [])
+    assert (code("1", "--resume"), flown) == (0, [])
+    assert (code("3", "--resume"), flown) == (1, [3])
+    assert (code("1", "--resume"), flown) == (0, [])
 
 
 def test_alerts_are_judged_by_their_time_and_listed() -> None:

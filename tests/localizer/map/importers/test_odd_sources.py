@@ -71,7 +71,7 @@ def dsm_of(folder, data=None, **options):
 
 def rasters(folder, data=None, ortho=None, **options):
     """A DSM as told, and an honest orthophoto."""
-    ortho = ortho or {}
+    ortho = dict(ortho or {})
     colours = ortho.pop("data", picture())
     return [dsm_of(folder, data, **options), write(folder / "ortho.tif", colours, **ortho)]
 
@@ -85,46 +85,7 @@ def with_hole(value, dtype=np.float32):
 # --- rasters ------------------------------------------------------------------------------------
 
 
-def all_nan(folder):
-    return rasters(folder, np.full((CELLS, CELLS), np.nan, np.float32))
-
-
-def beside(folder):
-    return rasters(folder, ortho={"place": (LEFT + 5000, TOP)})
-
-
-def a_strip_in_common(folder):
-    return rasters(folder, ortho={"place": (LEFT + 47, TOP)})
-
-
-def in_feet_untold(folder):
-    place = (985_000.0, 210_000.0)  # New York, US survey feet
-    return rasters(folder, crs="EPSG:2263", place=place, ortho={"crs": "EPSG:2263", "place": place})
-
-
-def unit_against_crs(folder):
-    return rasters(folder, crs=f"{UTM}+5773", units=["ft"])
-
-
-def depths(folder):
-    return rasters(folder, crs=f"{UTM}+5715")
-
-
-def untagged_minus_9999(folder):
-    return rasters(folder, with_hole(-9999))
-
-
-def untagged_zero(folder):
-    return rasters(folder, with_hole(0))
-
-
-def noise(folder):
-    return rasters(
-        folder, (400 + 200 * np.random.default_rng(1).random((CELLS, CELLS))).astype("f4")
-    )
-
-
-def sparse(folder):
+def sparse(folder, make):
     side = 400_000
     path = folder / "dsm.tif"
     with rasterio.open(
@@ -136,65 +97,14 @@ def sparse(folder):
     return [path, write(folder / "ortho.tif", picture())]
 
 
-def no_place(folder):
-    return rasters(folder, transform=Affine.identity())
-
-
-def singular(folder):
-    return rasters(folder, transform=Affine(1, 0, LEFT, 1, 0, TOP))
-
-
-def no_crs(folder):
-    return rasters(folder, crs=None)
-
-
-def degrees_swapped(folder):
-    """Latitude where longitude belongs: rows beyond the pole."""
-    there = {"crs": "EPSG:4326", "step": 1e-5, "place": (47.2, 189.0)}
-    return rasters(folder, ortho=dict(there), **there)
-
-
-def across_the_date_line(folder):
-    there = {"crs": "EPSG:4326", "step": 1e-5, "place": (180.0 - 24e-5, 10.0)}
-    return rasters(folder, ortho=dict(there), **there)
-
-
-def site_grid(folder):
-    crs = 'LOCAL_CS["site grid",UNIT["metre",1]]'
-    return rasters(folder, crs=crs, ortho={"crs": crs})
-
-
-def on_the_moon(folder):
-    crs = (
-        'GEOGCS["Moon",DATUM["D_Moon",SPHEROID["Moon",1737400,0]],PRIMEM["m",0],'
-        'UNIT["degree",0.0174532925199433]]'
-    )
-    there = {"crs": crs, "step": 1e-5, "place": (9.0, 47.2)}
-    return rasters(folder, ortho=dict(there), **there)
-
-
-def upside_down(folder):
-    """A band whose scale makes depths of heights."""
-    return rasters(folder, scales=(-1.0,))
-
-
-def complex_numbers(folder):
-    return rasters(folder, ground().astype(np.complex64))
-
-
-def cut_in_half(folder):
+def cut_in_half(folder, make):
     paths = rasters(folder)
     data = paths[0].read_bytes()
     paths[0].write_bytes(data[: len(data) // 2])
     return paths
 
 
-def metres_swapped(folder):
-    there = {"place": (TOP, LEFT)}
-    return rasters(folder, ortho=dict(there), **there)
-
-
-def palette(folder):
+def palette(folder, make):
     one = picture()[:1]
     paths = rasters(folder, ortho={"data": one, "photometric": "palette"})
     with rasterio.open(paths[1], "r+") as data:
@@ -202,19 +112,19 @@ def palette(folder):
     return paths
 
 
-def text_named_tif(folder):
+def text_named_tif(folder, make):
     paths = rasters(folder)
     paths[0].write_text("these are the heights")
     return paths
 
 
-def a_vrt(folder):
+def a_vrt(folder, make):
     paths = rasters(folder)
     paths[0].write_text('<VRTDataset rasterXSize="4" rasterYSize="4"></VRTDataset>')
     return paths
 
 
-def statistics_elsewhere(folder):
+def statistics_elsewhere(folder, make):
     paths = rasters(folder)
     mdi = '<MDI key="OVERVIEW_FILE">http://127.0.0.1/x.tif</MDI>'
     Path(f"{paths[0]}.aux.xml").write_text(
@@ -223,15 +133,11 @@ def statistics_elsewhere(folder):
     return paths
 
 
-def pipe(folder):
+def pipe(folder, make):
     paths = rasters(folder)
     paths[1].unlink()
     os.mkfifo(paths[1])
     return paths
-
-
-def device(folder):
-    return [rasters(folder)[0], Path("/dev/zero")]
 
 
 # --- tilesets and meshes --------------------------------------------------------------------------
@@ -260,34 +166,6 @@ def content(folder, make, scale=1.0, lift=0.0, **extra):
     glb = make.glb(make.y_up(positions), uvs, faces, make.picture(1), **extra)
     (folder / "t.glb").write_bytes(glb)
     return {"content": {"uri": "t.glb"}}
-
-
-def turned(scale):
-    T = LocalFrame(TILESET_ORIGIN).ecef_from_enu.matrix.copy()
-    T[:3, :3] = T[:3, :3] @ np.diag(scale)
-    return T
-
-
-def mirrored_tileset(folder, make):
-    return tileset(folder, turned((-1, 1, 1)), **content(folder, make))
-
-
-def doubled_tileset(folder, make):
-    return tileset(folder, turned((2, 2, 2)), **content(folder, make))
-
-
-def flattened_tileset(folder, make):
-    return tileset(folder, turned((1, 1, 0)), **content(folder, make))
-
-
-def mirrored_node(folder, make):
-    nodes = [{"mesh": 0, "scale": [-1, 1, 1]}]
-    return tileset(folder, **content(folder, make, nodes=nodes))
-
-
-def node_fan_out(folder, make):
-    nodes = [{"children": [i + 1] * 4} for i in range(40)] + [{"mesh": 0}]
-    return tileset(folder, **content(folder, make, nodes=nodes))
 
 
 def tileset_dag(folder, make):
@@ -319,10 +197,6 @@ def content_is_a_pipe(folder, make):
     return tileset(folder, content={"uri": "t.glb"})
 
 
-def content_elsewhere(folder, make):
-    return tileset(folder, content={"uri": "http://127.0.0.1:9/t.glb"})
-
-
 def texture_bomb(folder, make):
     import struct
     import zlib
@@ -336,10 +210,6 @@ def texture_bomb(folder, make):
     png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"") + chunk(b"IEND", b"")
     uri = "data:image/png;base64," + base64.b64encode(png).decode()
     return tileset(folder, **content(folder, make, images=[{"uri": uri}]))
-
-
-def in_space(folder, make):
-    return tileset(folder, **content(folder, make, lift=20_000.0))
 
 
 def wrong_geoid_stated(folder, make):
@@ -365,26 +235,10 @@ def obj_bad_texture(folder, make):
     return obj(folder)
 
 
-def obj_device_texture(folder, make):
-    return obj(folder, "map_Kd /dev/zero\n")
-
-
 def obj_of(folder, text):
     path = folder / "m.obj"
     path.write_text(text)
     return path
-
-
-def obj_without_area(folder, make):
-    return obj_of(folder, "v 0 0 0\nv 10 0 0\nv 20 0 0\nf 1 2 3\n")
-
-
-def obj_with_a_face_without_end(folder, make):
-    return obj_of(folder, "v 0 0 0\nv 50 0 0\nv 0 50 0\nf " + "1 2 3 " * 30_000 + "\n")
-
-
-def obj_swapped(folder, make):
-    return obj_of(folder, "v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n")
 
 
 def obj_with_one_vertex_far_aside(folder, make):
@@ -401,75 +255,123 @@ MESH = {"georeference": Georeference(origin=ORIGIN), "vertical_datum": "ellipsoi
 class Refused:
     """A source, what the error says, and the doubt that may be trusted."""
 
-    make: Callable[..., object]
+    make: Callable[[Path, Any], object]
     says: str
-    options: dict = field(default_factory=lambda: dict(ELLIPSOIDAL))
     trust: str | None = None
+    options: dict = field(default_factory=lambda: dict(ELLIPSOIDAL))
+    name: str = ""
 
     def __str__(self):
-        return self.make.__name__
+        return self.name or self.make.__name__
 
 
-RASTERS = [
-    Refused(all_nan, "holds no height at all"),
-    Refused(beside, "shows 0.0 % of the ground .* it lies beside it"),
-    Refused(a_strip_in_common, "shows 2.1 % of the ground", trust="overlap"),
-    Refused(in_feet_untold, "CRS is in feet .* --height-unit"),
-    Refused(unit_against_crs, "the band's unit is 'ft'"),
-    Refused(depths, "counts depths"),
-    Refused(untagged_minus_9999, "occur nowhere on Earth, most often -9999.*--nodata=-9999"),
-    Refused(untagged_zero, r"11 % of its heights are 0, .*--nodata=0", trust="nodata"),
-    Refused(noise, "rise by more than 80 degrees", trust="slope"),
+def raster(name, says, trust=None, both=None, **how):
+    """A DSM that is made so; `both`: so is its orthophoto."""
+    how |= {"ortho": both, **both} if both else {}
+    return Refused(lambda folder, _: rasters(folder, **how), says, trust, name=name)
+
+
+def tiles(make, says, trust=None, name=""):
+    return Refused(make, says, trust, {}, name)
+
+
+def turned(scale):
+    """A tileset whose axes are scaled so."""
+    T = LocalFrame(TILESET_ORIGIN).ecef_from_enu.matrix.copy()
+    T[:3, :3] = T[:3, :3] @ np.diag(scale)
+    return lambda folder, make: tileset(folder, T, **content(folder, make))
+
+
+def of_nodes(nodes):
+    return lambda folder, make: tileset(folder, **content(folder, make, nodes=nodes))
+
+
+def object_of(name, says, text, trust=None, **options):
+    return Refused(lambda folder, _: obj_of(folder, text), says, trust, MESH | options, name)
+
+
+NEW_YORK = {"crs": "EPSG:2263", "place": (985_000.0, 210_000.0)}  # US survey feet
+DEGREES = {"crs": "EPSG:4326", "step": 1e-5}
+SITE_GRID = 'LOCAL_CS["site grid",UNIT["metre",1]]'
+MOON = (
+    'GEOGCS["Moon",DATUM["D_Moon",SPHEROID["Moon",1737400,0]],PRIMEM["m",0],'
+    'UNIT["degree",0.0174532925199433]]'
+)
+NOISE = (400 + 200 * np.random.default_rng(1).random((CELLS, CELLS))).astype("f4")
+CORNERS = "v 0 0 0\nv 10 0 0\nv 0 10 0\n"
+UNTOLD = "occur nowhere on Earth, most often -9999.*--nodata=-9999"
+
+CASES = [
+    raster("all_nan", "holds no height at all", data=np.full((CELLS, CELLS), np.nan, np.float32)),
+    raster("beside", "shows 0.0 % of the ground .* it lies beside it",
+           ortho={"place": (LEFT + 5000, TOP)}),
+    raster("strip_in_common", "shows 2.1 % of the ground", "overlap",
+           ortho={"place": (LEFT + 47, TOP)}),
+    raster("in_feet_untold", "CRS is in feet .* --height-unit", both=NEW_YORK),
+    raster("unit_against_crs", "the band's unit is 'ft'", crs=f"{UTM}+5773", units=["ft"]),
+    raster("depths", "counts depths", crs=f"{UTM}+5715"),
+    raster("untagged_minus_9999", UNTOLD, data=with_hole(-9999)),
+    raster("untagged_zero", r"11 % of its heights are 0, .*--nodata=0", "nodata",
+           data=with_hole(0)),
+    raster("noise", "rise by more than 80 degrees", "slope", data=NOISE),
     Refused(sparse, r"more than 20,000,000,000 pixels .*--limit pixels=160000000000"),
-    Refused(no_place, "no geotransform"),
-    Refused(singular, "singular"),
-    Refused(no_crs, "no CRS"),
-    Refused(degrees_swapped, "dsm.tif: its corners .* lie outside .* swapped"),
-    Refused(across_the_date_line, "dsm.tif: reaches from longitude 179.9998 to 180.0002, beyond"),
-    Refused(site_grid, "dsm.tif: its CRS, site grid, is neither geographic nor projected"),
-    Refused(on_the_moon, "dsm.tif: its CRS.* celestial body"),
-    Refused(upside_down, "dsm.tif: its band's scale -1"),
-    Refused(complex_numbers, "1 bands of complex64: neither a DSM"),
+    raster("no_place", "no geotransform", transform=Affine.identity()),
+    raster("singular", "singular", transform=Affine(1, 0, LEFT, 1, 0, TOP)),
+    raster("no_crs", "no CRS", crs=None),
+    # Latitude where longitude belongs: rows beyond the pole.
+    raster("degrees_swapped", "dsm.tif: its corners .* lie outside .* swapped",
+           both=DEGREES | {"place": (47.2, 189.0)}),
+    raster("date_line", "dsm.tif: reaches from longitude 179.9998 to 180.0002, beyond",
+           both=DEGREES | {"place": (180.0 - 24e-5, 10.0)}),
+    raster("site_grid", "dsm.tif: its CRS, site grid, is neither geographic nor projected",
+           both={"crs": SITE_GRID}),
+    raster("on_the_moon", "dsm.tif: its CRS.* celestial body",
+           both={"crs": MOON, "step": 1e-5, "place": (9.0, 47.2)}),
+    raster("depths_of_heights", "dsm.tif: its band's scale -1", scales=(-1.0,)),
+    raster("complex_numbers", "1 bands of complex64: neither a DSM",
+           data=ground().astype(np.complex64)),
     Refused(cut_in_half, "dsm.tif.*: cannot be read: .*IReadBlock failed"),
-    Refused(metres_swapped, "dsm.tif: lies at .* outside the area of its CRS", trust="area"),
+    raster("metres_swapped", "dsm.tif: lies at .* outside the area of its CRS", "area",
+           both={"place": (TOP, LEFT)}),
     Refused(palette, "indices into a palette"),
     Refused(text_named_tif, "no GeoTIFF"),
     Refused(a_vrt, "no GeoTIFF"),
     Refused(statistics_elsewhere, "names other files"),
     Refused(pipe, "not a plain file"),
-]
-OTHERS = [
-    Refused(mirrored_tileset, "mirrors what it places", {}, "mirrored"),
-    Refused(doubled_tileset, "stretches what it places, by 2 to 2", {}, "scaled"),
-    Refused(flattened_tileset, "flattens space", {}),
-    Refused(mirrored_node, "node 0 mirrors its mesh", {}, "mirrored"),
-    Refused(node_fan_out, "several parents, or is in a cycle", {}),
-    Refused(tileset_dag, "referred to more than 64 times", {}),
-    Refused(tileset_cycle, "in a cycle", {}),
-    Refused(deep_tileset, "more than 200 levels .*--limit depth", {}),
-    Refused(content_is_a_pipe, "not a plain file", {}),
-    Refused(content_elsewhere, "not a local file", {}),
-    Refused(texture_bomb, "decompression bomb", {}),
-    Refused(in_space, "occur nowhere on Earth", {}, "heights"),
-    Refused(wrong_geoid_stated, "stated geoid separation is 5.00 m, EGM96's", {}, "geoid"),
-    Refused(obj_bad_texture, "t.png: a texture that cannot be read", MESH),
-    Refused(obj_device_texture, "/dev/zero is not a plain file", MESH),
-    Refused(obj_without_area, "m.obj: its triangles have no area", MESH),
-    Refused(obj_with_a_face_without_end, "m.obj: a line is longer than 65536 bytes", MESH),
-    Refused(
-        obj_swapped,
-        "m.obj: lies at .* outside the area of its CRS",
-        ELLIPSOIDAL | {"georeference": Georeference(UTM, (TOP, LEFT, 400.0))},
-        "area",
-    ),
-    Refused(obj_with_one_vertex_far_aside, "m.obj, 5000.. m wide .* nodes", MESH),
-]
+    tiles(turned((-1, 1, 1)), "mirrors what it places", "mirrored", "mirrored"),
+    tiles(turned((2, 2, 2)), "stretches what it places, by 2 to 2", "scaled", "doubled"),
+    tiles(turned((1, 1, 0)), "flattens space", name="flattened"),
+    tiles(of_nodes([{"mesh": 0, "scale": [-1, 1, 1]}]), "node 0 mirrors its mesh", "mirrored",
+          "mirrored_node"),
+    tiles(of_nodes([{"children": [i + 1] * 4} for i in range(40)] + [{"mesh": 0}]),
+          "several parents, or is in a cycle", name="node_fan_out"),
+    tiles(tileset_dag, "referred to more than 64 times"),
+    tiles(tileset_cycle, "in a cycle"),
+    tiles(deep_tileset, "more than 200 levels .*--limit depth"),
+    tiles(content_is_a_pipe, "not a plain file"),
+    tiles(lambda folder, _: tileset(folder, content={"uri": "http://127.0.0.1:9/t.glb"}),
+          "not a local file", name="content_elsewhere"),
+    tiles(texture_bomb, "decompression bomb"),
+    tiles(lambda folder, make: tileset(folder, **content(folder, make, lift=20_000.0)),
+          "occur nowhere on Earth", "heights", "in_space"),
+    tiles(wrong_geoid_stated, "stated geoid separation is 5.00 m, EGM96's", "geoid"),
+    Refused(obj_bad_texture, "t.png: a texture that cannot be read", options=MESH),
+    Refused(lambda folder, _: obj(folder, "map_Kd /dev/zero\n"), "/dev/zero is not a plain file",
+            options=MESH, name="obj_device_texture"),
+    object_of("obj_without_area", "m.obj: its triangles have no area",
+              "v 0 0 0\nv 10 0 0\nv 20 0 0\nf 1 2 3\n"),
+    object_of("obj_with_a_face_without_end", "m.obj: a line is longer than 65536 bytes",
+              CORNERS + "f " + "1 2 3 " * 30_000 + "\n"),
+    object_of("obj_swapped", "m.obj: lies at .* outside the area of its CRS",
+              CORNERS + "f 1 2 3\n", "area", georeference=Georeference(UTM, (TOP, LEFT, 400.0))),
+    Refused(obj_with_one_vertex_far_aside, "m.obj, 5000.. m wide .* nodes", options=MESH),
+]  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # as it should be
-@pytest.mark.parametrize("case", [*RASTERS, *OTHERS], ids=str)
+@pytest.mark.parametrize("case", CASES, ids=str)
 def test_an_odd_source_is_refused_by_name_or_trusted(case, tmp_path, make):
-    source = case.make(tmp_path) if case in RASTERS else case.make(tmp_path, make)
+    source = case.make(tmp_path, make)
     options = {"workers": 1} | case.options
     with pytest.raises(LocalizerError, match=case.says) as refusal:
         build_cache(source, tmp_path / "c", BuildOptions(**options))
