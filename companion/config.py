@@ -52,7 +52,7 @@ class CameraModel(StrictModel):
 
     @model_validator(mode="after")
     def _is_a_lens(self) -> CameraModel:
-        """Intrinsics in millimetres, in shares of the width, or of a typing error are none."""
+        """Refuse intrinsics in millimetres, in shares of the width, or with a typing error."""
         low, high = _FIELDS_OF_VIEW_DEG
         for name, side, f in (("fx", self.width, self.fx), ("fy", self.height, self.fy)):
             fov_deg = math.degrees(2.0 * math.atan(0.5 * side / f))
@@ -81,7 +81,7 @@ class CameraModel(StrictModel):
         return self
 
     def camera(self) -> Camera:
-        """As the geometry type."""
+        """The camera model as the geometry's type."""
         return Camera(
             self.width, self.height, self.fx, self.fy, self.cx, self.cy,
             whole_coefficients(self.distortion_model, self.distortion), self.readout_ms,
@@ -123,7 +123,7 @@ class FeedConfig(StrictModel):
         """Whether the camera model is from a recent calibration: focus, temperature and shocks
         change a camera.
 
-        False if the computer's clock is not set.
+        False if the computer's clock (`today`) is before it.
         """
         if self.calibrated is None:
             return False
@@ -131,7 +131,7 @@ class FeedConfig(StrictModel):
 
     @property
     def is_video(self) -> bool:
-        """Whether its pictures come in packets: not out of a folder of images."""
+        """Whether the frames come in packets: not from a folder of images."""
         return "://" in self.source or not Path(self.source).is_dir()
 
     @model_validator(mode="after")
@@ -194,8 +194,8 @@ class TargetConfig(StrictModel):
     # time outside the image after which a clicked target ends
     timeout_s: float = Field(300.0, exclude=True)
 
-    def over(self, kind: MapKind) -> TargetConfig:
-        """The settings over a map of this kind, which may lack roofs that targets stand on."""
+    def for_map(self, kind: MapKind) -> TargetConfig:
+        """The settings over a map of this kind, which may lack roofs on which targets stand."""
         sigma_m = max(self.map_sigma_m, kind.unknown_height_sigma_m)
         return self.model_copy(update={"map_sigma_m": sigma_m})
 
@@ -271,7 +271,7 @@ class CompanionConfig(StrictModel):
 
     @property
     def state_folder(self) -> Path | None:
-        """Folder of the enabled injection and the last position; None: not kept."""
+        """Folder of what a restart reads (injection, last position); None: nothing is stored."""
         if self.state_dir is not None or self.record is None:
             return self.state_dir
         return self.record.folder.parent
@@ -304,7 +304,7 @@ def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
 
 
 def resolved(config: CompanionConfig, folder: Path) -> CompanionConfig:
-    """With paths relative to `folder`; ValueError for a path that names nothing."""
+    """A copy with paths relative to `folder`; ValueError for a path that names nothing."""
     localizer = config.localizer
     if localizer.model is not None:
         model = _path(folder, localizer.model, "localizer.model")
@@ -355,7 +355,7 @@ def _resolve_bridge(bridge: BridgeConfig, folder: Path, state_dir: Path | None) 
 
 
 def _path(folder: Path, given: Path, key: str) -> Path:
-    """A setting's path; ValueError for none, which would be the deployment's own folder."""
+    """A path below `folder`; ValueError for an empty one, which would be the folder itself."""
     if given == Path() or "\0" in str(given):
         raise ValueError(f"{key}: {str(given)!r} names no file and no folder")
     return folder / given

@@ -44,7 +44,7 @@ _MAX_POSITION_AGE_NS = 2_000_000_000
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
-    """Constants of a flight: the map's frame and the camera's position on the vehicle."""
+    """Constants of a flight: map frame, geoid above ellipsoid, lever arm (3,) in body axes."""
 
     frame: LocalFrame
     geoid_separation_m: float
@@ -123,7 +123,7 @@ def vehicle_prior(
 ) -> PosePrior | None:
     """The camera's pose and velocity at `time_ns` from the autopilot's data; None if unknown.
 
-    sigma: of position (m) and rotation (rad).
+    attitude, gimbal: at that time. sigma: of position (m) and rotation (rad).
     """
     age_ns = time_ns - state.position_time_ns
     if attitude is None or gimbal is None or abs(age_ns) > _MAX_POSITION_AGE_NS:
@@ -182,8 +182,8 @@ def target_report(fix: TargetFix, camera: Camera, frame: LocalFrame, number: int
 
 
 def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> CameraView:
-    """The camera and the ground point in the image's centre; None if that ray does not
-    hit the map.
+    """The camera's position and direction, and the ground point in the image's centre; that is None
+    if its ray does not hit the map.
     """
     pose, camera = estimate.world_from_camera, estimate.camera
     position = frame.position(pose.translation)

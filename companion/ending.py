@@ -1,4 +1,4 @@
-"""Wait for the end of a thread with a time limit, so that a hanging thread does not block the
+"""Waits for the end of a thread with a time limit, so that a hanging thread does not block the
 shutdown.
 """
 
@@ -11,7 +11,7 @@ _log = logging.getLogger(__name__)
 _PATIENCE_S = 5.0
 
 
-def joined(thread: threading.Thread) -> bool:
+def wait_for_end(thread: threading.Thread) -> bool:
     """Wait for a daemon thread that was told to end; returns whether it has ended. A thread that
     hangs, for example on a disk or device, is named in the log. The shutdown then continues, so
     that record and link are closed.

@@ -10,8 +10,8 @@ class CompanionError(Exception):
 class StreamError(CompanionError):
     """Base of everything that can be wrong with a camera feed."""
 
-    def retold(self, text: str) -> StreamError:
-        """The same error in other words."""
+    def with_text(self, text: str) -> StreamError:
+        """The same error with another text."""
         return type(self)(text)
 
 
@@ -20,14 +20,14 @@ class StreamOpenError(StreamError):
 
 
 class StreamSizeError(StreamError):
-    """A stream whose frames are of another size than the camera model says. size: theirs."""
+    """Frames of another size than the camera model. size: of the frames, pixels."""
 
     def __init__(self, text: str, size: tuple[int, int] | None = None) -> None:
         super().__init__(text)
         self.size = size
 
-    def retold(self, text: str) -> StreamSizeError:
-        """The same error in other words."""
+    def with_text(self, text: str) -> StreamSizeError:
+        """The same error with another text."""
         return StreamSizeError(text, self.size)
 
 
@@ -40,11 +40,11 @@ class StreamDecodeError(StreamError):
 
 
 class ConfigError(CompanionError):
-    """A configuration that cannot be read or does not hold; names file and key."""
+    """A configuration that cannot be read or is not valid; the text names file and key."""
 
 
 class ReportError(CompanionError):
-    """A report or record that cannot be written where it was asked for."""
+    """A report or record that cannot be written where the user asked for it."""
 
 
 class DiskFaultError(ReportError):

@@ -63,7 +63,7 @@ class Mount:
         yaw_deg: float = 0.0,
         lever_arm_m: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Mount:
-        """From Euler angles, as a configuration gives them."""
+        """From Euler angles in degrees and the lever arm (3,), as in a configuration."""
         angles = np.radians([roll_deg, pitch_deg, yaw_deg])
         return cls(matrix_from_euler(*angles), np.asarray(lever_arm_m, dtype=np.float64))
 
@@ -81,7 +81,7 @@ def heading(ned_from_body: Array) -> float:
 
 
 def gimbal_attitude(ned_from_body: Array, gimbal: GimbalAngles) -> Array:
-    """NED from gimbal, (3, 3)."""
+    """Rotation (3, 3) NED from gimbal. ned_from_body: (3, 3)."""
     R = matrix_from_euler(gimbal.roll_rad, gimbal.pitch_rad, gimbal.yaw_rad)
     if gimbal.frame is GimbalFrame.EARTH:
         return R
@@ -91,7 +91,7 @@ def gimbal_attitude(ned_from_body: Array, gimbal: GimbalAngles) -> Array:
 
 
 def camera_attitude(ned_from_body: Array, gimbal: GimbalAngles, mount: Mount) -> Array:
-    """NED from camera (OpenCV axes), (3, 3)."""
+    """Rotation (3, 3) NED from camera (OpenCV axes). ned_from_body: (3, 3)."""
     return gimbal_attitude(ned_from_body, gimbal) @ mount.rotation @ GIMBAL_FROM_CAMERA
 
 
@@ -102,7 +102,8 @@ def world_from_camera(
     lever_arm_m: ArrayLike,
     ned_from_world: Array = NED_FROM_ENU,
 ) -> Pose:
-    """The camera's pose of a vehicle at `position` (3,), world metres.
+    """The camera's pose. position: (3,) of the vehicle, world metres; ned_from_body,
+    ned_from_camera: (3, 3) attitudes; lever_arm_m: (3,) autopilot to camera, body axes.
 
     ned_from_world: from the function of that name; by default as at the map's origin.
     """

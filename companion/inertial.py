@@ -1,8 +1,8 @@
 """Integrates the IMU alone, independent of any estimator.
 
-The autopilot's attitude follows what is injected: an EKF that is fed a frozen position explains
-the acceleration away as tilt. Here the gyros carry the attitude, which leans towards the
-autopilot's over 20 s only; what that leaves of a tilt error is for the reader to estimate as a
+The autopilot's attitude follows what is injected: an EKF that is fed a frozen position explains the
+acceleration away as tilt. Here the gyros carry the attitude, which is pulled towards the
+autopilot's over 20 s only. The user of the integral must estimate the remaining tilt error as a
 bias.
 """
 
@@ -32,11 +32,11 @@ class VehicleTelemetry(Protocol):
     """The vehicle's telemetry that the monitor reads from the bridge, without impossible values."""
 
     def state(self) -> VehicleState:
-        """What the vehicle says about itself."""
+        """Newest state of the vehicle."""
         ...
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
-        """Its attitude at a time."""
+        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
         ...
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
@@ -44,11 +44,11 @@ class VehicleTelemetry(Protocol):
         ...
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time."""
+        """The camera's attitude to NED at a time; None if unknown."""
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time, while it uses GNSS."""
+        """The EKF's latitude, longitude and altitude at a time; None unless it uses GNSS."""
         ...
 
 
@@ -78,7 +78,7 @@ class InertialTrack:
         self._track: deque[InertialDisplacement] = deque(maxlen=_KEPT)
 
     def follow(self, vehicle: VehicleTelemetry) -> None:
-        """Integrate the new samples."""
+        """Integrate the vehicle's samples since the last call."""
         with self._lock:
             for sample in vehicle.inertial_since(self.newest_ns):
                 self.add(sample, vehicle.attitude_at)
@@ -123,7 +123,7 @@ class InertialTrack:
         lean = 2.0 * np.array(error) * (1.0 if w >= 0.0 else -1.0)
         self._bias -= lean * dt / (_LEAN_S * _BIAS_S)
         rates = np.array(sample.rates) - self._bias + lean / _LEAN_S
-        return quat.turn(q, (float(rates[0]), float(rates[1]), float(rates[2])), dt)
+        return quat.rotated(q, (float(rates[0]), float(rates[1]), float(rates[2])), dt)
 
     def _integrate(self, time_ns: int, acceleration: Array, dt: float) -> None:
         if self._last is None or not self._track:

@@ -25,7 +25,7 @@ class SettingsError(ValueError):
 
 
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
-    """The mapping in a YAML file, empty for an empty file; else raises `error_type`."""
+    """The mapping in a YAML file, {} for an empty file; otherwise raises `error_type`."""
     try:
         data = load_yaml(plain_text(path, _MAX_BYTES))
     except OSError as error:
@@ -83,7 +83,7 @@ def _reason(model: type[BaseModel], error: dict[str, Any]) -> str:
 
 
 def _meant(model: type[BaseModel], where: Sequence[str | int]) -> str:
-    """The setting of a similar name in the same place, if there is one."""
+    """Name of a similar setting in the same place, for the error; "" without."""
     for part in where[:-1]:
         field = model.model_fields.get(str(part))
         kind = field.annotation if field is not None else None

@@ -20,8 +20,8 @@ from localizer.types import PoseEstimate
 TRAJECTORY_NAMES = ("poses.txt", "trajectory.tum", "covariances.csv")
 
 
-def stamped(name: str, estimate: PoseEstimate) -> StampedPose:
-    """An estimate as a `StampedPose`."""
+def to_stamped_pose(name: str, estimate: PoseEstimate) -> StampedPose:
+    """An estimate as a `StampedPose` with its exposure time."""
     return StampedPose(
         name, estimate.world_from_camera, estimate.exposure_time_ns, estimate.covariance
     )
@@ -35,7 +35,7 @@ def snapshot_name(exposure_time_ns: int) -> str:
 class TrajectoryFiles:
     """Writes ``poses.txt`` (our pose lines), ``trajectory.tum`` and ``covariances.csv``.
 
-    Raises OSError where the disk does not take them.
+    Raises OSError if the disk does not accept them.
     """
 
     def __init__(self, folder: Path, frame: LocalFrame) -> None:

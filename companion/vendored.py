@@ -11,7 +11,7 @@ def vendored(name: str) -> str:
 
 
 def licence_of(package: str) -> str:
-    """The licence that comes with the package's files."""
+    """The licence in the package's files."""
     return _file(f"LICENSE.{package}.txt")
 
 

@@ -18,7 +18,7 @@ _BY_UMASK = 0o666
 def writing(path: Path, option: str = "") -> Iterator[None]:
     """Context manager: an `OSError` becomes a `ReportError` with the file's name.
 
-    option: through which it was asked for, e.g. ``--out``.
+    option: command-line option that named the file, e.g. ``--out``; "" for none.
     """
     try:
         yield
@@ -27,7 +27,7 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
         raise ReportError(f"{where}: cannot be written: {error.strerror or error}") from error
 
 
-def made_folder(path: Path, option: str = "") -> Path:
+def make_folder(path: Path, option: str = "") -> Path:
     """Create the folder if it is missing; `ReportError` if that fails."""
     if path.is_file():
         raise ReportError(f"{option} {path}: is a file; give a folder".lstrip())
@@ -79,7 +79,7 @@ class NewestFile:
         self._wake.set()
 
     def stop(self, patience_s: float = 2.0) -> None:
-        """Write the last text and end; a disk that hangs is not waited for."""
+        """Write the last text and end; waits up to patience_s for a disk that hangs."""
         self._stopping = True
         self._wake.set()
         self._thread.join(patience_s)

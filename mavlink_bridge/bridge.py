@@ -145,7 +145,7 @@ class Bridge:
         self._fc.set_map_id(map_id)
 
     def start(self) -> None:
-        """Open the links and keep them open."""
+        """Open the links, which reconnect by themselves."""
         if self._started:
             raise BridgeStateError("the bridge was already started; make a new one")
         self._started = True
@@ -168,7 +168,7 @@ class Bridge:
         self._fc.on_tick(self._fc_link, self._clock())
 
     def hand_over(self) -> None:
-        """The following stop is no clean shutdown: state for a restart is kept."""
+        """A restart follows the coming stop, which is not clean: keep state for the restart."""
         if self._shared.enable is not None:
             self._shared.enable.stop(clean_shutdown=False)
         self._fc.end(clean_shutdown=False)
@@ -198,7 +198,7 @@ class Bridge:
     # --- in -------------------------------------------------------------------------------------
 
     def submit(self, fix: VisionFix) -> None:
-        """Submit a fix; never blocks."""
+        """Queue a fix, to be sent or compared by the link's thread; never blocks."""
         self._fc.sender.put(fix)
         self._fc_link.wake()
 
@@ -210,7 +210,7 @@ class Bridge:
             self._cot.send(target)
 
     def forget(self, target_id: int) -> None:
-        """Stop reporting that target; never blocks."""
+        """Stop reporting the target of this number; never blocks."""
         self._to_ground(TargetEnd(target_id))
         self._shared.look.forget(target_id)
 
@@ -224,8 +224,8 @@ class Bridge:
             self._shared.on_track(request)
 
     def inhibit(self, of: AlertId) -> None:
-        """Until `clear`, what the alert inhibits does not start (`Inhibits`). The pilot's command
-        (mode ``rc``) and `injection.force` override it.
+        """Prevent what the alert inhibits (`Inhibits`) from starting, until `clear`. The pilot's
+        command (mode ``rc``) and `injection.force` override it.
         """
         self._fc.inhibit(of)
 
@@ -233,15 +233,15 @@ class Bridge:
         """End the inhibition by this alert."""
         self._fc.clear(of)
 
-    def look(self, view: CameraView) -> None:
+    def report_view(self, view: CameraView) -> None:
         """Report the camera's view to the ground station (CAMERA_FOV_STATUS); never blocks."""
         if self._config.camera.announce:
             self._to_ground(view)
         if self._cot is not None:
-            self._cot.look(view)
+            self._cot.report_view(view)
 
     def _to_ground(self, item: TargetReport | TargetEnd | CameraView) -> None:
-        self._ground.show(item)
+        self._ground.queue_item(item)
         self._ground_link.wake()
 
     def set_health(
@@ -249,7 +249,7 @@ class Bridge:
     ) -> None:
         """Set the localizer's health and the active alerts, most severe first; each is sent once.
 
-        tell: false for what was sent already.
+        tell: False if another component has sent them already.
         """
         self._status.set_health(level, alerts, tell=tell)
 
@@ -257,9 +257,9 @@ class Bridge:
         """Report an alert to the operator: STATUSTEXT to the ground station, and the log."""
         self._status.report(alert)
 
-    def tell_figures(self, figures: Mapping[str, float]) -> None:
-        """Send NAMED_VALUE_FLOAT for each value, with names of at most 10 characters, if
-        `named_values` is set; never blocks.
+    def send_named_values(self, figures: Mapping[str, float]) -> None:
+        """Send NAMED_VALUE_FLOAT for each value, if the setting `named_values` is on; never blocks.
+        figures: value by name, at most 10 characters.
         """
         if self._config.named_values:
             uptime_ms = self._shared.uptime_ms(self._clock())
@@ -283,7 +283,7 @@ class Bridge:
         return self._tracker.attitude_at(time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time, from gimbal or body, and the mounting."""
+        """The camera's attitude to NED at a time, by gimbal or body, and mounting; or None."""
         return self._tracker.gimbal_at(time_ns)
 
     def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
@@ -380,19 +380,19 @@ class Bridge:
         result["ekf_source_set"] = self._fc.sources.current
         return result
 
-    def waiting(self) -> dict[str, int]:
-        """Queued messages and bytes, by queue."""
-        result = {"alerts": len(self._status.alerts()), **self._fc.waiting()}
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of queued messages or bytes, by queue."""
+        result = {"alerts": len(self._status.alerts()), **self._fc.queue_lengths()}
         if self._ground is not self._fc.components:
-            result.update({f"ground {name}": n for name, n in self._ground.waiting().items()})
+            result.update({f"ground {name}": n for name, n in self._ground.queue_lengths().items()})
         for link in self._links:
-            result.update({f"{link.name} {name}": n for name, n in link.waiting().items()})
+            result.update({f"{link.name} {name}": n for name, n in link.queue_lengths().items()})
         return result
 
 
 @dataclass(frozen=True)
 class _LinkMaker:
-    """Makes both links of a bridge: to the autopilot ("fc") and to the ground."""
+    """Creates both links of a bridge: to the autopilot ("fc") and to the ground."""
 
     config: BridgeConfig
     recorder: TlogRecorder | None

@@ -53,7 +53,7 @@ class Components:
     """The bridge's components on one link; its owner thread calls the methods.
 
     They send a heartbeat once a second, answer commands and report targets and camera poses.
-    Only `show` may be called from other threads.
+    Only `queue_item` may be called from other threads.
     """
 
     def __init__(self, shared: Shared, *, ground: bool) -> None:
@@ -76,20 +76,20 @@ class Components:
         self._refused: set[int] = set()
         self._hints_told: dict[AlertId, int] = {}  # when
 
-    def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
+    def queue_item(self, item: TargetReport | TargetEnd | CameraView) -> None:
         """Queue an item for the ground station; the oldest is dropped if the queue is full."""
         self._outbound.append(item)
 
-    def waiting(self) -> dict[str, int]:
-        """Lengths of the queues."""
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of entries in each queue, by name."""
         return {"outbound": len(self._outbound), "targets": self._camera.targets}
 
     def announce(self) -> None:
-        """The link was opened: send the next heartbeat at once."""
+        """Send the next heartbeat at once, because the link was opened."""
         self._next_heartbeat_ns = 0
 
     def heartbeat(self, link: Link, now_ns: int) -> None:
-        """HEARTBEAT of each component at 1 Hz; system status follows the localizer's health."""
+        """HEARTBEAT of each component at 1 Hz; its system status is the localizer's health."""
         if now_ns < self._next_heartbeat_ns:
             return
         self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
@@ -118,7 +118,7 @@ class Components:
             elif isinstance(item, TargetEnd):
                 self._camera.forget(item.target_id)
             else:
-                self._camera.look(item)
+                self._camera.report_view(item)
         position = None
         place = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
         if place[0] is not None and place[1] is not None and place[2] is not None:

@@ -40,7 +40,7 @@ class OriginConfig(StrictModel):
 
 @dataclass(frozen=True)
 class YawGuardConfig:
-    """Cross-check of the vision yaw against the autopilot's.
+    """Cross-check of the vision yaw against the autopilot's and the gyros'.
 
     A vision frame rotated by 5 deg costs 25 m and raises no warning in ArduPilot.
     """
@@ -53,7 +53,7 @@ class YawGuardConfig:
 
 
 class InjectionConfig(StrictModel):
-    """What is sent to the flight controller, how often, and when it is withheld."""
+    """What is sent to the flight controller, how often, and when output is held."""
 
     message: InjectionMessage = Field(
         default="vision_position_estimate", description="MAVLink message that holds a fix"
@@ -228,7 +228,7 @@ class SigningConfig(StrictModel):
     state_file: Path | None = Field(None, exclude=True)
 
     def state_path(self, link: str) -> Path:
-        """Where the replay window of the link of this name is kept."""
+        """File of the replay window of the link of this name."""
         name = f"{self.key_file.name}.{link}.seen"
         return self.state_file or self.key_file.with_name(name)
 

@@ -26,7 +26,7 @@ from mavlink_bridge.messages import Figures, VehicleState
 from mavlink_bridge.place_hint import PLACE_HINT
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
-from mavlink_bridge.vehicle.commands import Commander, accepted
+from mavlink_bridge.vehicle.commands import Commander, is_accepted
 from mavlink_bridge.vehicle.mission import MISSION_IN
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
@@ -65,7 +65,7 @@ def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
 
 
 class FlightControllerEnd:
-    """Runs in the flight-controller link's thread; only `sender.put` is called from others.
+    """Handles the flight controller's link, in its thread; only `sender.put` is called from others.
 
     Above 200 lines: it passes each message and each clock tick to one of a dozen components.
     """
@@ -112,26 +112,26 @@ class FlightControllerEnd:
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
         if self._shared.config.injection.message in unswitched and (
-            current is None or self.sender.fed(now_ns)
+            current is None or self.sender.may_feed_ekf(now_ns)
         ):
             return False
         return None if current is None else self.sources.on_gnss
 
     def set_map_id(self, map_id: str) -> None:
-        """Before `recall`: the id of the map."""
+        """Set the id of the map; called before `recall`."""
         if self._no_go is not None:
             self._no_go.about = map_id
 
     def recall(self) -> None:
-        """Before the link starts: restore the state of a process that was killed."""
+        """Restore the state of a process that was killed; called before the link starts."""
         self._interlock.recall()
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """Call after the link has ended; for a restart, before it."""
+        """End the memories: after the link has ended, or for a restart before it."""
         self._interlock.end(clean_shutdown=clean_shutdown)
 
     def inhibit(self, of: AlertId) -> None:
-        """Until `clear`, what the alert inhibits does not start."""
+        """Prevent what the alert inhibits from starting, until `clear`."""
         if Inhibits.INJECTION in CATALOGUE[of].inhibits:
             self._interlock.inhibited_by |= {of}
         if Inhibits.EKF_OK in CATALOGUE[of].inhibits:
@@ -179,10 +179,10 @@ class FlightControllerEnd:
         result["fixes_not_taken"] = self.sender.dropped
         return result
 
-    def waiting(self) -> dict[str, int]:
-        """Lengths of all queues, by name."""
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of entries in each queue, by name."""
         parts = (self.sender, self.outcome, self.components, self.time_sync)
-        return {name: length for part in parts for name, length in part.waiting().items()}
+        return {name: length for part in parts for name, length in part.queue_lengths().items()}
 
     # --- messages in ----------------------------------------------------------------------------
 
@@ -195,7 +195,7 @@ class FlightControllerEnd:
         if not self._tracker.accepts(message):
             self._strangers.on_message(link, message)
             return
-        self.requests.streams.seen(kind, time_ns)
+        self.requests.streams.on_message(kind, time_ns)
         if kind == "HEARTBEAT":
             link.keep_peer()
         if kind == "TIMESYNC":
@@ -213,7 +213,7 @@ class FlightControllerEnd:
             if not getattr(message, "chunk_seq", 0):  # a longer text's middle begins anyhow
                 self.sources.on_text(str(message.text))
         elif kind == "RC_CHANNELS" and self._shared.enable is not None:
-            self._shared.enable.channels(self._tracker.snapshot(time_ns).rc_channels_us)
+            self._shared.enable.on_rc_channels(self._tracker.snapshot(time_ns).rc_channels_us)
 
     def _acknowledged(self, link: Link, message: Any, now_ns: int) -> None:
         if message.command == PLACE_HINT:
@@ -221,10 +221,10 @@ class FlightControllerEnd:
             return
         if not self._commander.is_ours(link, message):
             return
-        if not accepted(message):
+        if not is_accepted(message):
             self.counters["commands_refused"] += 1
         if message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
-            self.sources.acknowledged(accepted(message))
+            self.sources.acknowledged(is_accepted(message))
         elif message.command in LOOKS:
             self._shared.look.answered(message.result)
 
@@ -239,13 +239,13 @@ class FlightControllerEnd:
     # --- the clockwork --------------------------------------------------------------------------
 
     def on_open(self, link: Link) -> None:
-        """Announce at once, and request everything again."""
+        """Announce our components at once, and request everything again."""
         self.components.announce()
         self.requests.reset()
         self.time_sync.reset()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Do everything that is due; returns when the next is."""
+        """Do everything that is due; returns the time of the next, CLOCK_MONOTONIC ns."""
         config = self._shared.config
         state = self._tracker.snapshot(now_ns)
         link.system_id = config.system_id or state.system_id or 0
@@ -275,7 +275,7 @@ class FlightControllerEnd:
         self._connected = state.connected
         if state.connected:
             self.requests.reset()
-            self.sources.met(state)
+            self.sources.on_first_message(state)
         else:
             self.counters["lost"] += 1
             # It may come back as another: after a reboot, with another origin.
@@ -283,21 +283,21 @@ class FlightControllerEnd:
 
     def _inject(self, link: Link, state: VehicleState, now_ns: int) -> int:
         sender = self.sender
-        sender.take(now_ns)
+        sender.drain_queue(now_ns)
         shared = self._shared
         mode = self._mode = self._interlock.mode(
             shared.mode(), state, now_ns, by_pilot=shared.enable is not None
         )
         if mode == "off" or not state.connected:
-            sender.injector.skip()
+            sender.injector.clear()
             return now_ns + _IDLE_NS
         profile = select_profile(state.autopilot, state.version)
-        self._warnings.firmware(state, profile)
+        self._warnings.check_firmware(state, profile)
         sender.step(link, state, mode, now_ns)
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + _IDLE_NS
             self._check(link, state, now_ns)
-            self._warnings.fixes(profile, now_ns)
+            self._warnings.check_fixes(profile, now_ns)
         return sender.injector.next_due_ns(now_ns)
 
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
@@ -319,5 +319,5 @@ class FlightControllerEnd:
                 link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
             )
         held = came and may_inject
-        self.news.held(self._interlock.reason if held else None, now_ns)
-        self.news.look(state, now_ns, injecting=good, refused=self.sources.gnss_refused)
+        self.news.set_hold_reason(self._interlock.reason if held else None, now_ns)
+        self.news.update(state, now_ns, injecting=good, refused=self.sources.gnss_refused)

@@ -41,8 +41,8 @@ class GnssRefusal:
 
 @dataclass(frozen=True)
 class _Report:
-    """One report; differences are north and east, metres. off_m: difference from vision at its
-    time.
+    """One report of the receiver; differences are north and east, metres. off_m: difference from
+    vision at its time.
 
     slipped_m: difference from the integral of the EKF's velocity, with an arbitrary zero.
     claimed_m: the accuracy that the receiver states, None without one.
@@ -73,12 +73,12 @@ class GnssReturnCheck:
         self._looked_ns = 0
 
     def reset(self) -> None:
-        """Forget the receiver."""
+        """Forget the receiver's reports and the result."""
         self._reports.clear()
         self.refusal, self.accepted, self._anchor = None, False, None
 
-    def look(self, state: VehicleState, vision: PropagatedFix | None, now_ns: int) -> None:
-        """Process the newest report; call it ten times a second. vision: None while it is not
+    def update(self, state: VehicleState, vision: PropagatedFix | None, now_ns: int) -> None:
+        """Process the newest report; called ten times a second. vision: None while it is not
         reliable; the last result then stays.
         """
         velocity = np.array((state.local_velocity_ned or (0.0, 0.0))[:2])
@@ -157,8 +157,8 @@ class GnssReturnCheck:
 
 
 def _motion(times: _Array, positions: _Array) -> tuple[float, float, float, float]:
-    """Speed of the straight line through positions (n, 2), its sigma, the rms distance to it, and
-    the length of its end; m/s and m.
+    """Speed of the straight line through positions (n, 2), its sigma, the rms distance of the
+    positions to the line, and the distance of the line's end from zero; m/s and m.
     """
     t = times - times.mean()
     spread = float(t @ t)

@@ -16,7 +16,7 @@ _TICK_NS = 20_000_000
 
 
 class GroundEnd:
-    """Runs in the ground link's thread; other threads only fill its components' queues."""
+    """Handles the ground link, in its thread; other threads only fill its components' queues."""
 
     def __init__(self, shared: Shared) -> None:
         self.components = Components(shared, ground=True)
@@ -24,7 +24,7 @@ class GroundEnd:
         self._notifier = StatusNotifier(shared.report)
 
     def on_open(self, link: Link) -> None:
-        """Announce at once."""
+        """Announce our components at once."""
         self.components.announce()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
@@ -37,7 +37,7 @@ class GroundEnd:
             self.components.command(link, message, time_ns)
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Heartbeats and targets, once the vehicle's system id is known."""
+        """Send heartbeats and targets, once the vehicle's system id is known."""
         config = self._shared.config
         state = self._shared.tracker.snapshot(now_ns)
         link.system_id = config.system_id or state.system_id or 0

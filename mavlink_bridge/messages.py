@@ -91,7 +91,7 @@ def horizontal_sigma_m(P: Array) -> float:
 class VisionFix:
     """One position (and attitude) of the vehicle's body from vision.
 
-    Raises `FixError` for what no autopilot should be told.
+    Raises `FixError` for values that no autopilot should receive.
     """
 
     time_ns: int
@@ -151,7 +151,7 @@ class VisionFix:
 
     @property
     def by_odometry(self) -> bool:
-        """Whether visual odometry propagated it from an earlier fix."""
+        """Whether visual odometry propagated the fix from an earlier one."""
         return self.scale_sigma is not None
 
     @property
@@ -166,7 +166,7 @@ class VisionFix:
 
     @property
     def yaw_rad(self) -> float | None:
-        """Heading from true north; None if the attitude is unknown."""
+        """Heading from true north, rad; None if the attitude is unknown."""
         return None if self.quaternion is None else quat.to_euler(self.quaternion)[2]
 
 
@@ -217,7 +217,7 @@ class TargetReport:
 
 @dataclass(frozen=True)
 class TargetEnd:
-    """The target is no longer reported."""
+    """Notice that the target of this number is no longer reported."""
 
     target_id: int
 

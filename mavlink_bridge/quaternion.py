@@ -81,7 +81,7 @@ def slerp(a: Quaternion, b: Quaternion, t: float) -> Quaternion:
     return normalise([u * p + v * q for p, q in zip(a, b, strict=True)])
 
 
-def turn(q: Quaternion, rates: Vector, seconds: float) -> Quaternion:
+def rotated(q: Quaternion, rates: Vector, seconds: float) -> Quaternion:
     """Attitude after a rotation of q at constant body rates (rad/s)."""
     rx, ry, rz = (rate * seconds for rate in rates)
     angle = math.sqrt(rx * rx + ry * ry + rz * rz)

@@ -23,7 +23,7 @@ class Hysteresis:
         self._over_ns: int | None = None
 
     def is_over(self, now_ns: int, *, bad: bool) -> bool:
-        """Take in whether the problem exists now. True if it has been absent for long enough."""
+        """Add whether the problem exists now. True if it has been absent for long enough."""
         if bad:
             if self._over_ns is not None:
                 relapsed = now_ns - self._over_ns < _RELAPSE_NS + 2 * self._wait_ns
@@ -57,7 +57,7 @@ class StatusNotifier:
         return self._reported.get(topic)
 
     def forget(self, topic: str) -> None:
-        """Report the next alert of a topic even if it equals the last."""
+        """Forget a topic's last alert: the next one is reported even if it is equal."""
         self._reported.pop(topic, None)
 
     def notify(self, topic: str, problem: Alert | None, relief: Alert | None = None) -> None:

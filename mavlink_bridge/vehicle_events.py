@@ -1,4 +1,4 @@
-"""Detects changes of the vehicle that concern the operator: GNSS lost, arming."""
+"""Reports changes of the vehicle that concern the operator: GNSS lost, arming."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class VehicleEvents:
         self._unheard_ns: int | None = None  # since when it is armed, before any GNSS report
         self._held_ns: int | None = None
 
-    def look(
+    def update(
         self, state: VehicleState, now_ns: int, *, injecting: bool, refused: bool = False
     ) -> None:
         """Process the vehicle's state. injecting: positions are being sent. refused: GNSS
@@ -45,7 +45,7 @@ class VehicleEvents:
             self._notifier.report(alert(AlertId.ARMED_WITHOUT_GNSS, output=_output(injecting)))
         self._armed = state.armed
 
-    def held(self, reason: Alert | None, now_ns: int) -> None:
+    def set_hold_reason(self, reason: Alert | None, now_ns: int) -> None:
         """Set the interlock's reason for not sending available fixes; None without one.
 
         The shadow check needs some seconds, so a reason that passes soon is not reported.

@@ -13,7 +13,7 @@ from benchmarks.calibration.desk.film import EstimateWithTruth
 from benchmarks.calibration.draws import Draw, Sortie, drawn, fly, true_camera, true_mount
 from companion.calibrate import unknowns as u
 from companion.calibrate.flight import CalibrationResult, calibrate
-from companion.calibrate.proposal import blind_spots, changed, changes
+from companion.calibrate.proposal import apply_changes, blind_spots, setting_changes
 from companion.config import CompanionConfig, load_config
 from companion.offline.record import load_record
 from localizer.geometry.pose import Array, euler_from_matrix, so3_log
@@ -51,7 +51,7 @@ def solve_draw(
     row = known | _found_numbers(found)
     if after:
         deployment = load_config(folder / "deployment.yaml")
-        corrected = changed(deployment, changes(deployment, found))
+        corrected = apply_changes(deployment, setting_changes(deployment, found))
         row["again"] = _again(assets, drawn(seed), seed, folder, corrected)
     return row
 

@@ -216,7 +216,7 @@ def _fixes(folder: Path) -> tuple[list[_Arrival], int]:
     jumps, fixes = JumpCounter(), []
     for record in records:
         for row in _rows(record / "estimates.csv"):
-            jumps.note(TrackingState(row["state"]))
+            jumps.add_state(TrackingState(row["state"]))
             if row["accepted"] == "1" and row.get("hpl_m"):
                 time_ns = int(row["exposure_time_ns"])
                 came_ns = time_ns + round(float(row["latency_ms"]) * 1e6)

@@ -18,7 +18,7 @@ OFFSETS_S: Array = np.arange(-REACH_S, REACH_S + 1e-9, _STEP_S)
 
 
 class AutopilotRecord(Protocol):
-    """A record's messages."""
+    """A record's telemetry at any time; None if unknown."""
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
         """The vehicle's attitude at a CLOCK_MONOTONIC time."""
@@ -48,7 +48,7 @@ class AutopilotWindow:
 
     @property
     def has_place(self) -> bool:
-        """Whether the EKF's position is known throughout."""
+        """Whether the EKF's position is known at all T times."""
         return bool(np.isfinite(self.place).all())
 
     def motion(self, offset_s: float = 0.0) -> tuple[Array, Array]:
@@ -65,7 +65,7 @@ class AutopilotWindow:
 def autopilot_window_at(
     autopilot: AutopilotRecord, time_ns: int, frame: LocalFrame, geoid_m: float, mount: Array
 ) -> AutopilotWindow | None:
-    """The window around a timestamp; None if attitude or gimbal are not known throughout.
+    """The window around a timestamp; None if attitude or gimbal is unknown at one of its times.
 
     mount: (3, 3), the deployment's mounting angles. The angles of `gimbal_at` contain them already.
     """
@@ -89,7 +89,7 @@ def autopilot_window_at(
 
 
 def at(values: Array, offset_s: float) -> Array:
-    """Values (K, T, ...) of K stamps at one offset, linear between: (K, ...)."""
+    """Values (K, T, ...) of K timestamps at one offset, linearly interpolated: (K, ...)."""
     where = np.clip((offset_s + REACH_S) / _STEP_S, 0.0, len(OFFSETS_S) - 1.001)
     i = int(where)
     t = where - i

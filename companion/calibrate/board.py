@@ -69,7 +69,7 @@ def write_sheet(path: Path, paper: Paper) -> BoardPage:
 
 
 def _pdf(sheet: BoardPage) -> bytes:
-    """One page, the board an image that is placed by millimetres (PDF 1.4)."""
+    """A PDF page (1.4) with the board as an image that is placed by millimetres."""
     picture = board_picture(_DOTS_PER_SQUARE // 4)
     rows, columns = picture.shape
     packed = zlib.compress(picture.tobytes())
@@ -108,7 +108,7 @@ def _pdf(sheet: BoardPage) -> bytes:
 
 
 def _png(sheet: BoardPage) -> bytes:
-    """A white page with its dots per metre (pHYs), so that it prints at true scale."""
+    """A white PNG with its dots per metre (pHYs), so that it prints at true scale."""
     dots = _DOTS_PER_SQUARE
     per_mm = dots / sheet.square_mm
     board = board_picture(dots)

@@ -24,7 +24,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 
 @dataclass(frozen=True)
 class CalibrationFrame:
-    """One image with the autopilot's data. time_ns: its timestamp."""
+    """One image with the autopilot's data. time_ns: its timestamp; pose: registered."""
 
     time_ns: int
     pose: Pose
@@ -42,18 +42,17 @@ class Guess:
     rotations: Array
     places: Array
 
-    def moved(self, shared: Array, frames: Array) -> Guess:
-        """The values after steps (COUNT,) and (K, 6): metres, and left rotation vectors, world
-        axes.
+    def stepped(self, shared: Array, frames: Array) -> Guess:
+        """The values after steps (COUNT,) of `shared` and (K, 6) of the frames: metres, and left
+        rotation vectors, world axes.
         """
         turned = Rotation.from_rotvec(frames[:, 3:]).as_matrix() @ self.rotations
         return Guess(self.shared + shared, turned, self.places + frames[:, :3])
 
 
 class CalibrationProblem:
-    """Observations of K frames with N patches in all, relative to a deployment's values.
-
-    camera, mount (3, 3), arm_m (3,): the deployment's.
+    """Observations of K frames with N patches in all, relative to a deployment's camera model,
+    mount (3, 3) and lever arm arm_m (3,).
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class CalibrationProblem:
         return middles
 
     def camera_of(self, shared: Array) -> Camera:
-        """The camera model with these values."""
+        """The deployment's camera model with these corrections (COUNT,)."""
         return changed_camera(self._camera, shared)
 
     def pixels(self, guess: Guess) -> Array:
@@ -117,7 +116,7 @@ class CalibrationProblem:
         return turned
 
     def places(self, guess: Guess) -> Array:
-        """(K, 3): estimated minus reported, metres; NaN where nothing was reported."""
+        """(K, 3): estimated minus reported position, metres; NaN where none was reported."""
         late_s, s = float(guess.shared[u.LATE]), guess.shared
         place = at(self._place, -late_s)
         arm = at(self._body, -late_s) @ (self.arm_m + s[u.ARM])

@@ -66,7 +66,7 @@ class CalibrationResult:
 
     @property
     def sigmas(self) -> Array:
-        """(COUNT,), one standard deviation."""
+        """(COUNT,), one standard deviation of each value."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -96,8 +96,8 @@ def calibrate(
     config = record.config
     stack = MapStack(config.map, config.localizer)
     try:
-        record.tables.flown.require_frame(stack.cache)
-        mount = mount_of(config)
+        record.tables.flown_map.require_frame(stack.cache)
+        mount = mount_matrix(config)
         pictures, bias_m = _chosen(record, stack, mount, frames)
         camera = _stream_camera(record, pictures)
         arm_m = np.array(config.camera.lever_arm_m)
@@ -144,7 +144,7 @@ def _tell(progress: Callable[[int, int], None], begun: int, total: int, done: in
     progress(begun + done, total)
 
 
-def mount_of(config: CompanionConfig) -> Array:
+def mount_matrix(config: CompanionConfig) -> Array:
     """(3, 3): the mounting correction from the camera's housing to the gimbal."""
     c = config.bridge.camera
     return Mount.from_degrees(c.mount_roll_deg, c.mount_pitch_deg, c.mount_yaw_deg).rotation
@@ -153,8 +153,8 @@ def mount_of(config: CompanionConfig) -> Array:
 def _chosen(
     record: FlightRecord, stack: MapStack, mount: Array, most: int
 ) -> tuple[list[_ChosenFrame], float]:
-    """At most so many accepted estimates with their images, and the receiver's constant
-    error, m.
+    """At most `most` accepted estimates that have an image, spread over the flight, and the GNSS
+    receiver's constant error, m.
     """
     config, bridge = record.config, record.config.bridge
     autopilot = RecordedAutopilot(bridge, record.log, record.tables.start_ns)

@@ -1,4 +1,4 @@
-"""Estimate the camera model and its uncertainty from views of the board."""
+"""Estimates the camera model and its uncertainty from views of the board."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _SIGMA_FACTOR = 2.0  # a board is not flat, and its corners do not err independe
 
 @dataclass(frozen=True)
 class LensEstimate:
-    """The camera with one sigma of fx, fy, cx, cy, k1, k2, p1, p2, k3 (9,); rms_px: of the corners;
-    views: used, of how many.
+    """The camera model. sigmas: (9,) of fx, fy, cx, cy, k1, k2, p1, p2, k3; rms_px: of the corners;
+    views: number used, number in all.
     """
 
     camera: Camera
@@ -32,7 +32,7 @@ class LensEstimate:
 
 
 def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstimate:
-    """By OpenCV's bundle adjustment (Zhang 2000). `RecordError` with fewer than eight views."""
+    """Estimate the camera from views (Zhang 2000). `RecordError` with fewer than eight views."""
     if len(views) < _LEAST_VIEWS:
         raise RecordError(
             f"{len(views)} usable views of the board; the camera's model needs {_LEAST_VIEWS}, "
@@ -57,7 +57,7 @@ def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstim
 
 @dataclass(frozen=True)
 class _Fit:
-    """As OpenCV gives it; errors: (N,) px of each view."""
+    """Result of OpenCV. errors: (N,) px of each view."""
 
     K: Array
     distortion: Array

@@ -57,7 +57,9 @@ class PictureReader:
         self._undistorter = Undistorter(camera, self._working)
 
     def read(self, frame: Frame, pose: Pose, sweep: Sweep | None) -> Parts | None:
-        """The patches of an image taken at `pose`; None if they cannot be compared."""
+        """The patches of an image taken at `pose`, with rolling shutter `sweep`; None
+        if unusable.
+        """
         view = self._renderer.render(pose, self._working, wait=True)
         if np.count_nonzero(view.depth) < 0.2 * view.depth.size:
             return None
@@ -125,8 +127,8 @@ def _step(
     level: FeatureLevel, at: Array, of_map: tuple[Float32, Float32], number: NDArray[np.int64],
     count: int,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """One Gauss-Newton step (count, 2) of every part, in the level's cells; its normal equations
-    (count, 2, 2) and the parts' mean residual (count,).
+    """One Gauss-Newton step (count, 2) of every patch, in the level's cells; its normal equations
+    (count, 2, 2) and the patches' mean residual (count,).
     """
     features, confidence = of_map
     u, v = (at / level.stride - 0.5).T

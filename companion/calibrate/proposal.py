@@ -1,4 +1,4 @@
-"""Convert the result of a calibration to changes of the deployment file."""
+"""Converts the result of a calibration to changes of the deployment file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SettingChange:
     after: Any
 
 
-def changes(config: CompanionConfig, found: CalibrationResult) -> tuple[SettingChange, ...]:
+def setting_changes(config: CompanionConfig, found: CalibrationResult) -> tuple[SettingChange, ...]:
     """All settings that the flight's estimate replaces. They were estimated together and must be
     replaced together.
     """
@@ -103,7 +103,7 @@ def _sigmas(config: CompanionConfig, found: CalibrationResult) -> list[SettingCh
 
 
 def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[SettingChange, ...]:
-    """The settings that a board calibration changes; config: None if there is no deployment yet."""
+    """The settings that a board calibration changes. config: None if there is no deployment yet."""
     model = None if config is None else config.camera.model
     told = None if config is None else config.localizer.calibration
     c = lens.camera
@@ -135,8 +135,8 @@ def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[Se
     return tuple(made)
 
 
-def changed(config: CompanionConfig, wanted: tuple[SettingChange, ...]) -> CompanionConfig:
-    """The deployment with its changes. Raises `SettingsError` if it is invalid."""
+def apply_changes(config: CompanionConfig, wanted: tuple[SettingChange, ...]) -> CompanionConfig:
+    """A copy of the deployment with the changes. Raises `SettingsError` if it is invalid."""
     document = config.model_dump()
     _apply(document, wanted)
     return validated(CompanionConfig, document)
@@ -171,8 +171,8 @@ def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
 
 
 def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -> Path:
-    """Replace the deployment file if the result is valid. The old file is kept beside it; its name
-    is returned. Access rights stay the same. `ConfigError` if it is not valid or cannot be written.
+    """Replace the deployment file; returns the name of the old file, kept beside it. Access rights
+    stay the same. `ConfigError` if the result is not valid or cannot be written.
     """
     document = with_current_keys(CompanionConfig, read_settings(path, ConfigError), str(path))
     _apply(document, wanted)

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import CalibrationProblem, Guess
-from companion.calibrate.spatial_correlation import ImageNormalEquations, pictures_part
+from companion.calibrate.spatial_correlation import ImageNormalEquations, images_covariance
 from companion.calibrate.wander import AttitudeProcess, GaussMarkovProcess
 from localizer.geometry.pose import Array
 
@@ -60,8 +60,8 @@ class _Noise:
 def solve(
     evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None, sigmas: Array = u.SIGMAS
 ) -> Solution:
-    """Estimate the values. fixed: (COUNT,) bool, keep their value; sigmas: (COUNT,) of the weak
-    priors.
+    """Estimate the values. fixed: (COUNT,) bool, True keeps the value, None: none; sigmas: (COUNT,)
+    of the weak priors.
     """
     guess = evidence.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
@@ -76,16 +76,16 @@ def solve(
             factor = cho_factor(H, lower=True, check_finite=False)
             step = -cho_solve(factor, g, check_finite=False)
             frames = step[u.COUNT :].reshape(-1, 6)
-            guess = guess.moved(step[: u.COUNT], frames)
+            guess = guess.stepped(step[: u.COUNT], frames)
             if np.abs(step[: u.COUNT] / u.USEFUL).max() < _CONVERGED:
                 break
         noise = _noise(evidence, guess, noise)
-    noise = _as_told(evidence, guess, noise)
+    noise = _with_long_term_errors(evidence, guess, noise)
     H, _ = _normal(evidence, guess, noise, prior)
     shared = np.eye(len(H), u.COUNT)
     gain: Array = cho_solve(cho_factor(H, lower=True), shared).T
     pictures = _pictures(evidence, guess, noise)
-    alone, larger = pictures_part(gain, u.COUNT, pictures, evidence.grounds)
+    alone, larger = images_covariance(gain, u.COUNT, pictures, evidence.grounds)
     P = gain[:, : u.COUNT] + alone * (np.outer(larger, larger) - 1.0)
     P = 0.5 * (P + P.T)
     information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(prior)
@@ -108,8 +108,8 @@ def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise
     return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
 
 
-def _as_told(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> _Noise:
-    """Of the reported covariance: positions stray further than from picture to picture."""
+def _with_long_term_errors(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> _Noise:
+    """Noise whose position errors are those over minutes, for the reported covariance."""
     placed = evidence.placed
     if not placed.any():
         return noise
@@ -121,7 +121,7 @@ def _normal(
     evidence: CalibrationProblem, guess: Guess, noise: _Noise, prior: Array
 ) -> tuple[Array, Array]:
     """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,). prior: (COUNT,)
-    information of the weak priors; of what is fixed, certainty.
+    information of the weak priors; very large for a fixed value.
     """
     K = len(evidence.times_s)
     M = u.COUNT + 6 * K
@@ -148,13 +148,13 @@ def _derivatives(
         h = _DIFFERENCE * (1.0 if j < 3 else 0.01)
         step = np.zeros((K, 6))
         step[:, j] = h
-        by_frame[..., j] = (function(guess.moved(none, step)) - value) / h
+        by_frame[..., j] = (function(guess.stepped(none, step)) - value) / h
     by_shared = np.zeros((*value.shape, u.COUNT))
     still = np.zeros((K, 6))
     for j in shared:
         step = none.copy()
         step[j] = h = 1e-4 * u.USEFUL[j]
-        by_shared[..., j] = (function(guess.moved(step, still)) - value) / h
+        by_shared[..., j] = (function(guess.stepped(step, still)) - value) / h
     return value, by_frame, by_shared
 
 
@@ -182,7 +182,7 @@ def _add_wander(
     function: Callable[[Guess], Array], name: str, wander: GaussMarkovProcess | AttitudeProcess,
     evidence: CalibrationProblem, guess: Guess, H: Array, g: Array,
 ) -> None:  # fmt: skip
-    """One account of the autopilot's: each value less what is left of the one before it."""
+    """Add the autopilot's residuals, whitened by their error process, to H and g."""
     used = evidence.placed if name == "places" else np.ones(len(guess.places), bool)
     value, by_frame, by_shared = _derivatives(function, guess, range(u.LATE, u.COUNT))
     which = np.flatnonzero(used)

@@ -40,8 +40,8 @@ class ImageNormalEquations:
         by_frame: Array,
         by_optics: Array,
     ) -> ImageNormalEquations:
-        """Of N parts: values (N, 2), derivatives (N, 2, 6) and (N, 2, S). owner: (N,) each one's
-        picture, ascending, none without a part.
+        """From N patches: values (N, 2), derivatives (N, 2, 6) and (N, 2, S). owner: (N,) image of
+        each patch, ascending, each with one at least.
         """
         begins = np.flatnonzero(np.diff(owner, prepend=-1))
         weighted, weighted_optics = (weight[:, None, None] * d for d in (by_frame, by_optics))
@@ -55,7 +55,7 @@ class ImageNormalEquations:
         return cls(*(np.add.reduceat(one, begins, axis=0) for one in each))
 
 
-def pictures_part(
+def images_covariance(
     gain: Array, count: int, pictures: ImageNormalEquations, grounds: Array
 ) -> tuple[Array, Array]:
     """The images' part (C, C) of the shared values' covariance for independent image errors, and

@@ -11,8 +11,8 @@ from localizer.geometry.pose import Array
 
 @dataclass(frozen=True)
 class Unknown:
-    """One value. sigma: prior of a deployment (weak); useful: accuracy from which the flight counts
-    as informative. scale: from the value to the shown unit.
+    """One estimated value. sigma: its weak prior; useful: accuracy from which the flight counts as
+    informative. scale: from the value to the shown unit.
     """
 
     name: str

@@ -38,7 +38,7 @@ class BoardView:
 
 
 class BoardViews:
-    """Takes images of one camera in order and keeps the views that add information."""
+    """Takes images of one camera in order and keeps the views of the board that add information."""
 
     def __init__(self, width: int, height: int) -> None:
         self._size = (width, height)
@@ -48,8 +48,8 @@ class BoardViews:
         self._last: tuple[Array, Array] | None = None
         self.views: list[BoardView] = []
 
-    def take(self, image: Image) -> str:
-        """Add an image (H, W, 3); returns the result in words."""
+    def add_image(self, image: Image) -> str:
+        """Add an image (H, W, 3); returns the result in words for the user."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         corners, names, _, _ = self._detector.detectBoard(grey)
         if names is None or len(names) < _LEAST_CORNERS:
@@ -99,8 +99,8 @@ class BoardViews:
         return wanted
 
     def _is_still(self, ids: Array, pixels: Array) -> bool:
-        """Whether the corners have not moved, so that there is no blur and no rolling-shutter
-        shear.
+        """Whether the corners have not moved since the last image, so that there is no blur and no
+        rolling-shutter shear.
         """
         if self._last is None:
             return False
@@ -128,7 +128,7 @@ class BoardViews:
 
 
 def _side_px(ids: Array, pixels: Array) -> float:
-    """A square's side in the picture, the shorter one of a board that is tilted."""
+    """Side of a square in the image, pixels; the shorter one of a tilted board."""
     place = {int(name): pixel for name, pixel in zip(ids, pixels, strict=True)}
     row = ACROSS - 1
     sides = []

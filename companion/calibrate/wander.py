@@ -29,7 +29,7 @@ _FEW = 100  # frames suffice for the sigmas
 
 @dataclass(frozen=True)
 class GaussMarkovProcess:
-    """Independent along three axes. sigma, memory_s (correlation time): (3,)."""
+    """Error process, independent along three axes. sigma, memory_s (correlation time): (3,)."""
 
     sigma: Array
     memory_s: Array
@@ -68,11 +68,11 @@ class GaussMarkovProcess:
         return cls(sigmas, memories)
 
     def over_long_steps(self, left: Array, times_s: Array) -> GaussMarkovProcess:
-        """The same correlation times, with sigmas that are at least those of steps over
+        """The same correlation times, with sigmas at least those of the residuals' changes over
         `_LONG_STEP_S`.
 
         An EKF smooths its receiver's errors from frame to frame, so short steps underestimate its
-        drift. left: residuals (K, 3).
+        drift. left: residuals (K, 3); times_s: (K,) their times.
         """
         spacing_s = max(float(np.median(np.diff(times_s))), 1e-3)
         stride = max(1, round(_LONG_STEP_S / spacing_s))
@@ -182,7 +182,7 @@ class Likelihood:
 
 
 def _covariances(logs: Array, memory_s: float, up: Array, times_s: Array) -> list[Array]:
-    """(3 K, 3 K) of each of the five sources."""
+    """Covariance (3 K, 3 K) of each of the five sources."""
     gaps = np.abs(times_s[:, None] - times_s)
     quick, slow = np.exp(-gaps / memory_s), np.exp(-gaps / _COMPASS_S)
     upright = up.reshape(-1, 1) @ up.reshape(1, -1)

@@ -1,4 +1,4 @@
-"""Collect views of the board from a stream until there are enough."""
+"""Collects views of the board from a stream until there are enough."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.sources import SourceSettings, open_source
 from localizer.geometry.camera import Camera
 from localizer.pictures import write_rgb
 
-Told = Callable[[int, str, list[str]], None]
+OnView = Callable[[int, str, list[str]], None]
 _QUIET_PICTURES = 30  # of the same word, after which it is said again
 
 
@@ -27,11 +27,13 @@ class BoardViewing:
     height: int
 
 
-def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> BoardViewing:
+def watch_board(
+    source: str, seconds: float, on_view: OnView, keep: Path | None = None
+) -> BoardViewing:
     """Collect views of the board until all are there, the source ends, or `seconds` have passed.
 
-    told: called after each change with the views, the result of the newest image and the missing
-    views. keep: folder for the images used.
+    source: as `open_source`. on_view: called after each change with the views, the result of the
+    newest image and the missing views. keep: folder for the images used, None for none.
     """
     size = read_stream_size(source)
     views = BoardViews(size.width, size.height)
@@ -46,12 +48,12 @@ def watch_board(source: str, seconds: float, told: Told, keep: Path | None = Non
     last, quiet = "", 0
     try:
         for frame in feed.frames():
-            word = views.take(frame.image)
+            word = views.add_image(frame.image)
             quiet = 0 if word != last else quiet + 1
             if word == "taken" and keep is not None:
                 write_rgb(keep / f"view-{len(views.views):03d}.png", frame.image)
             if quiet % _QUIET_PICTURES == 0:
-                told(len(views.views), word, views.missing())
+                on_view(len(views.views), word, views.missing())
             last = word
             if word == "taken" and not views.missing():
                 break

@@ -1,3 +1,4 @@
-"""Check in flight whether focal length, boresight and timestamps are as configured. It raises
-alerts and changes no parameter; ``companion.calibrate`` estimates them.
+"""Checks in flight whether focal length, boresight and timestamps are as configured.
+
+Alerts only: no parameter changes; ``companion.calibrate`` estimates them.
 """

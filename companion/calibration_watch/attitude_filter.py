@@ -1,7 +1,7 @@
 """Estimates boresight and time offset from registered attitude, gimbal and autopilot.
 
-A mounting, gimbal or compass error is a constant angle. A time offset is an angle of turn rate
-times delay.
+A mounting, gimbal or compass error is a constant angle. The error of a time offset is the turn rate
+times the delay.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class AttitudeFilter:
         """Reset the time offset to unknown."""
         self._forget([_LATE])
 
-    def take(
+    def add(
         self, seen: CalibrationObservation, known: AutopilotObservation, seconds: float
     ) -> None:
-        """Add an observation, so many seconds after the one before."""
+        """Add an observation and the autopilot's data, `seconds` after the one before."""
         self._cov = self._cov + np.diag(np.square(_WALKS) * min(seconds, 10.0))
         if known.ned_from_camera is None or known.turn is None:
             return
@@ -93,7 +93,7 @@ class AttitudeFilter:
 
 
 def level_axes(ned_from_camera: Array) -> Array:
-    """Rows: down (yaw), right (pitch), forward (roll) of a camera, each level or plumb, NED."""
+    """Axes of a camera, made level, as rows in NED: down (yaw), right (pitch), forward (roll)."""
     forward = ned_from_camera[:, 2] * np.array([1.0, 1.0, 0.0])
     if np.linalg.norm(forward) < _LEVEL_TURN:
         forward = -ned_from_camera[:, 1] * np.array([1.0, 1.0, 0.0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CalibrationLimits:
-    """An error above its limit by four sigmas raises an alert and inhibits injection."""
+    """A value above its limit and four of its sigmas raises an alert and inhibits injection."""
 
     enabled: bool = True
     focal_share: float = 0.025  # focal length error

@@ -20,19 +20,19 @@ _LONG_AGO_NS = 10_000_000_000  # the ground below may be another since
 
 class GroundView:
     """Tracks ground distance and width of the view from registered frames. horizontal_fov_deg: used
-    where an observation has none.
+    for observations without one.
     """
 
     def __init__(self, horizontal_fov_deg: float) -> None:
         self._fov_deg = horizontal_fov_deg
         self._newest: CalibrationObservation | None = None
 
-    def add(self, sighting: CalibrationObservation) -> None:
+    def add(self, observation: CalibrationObservation) -> None:
         """Add a registered frame that was accepted against the map."""
-        self._newest = sighting
+        self._newest = observation
 
     def height_m(self, state: VehicleState, now_ns: int) -> float | None:
-        """Height above the ground, the largest of the known ones; None if none is known.
+        """Height above the ground, the largest of the known ones (m); None if none is known.
 
         now_ns: time of the query; observations from long before it are not used.
         """
@@ -43,14 +43,14 @@ class GroundView:
         return max(known, default=None)
 
     def width_m(self, state: VehicleState, now_ns: int) -> float:
-        """Width of the ground in the frame, m."""
+        """Width of the ground in the frame at now_ns, m."""
         newest = self._newest
         if newest is not None and now_ns - newest.time_ns < _HOLDS_NS:
-            return newest.depth_m * _spread(newest.horizontal_fov_deg)
+            return newest.depth_m * _width_ratio(newest.horizontal_fov_deg)
         height_m = self.height_m(state, now_ns)
-        return (_WIDTH_HEIGHT_M if height_m is None else height_m) * _spread(self._fov_deg)
+        return (_WIDTH_HEIGHT_M if height_m is None else height_m) * _width_ratio(self._fov_deg)
 
 
-def _spread(fov_deg: float) -> float:
-    """Width of the view divided by its distance."""
+def _width_ratio(fov_deg: float) -> float:
+    """Width of the view divided by its distance, at this horizontal field of view."""
     return 2.0 * math.tan(math.radians(fov_deg) / 2.0)

@@ -49,7 +49,7 @@ class MapOffsetTelemetry(Protocol):
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time, while the EKF uses GNSS."""
+        """The EKF's latitude, longitude and altitude at a time; None unless the EKF uses GNSS."""
         ...
 
     def report_alert(self, alert: Alert) -> None:
@@ -59,8 +59,8 @@ class MapOffsetTelemetry(Protocol):
 
 @dataclass(frozen=True)
 class MapOffset:
-    """The map's offset from GNSS. ne_m: north, east; covariance: (2, 2), GNSS's own bias included;
-    significant: GNSS's errors do not explain it.
+    """The map's offset from GNSS. ne_m: north, east, m; covariance: (2, 2), GNSS's own bias
+    included; blocks: number of averages used; significant: GNSS's errors do not explain the offset.
     """
 
     ne_m: tuple[float, float]
@@ -144,7 +144,7 @@ class MapOffsetEstimator:
         }
 
     def check(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
-        """Compare the fix with GNSS; return it shifted if the offset is applied."""
+        """Add a fix, to be compared with GNSS; return it, shifted if the policy is "apply"."""
         if seen.state is TrackingState.TRACKING and not self._gnss_is_ours:
             self._waiting.append(fix)
         while self._waiting and fix.time_ns - self._waiting[0].time_ns >= _WAITS_NS:
@@ -193,7 +193,7 @@ class MapOffsetEstimator:
         )
 
     def _shifted(self, fix: VisionFix) -> VisionFix:
-        """The fix corrected by the applied offset, which changes slowly, without a jump."""
+        """The fix corrected by the applied offset, which is changed slowly to avoid jumps."""
         shift = self._shift
         usable = shift is not None and shift.significant and math.hypot(*shift.ne_m) <= _LARGEST_M
         if shift is not None and usable:

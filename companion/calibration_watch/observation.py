@@ -51,9 +51,9 @@ class CalibrationEstimate:
     sigma: float
 
     def exceeds(self, limit: float) -> bool:
-        """Whether the error is above the limit with four sigmas of confidence."""
+        """Whether the value is above the limit and differs from zero by four sigmas."""
         return abs(self.value) > limit and abs(self.value) > 4.0 * self.sigma
 
     def is_within(self, limit: float) -> bool:
-        """Whether the error is below the limit with confidence."""
+        """Whether the value plus two sigmas is below the limit."""
         return abs(self.value) + 2.0 * self.sigma < limit

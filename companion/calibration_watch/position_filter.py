@@ -61,7 +61,7 @@ class PositionFilter:
         return self._figure(_T)
 
     def forget_motion(self) -> None:
-        """Reset the motion since the last observation: after a gap or a jump of vision."""
+        """Forget the motion since the last observation, after a gap or a jump of vision."""
         for at in (_P, _V, _A):
             self._loosen(at, 2)
 
@@ -70,8 +70,8 @@ class PositionFilter:
         self._loosen(_T, 1)
 
     def predict(self, moved: Array, faster: Array, seconds: float) -> None:
-        """Predict with the IMU over so many seconds: displacement beyond the velocity's, and change
-        of velocity, (2,) each.
+        """Predict with the IMU over `seconds`. moved: displacement beyond that of the velocity, m;
+        faster: change of velocity, m/s; (2,) each, north and east.
         """
         h = seconds
         transition = np.eye(_SIZE)
@@ -89,14 +89,14 @@ class PositionFilter:
         self._x[_V : _V + 2] += faster
         self._cov = transition @ self._cov @ transition.T + noise
 
-    def take(
+    def add(
         self,
         place: Array,
         seen: CalibrationObservation,
         known: AutopilotObservation,
         climb_mps: float,
     ) -> None:
-        """Add an observation at `place` (2,), north and east of a fixed point, m."""
+        """Add an observation at `place` (2,), north and east, m. climb_mps: climb rate."""
         axis = seen.ned_from_camera[:, 2]
         behind = seen.depth_m * axis  # by which a share of 1 would put the camera back
         # Heights first: they tell a lens from a lag, which is all horizontal.
@@ -136,8 +136,8 @@ class PositionFilter:
         down_m: float,
         climb_mps: float,
     ) -> bool:
-        """Vision's height is `focal x down_m` too large, and behind a climb by what it is late.
-        Returns whether the other heights agree with what is known.
+        """Compare heights. Vision's height is `focal x down_m` too large, and lags a climb by the
+        time offset. False if the other heights contradict the estimate.
         """
         agreed = True
         height = seen.place[2]

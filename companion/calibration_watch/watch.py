@@ -1,4 +1,4 @@
-"""The calibration watch: observations in, estimates out. It has no threads and no clock."""
+"""The calibration watch: observations in, estimates out. No threads and no clock."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Known:
 
 
 class CalibrationWatch:
-    """Use from one thread. Call `add` with observations, then `step`."""
+    """Estimates calibration errors; one thread. Call `add`, then `step`."""
 
     def __init__(self, limits: CalibrationLimits) -> None:
         self._limits = limits
@@ -78,13 +78,13 @@ class CalibrationWatch:
         self._kept: deque[_Known] = deque(maxlen=_KEPT)
         self._doubted_ns: int | None = None
 
-    def add(self, sighting: CalibrationObservation) -> None:
+    def add(self, observation: CalibrationObservation) -> None:
         """Add a registered frame that was accepted against the map."""
         if self._limits.enabled:
-            self._waiting.append(sighting)
+            self._waiting.append(observation)
 
-    def distrust(self, since_ns: int) -> None:
-        """Exclude frames from this time on, because they are frozen or repeated, and undo what the
+    def exclude_since(self, since_ns: int) -> None:
+        """Exclude frames from since_ns on, because they are frozen or repeated, and undo what the
         filters learned from them. Call it as long as this lasts.
         """
         self._waiting = deque((s for s in self._waiting if s.time_ns <= since_ns), _QUEUE)
@@ -97,12 +97,12 @@ class CalibrationWatch:
         self._position, self._attitude = known.position, known.attitude
         self._last, self._last_ns = None, since_ns
 
-    def doubt_stamps(self, since_ns: int) -> None:
-        """The timestamps may change at this time: discard the estimated time offset."""
+    def suspect_timestamps(self, since_ns: int) -> None:
+        """Discard the estimated time offset: timestamps may have changed at since_ns."""
         self._doubted_ns = since_ns
 
     def step(self, now_ns: int, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
-        """Process the new observations; call it a few times a second."""
+        """Process the new observations; called a few times a second."""
         if not self._limits.enabled:
             return
         state = vehicle.state()
@@ -122,18 +122,20 @@ class CalibrationWatch:
         angle, late = angles[worst], self._lateness()
         # An EKF that follows late positions turns its own heading away (5 degrees in 8 s at 10 m/s,
         # ArduPilot): then nobody can tell whether the camera is off, or the EKF.
-        sigma = math.inf if not self._on_gnss and _tells(late) else math.degrees(angle.sigma)
+        sigma = (
+            math.inf if not self._on_gnss and _is_significant(late) else math.degrees(angle.sigma)
+        )
         boresight = CalibrationEstimate(math.degrees(angle.value), sigma)
         return CalibrationFigures(self._position.focal, late, boresight, AXES[worst])
 
-    def known_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
-        """Position error that the estimated calibration errors cause, metres."""
+    def position_error_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
+        """Position error caused by the estimated errors of focal length and time (if True), m."""
         focal_m = abs(self._position.focal.value) * self._depth_m if focal else 0.0
         return focal_m + (abs(self._lateness().value) * speed_mps if time else 0.0)
 
     def _lateness(self) -> CalibrationEstimate:
-        """Time offset from the motion over ground; the camera's rotation is used only where it
-        agrees.
+        """Time offset from the motion over ground; that from the camera's rotation is used only if
+        it agrees.
 
         The angles of a gimbal may be late themselves. A camera without gimbal rotates with the
         autopilot's own attitude. There the more certain of both estimates is used, if the other one
@@ -143,7 +145,7 @@ class CalibrationWatch:
             return CalibrationEstimate(0.0, math.inf)
         way, turns = self._position.late_s, self._attitude.late_s
         if not self._fixed:
-            return _fused(way, turns) if _tells(way) and _agree(way, turns) else way
+            return _fused(way, turns) if _is_significant(way) and _agree(way, turns) else way
         surer, other = (way, turns) if way.sigma <= turns.sigma else (turns, way)
         limit = self._limits.time_s
         # The autopilot's own attitude may lag, too: then the turns are sure of a time that the way
@@ -172,7 +174,7 @@ class CalibrationWatch:
             self._kept.append(copy.deepcopy(known_now))
         known = self._evidence(seen, state, vehicle)
         self._on_gnss = known.north_east_m is not None
-        self._attitude.take(seen, known, gap_s)
+        self._attitude.add(seen, known, gap_s)
         moved = track.at(seen.time_ns)
         if moved is None:
             self._last = None
@@ -189,7 +191,7 @@ class CalibrationWatch:
             self._anchor = seen.place[:2]
         place = np.array(north_east(*self._anchor, *seen.place[:2]))
         climb = -(state.local_velocity_ned or (0.0, 0.0, 0.0))[2]
-        self._position.take(place, seen, known, climb)
+        self._position.add(place, seen, known, climb)
 
     def _evidence(
         self, seen: CalibrationObservation, state: VehicleState, vehicle: VehicleTelemetry
@@ -228,7 +230,7 @@ class _History:
         return float(np.interp(time_ns, times, values))
 
 
-def _tells(figure: CalibrationEstimate) -> bool:
+def _is_significant(figure: CalibrationEstimate) -> bool:
     """Whether the estimate differs from zero significantly."""
     return abs(figure.value) > 2.0 * figure.sigma
 

@@ -62,7 +62,7 @@ def console_command(
 
 
 def require_extra() -> None:
-    """`ConfigError` where the packages of the extra `console` are not installed."""
+    """`ConfigError` if the packages of the extra `console` are not installed."""
     try:
         for name in ("starlette", "uvicorn", "websockets"):
             import_module(name)
@@ -71,7 +71,7 @@ def require_extra() -> None:
 
 
 def serve(site: ConsoleSite) -> None:
-    """Serve until interrupted. Prints the address when the page can be opened."""
+    """Serve the page until interrupted. Prints the address once the page can be opened."""
     from companion.console.serving import Server
 
     def tell() -> None:
@@ -83,7 +83,7 @@ def serve(site: ConsoleSite) -> None:
 
 
 def _end_with_input() -> None:
-    """End when the standard input closes: the flight process that started this one has ended."""
+    """End with the standard input: the flight process that started this one has ended."""
     while sys.stdin.buffer.read(1):
         pass
     os._exit(0)

@@ -21,7 +21,7 @@ from localizer.geometry.trajectory import StampedPose
 
 
 class InputFormat(str, Enum):
-    """What is read."""
+    """Format of the source."""
 
     POSES = "poses"
     TUM = "tum"
@@ -32,7 +32,7 @@ class InputFormat(str, Enum):
 
 
 class OutputFormat(str, Enum):
-    """What is written."""
+    """Format of the result."""
 
     POSES = "poses"
     TUM = "tum"
@@ -42,7 +42,7 @@ class OutputFormat(str, Enum):
 
 
 class HeightDatum(str, Enum):
-    """What photos' heights are above."""
+    """Datum of the heights in photo tags."""
 
     AMSL = "amsl"
     ELLIPSOIDAL = "ellipsoidal"
@@ -98,7 +98,7 @@ def convert_command(
 
 
 def _refuse_footage(source: Path, out: Path, to: OutputFormat) -> None:
-    """`ConfigError` where the result would replace a photo, its sidecar or a video."""
+    """`ConfigError` if the result would replace a photo, its sidecar or a video."""
     from companion.recorded.photo_tags import PHOTO_SUFFIXES, RAW_SUFFIXES
     from companion.recorded.video import VIDEO_SUFFIXES
 
@@ -117,7 +117,7 @@ def _on_earth(separation_m: float) -> float:
 
 
 def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame | None, float | None]:
-    """The ENU frame and the geoid separation there, as far as given."""
+    """The ENU frame and the geoid separation (m) there; None for what is not given."""
     if map_cache is not None and origin is not None:
         raise ConfigError("give either --map or --origin LAT,LON,HEIGHT")
     if origin is not None:
@@ -134,7 +134,7 @@ def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame | Non
 def _dated(
     poses: Sequence[StampedPose], times: Path | None, *, needed: bool
 ) -> tuple[StampedPose, ...]:
-    """The poses with the file's times, or with the file's names for their times."""
+    """The poses with the file's times, or with its names for their times. needed: times are."""
     if times is None:
         if needed and any(pose.time_ns is None for pose in poses):
             raise ConfigError("these poses have no times: give --times timestamps.txt")

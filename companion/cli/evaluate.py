@@ -23,9 +23,9 @@ from companion.recorded.sequence import sequence_of
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, tally
-from companion.trajectory import stamped, write_trajectory
+from companion.trajectory import to_stamped_pose, write_trajectory
 from companion.versions import made_by
-from companion.writing import made_folder, writing
+from companion.writing import make_folder, writing
 from localizer.config import LocalizerConfig
 from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -180,7 +180,7 @@ def evaluate_command(
 def place_finder(
     stack: MapStack, config: LocalizerConfig, known: SimulatedPlaceData | None
 ) -> Iterator[PlaceFinder | None]:
-    """The search for a position without a prior, if the option selects it."""
+    """The search for a position without a prior; yields None if the option does not select it."""
     opened = None if known is None else open_relocalizer(stack.cache, config)
     if known is None or opened is None:
         yield None
@@ -199,7 +199,7 @@ def _print_problems(frames: list[EvaluatedFrame]) -> None:
 
 
 def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
-    """The columns of the paper's Table 2, and how many images could not be used."""
+    """Print the columns of the paper's Table 2, and how many images could not be used."""
     caption = "medians of localized frames; recalls and completeness of all"
     m = metrics
     table = Table(title=title, caption=caption)
@@ -226,7 +226,7 @@ def _text(value: float | None, digits: int) -> str:
 
 def _prepare(folder: Path) -> None:
     """Create the report's folder and check that it is writable, before the long computation."""
-    with writing(made_folder(folder, "--report"), "--report"), TemporaryFile(dir=folder):
+    with writing(make_folder(folder, "--report"), "--report"), TemporaryFile(dir=folder):
         pass
 
 
@@ -251,16 +251,16 @@ def _write_report(
 def _write_trajectories(
     folder: Path, frames: list[EvaluatedFrame], data: Sequence, local: LocalFrame
 ) -> None:
-    """What was localized, and the truth beside it: ``evo_ape tum truth.tum trajectory.tum``."""
+    """Write localized poses and the truth, for ``evo_ape tum truth.tum trajectory.tum``."""
     estimates = [(f.name, f.estimate) for f in frames if f.estimate is not None]
-    write_trajectory(folder, [stamped(n, e) for n, e in estimates if e.accepted], local)
+    write_trajectory(folder, [to_stamped_pose(n, e) for n, e in estimates if e.accepted], local)
     names = (path.name for path in data.images)
     truth = map(StampedPose, names, data.truth, data.times_ns)
     write_tum(folder / "truth.tum", truth)
 
 
 def _shown(frames: list[EvaluatedFrame]) -> list[int]:
-    """The worst frames; at most half of them rejected, if others were localized."""
+    """Indices of the worst frames; at most half of them rejected, if others were localized."""
     order = worst_first(frames)
     rejected = [i for i in order if frames[i].translation_error_m is None]
     localized = [i for i in order if frames[i].translation_error_m is not None]
@@ -275,7 +275,7 @@ def _write_overlays(
     renderer: MapRenderer,
     camera: Camera,
 ) -> None:
-    """The worst frames beside the map rendered at their estimated poses."""
+    """Write images of the worst frames beside the map rendered at their estimated poses."""
     undistort = Undistorter(data.camera, camera)
     for i in _shown(frames):
         estimate = frames[i].estimate

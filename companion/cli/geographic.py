@@ -9,7 +9,7 @@ from companion.errors import ConfigError
 
 
 def numbers(text: str, option: str, names: Sequence[str]) -> tuple[float, ...]:
-    """The numbers of ``--prior 47.1,8.5,500,...``; `names` are what they mean, in order."""
+    """Parse ``--prior 47.1,8.5,500,...``; `names`: meanings of the numbers, for the error."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

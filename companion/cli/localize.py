@@ -23,8 +23,8 @@ from companion.offline.localize import (
 )
 from companion.sources.folder_source import list_images
 from companion.terminal.steps import COMPILES, show_count, tally
-from companion.trajectory import TRAJECTORY_NAMES, stamped, write_trajectory
-from companion.writing import made_folder, refuse_input, writing
+from companion.trajectory import TRAJECTORY_NAMES, to_stamped_pose, write_trajectory
+from companion.writing import make_folder, refuse_input, writing
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -106,7 +106,7 @@ def localize_command(
     rows = read_poses(priors) if priors is not None else [_row(paths[0].name, str(prior))]
     if paths[0].name not in {row.name for row in rows}:
         raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")
-    made_folder(out, "--out")
+    make_folder(out, "--out")
     for name in (*TRAJECTORY_NAMES, "images.csv"):
         refuse_input(out / name, "--out", priors, camera, *paths)
     sigmas = Sigmas(prior_sigma_m, prior_sigma_deg, attitude_sigma_deg, height_sigma_m)
@@ -162,14 +162,16 @@ def _print(found: Sequence[LocalizedImage], frame: LocalFrame) -> int:
 
 
 def _sigmas(estimate: PoseEstimate) -> list[float]:
-    """East, north and up in metres; the largest of the attitude in degrees."""
+    """Sigmas: east, north, up (m), and the largest of the attitude (degrees)."""
     sigma = np.sqrt(estimate.covariance.diagonal())
     return [*(float(x) for x in sigma[:3]), float(np.degrees(sigma[3:].max()))]
 
 
 def _write(folder: Path, found: Sequence[LocalizedImage], frame: LocalFrame) -> None:
     used = [
-        stamped(i.name, i.estimate) for i in found if i.estimate is not None and i.estimate.accepted
+        to_stamped_pose(i.name, i.estimate)
+        for i in found
+        if i.estimate is not None and i.estimate.accepted
     ]
     write_trajectory(folder, used, frame)
     with (folder / "images.csv").open("w", newline="", encoding="utf-8") as file:

@@ -173,7 +173,7 @@ def build(
 def _require_flat(
     ground_m: float, source: list[Path], height_unit: str | None, heights: str | None
 ) -> None:
-    """`ConfigError` where the options contradict a flat ground."""
+    """`ConfigError` if the options contradict a flat ground."""
     from localizer.map.importers.height_crs import unit_of
     from localizer.map.importers.rules import HIGHEST_M, LOWEST_M
 

@@ -50,7 +50,7 @@ def replay_command(
     table.add_row("position differs, m", *_spread(summary.translation_m, 2))
     table.add_row("rotation differs, °", *_spread(summary.rotation_deg, 3))
     console = Console()
-    if doubt := loaded.tables.flown.doubt(TileCache.open(loaded.config.map)):
+    if doubt := loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map)):
         console.print(f"[yellow]warning:[/] {escape(doubt)}", highlight=False, soft_wrap=True)
     console.print(table)
     console.print(
@@ -69,7 +69,7 @@ def _spread(values: Array, digits: int) -> tuple[str, ...]:
 
 
 def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
-    """Serve the page on this machine with the record, and its neighbours to download."""
+    """Serve the page with the record on this machine; records beside it can be downloaded."""
     require_extra()
     from companion.console.records import Records
     from companion.console.replay_source import ReplaySource
@@ -87,7 +87,7 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
         raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
     with (
         show_steps(Console(stderr=True)) as say,
-        map_pictures(map_path, flown=tables.flown) as pictures,
+        map_pictures(map_path, flown=tables.flown_map) as pictures,
     ):
         say(f"reading {record} and its map")
         source = ReplaySource(tables, pictures)

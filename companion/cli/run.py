@@ -13,7 +13,7 @@ import typer
 
 from companion.cli.interrupts import end_at_once
 from companion.config import CompanionConfig
-from companion.supervision.kept_settings import keep, settings_of
+from companion.supervision.kept_settings import keep_settings, settings_of
 from companion.terminal.console_log import console_log
 from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice
@@ -61,9 +61,11 @@ def run_command(
     changes = {key: value for key, value in given.items() if value is not None}
     localizer = settings.localizer.model_copy(update=changes)
     settings = settings.model_copy(update={"localizer": localizer})
-    from companion.flight.standby import ready
+    from companion.flight.standby import released_companion
 
-    companion = ready(settings, standby=standby, pulse=pulse, restart=restart, lost_settings=lost)
+    companion = released_companion(
+        settings, standby=standby, pulse=pulse, restart=restart, lost_settings=lost
+    )
     if companion is None:
         return
 
@@ -85,7 +87,7 @@ def run_command(
 
 
 def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
-    """The exit code of the flight process, or of the last one."""
+    """Run the supervisor; returns the exit code of the last flight process."""
     from companion.supervision.processes import FlightProcess
     from companion.supervision.service_manager import ServiceManager
     from companion.supervision.supervisor import Supervisor, mark_dead
@@ -97,7 +99,7 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     def tell(alert: Alert) -> None:
         report_without_bridge(settings.bridge, alert)
 
-    begun, kept = count(), keep(settings)
+    begun, kept = count(), keep_settings(settings)
 
     def spawn(standby: bool) -> FlightProcess:
         if not next(begun):

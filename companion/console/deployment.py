@@ -1,4 +1,4 @@
-"""The deployment file in the console: show with help, check before writing, keep the old file."""
+"""The deployment file in the console: shows it with help, checks a new text, keeps the old file."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from localizer.plain_files import plain_text
 _MOST_BYTES = 64 << 10
 
 
-def shown(path: Path, editable: bool) -> dict[str, Any]:
-    """The file's text and the help; credentials only for someone who may change the file.
-    `ConfigError` if the file cannot be read. editable: they may.
+def read_for_page(path: Path, editable: bool) -> dict[str, Any]:
+    """The file's text and the help for its keys. editable: whether the reader may change the file;
+    otherwise credentials are hidden. `ConfigError` if the file cannot be read.
     """
     try:
         text = plain_text(path)
@@ -38,13 +38,13 @@ def shown(path: Path, editable: bool) -> dict[str, Any]:
 
 
 def check(path: Path, text: str) -> CompanionConfig:
-    """Check the text as a deployment; `ConfigError` names what is wrong.
+    """Check the text as a deployment at `path`; `ConfigError` names what is wrong.
 
-    Read from a file beside the real one, since relative paths begin there.
+    It is read from a file beside the real one, since relative paths begin there.
     """
     if len(text.encode()) > _MOST_BYTES:
         raise ConfigError(f"over {_MOST_BYTES >> 10} KiB; that is no deployment")
-    with _beside(path, text) as trial:
+    with _temporary_file(path, text) as trial:
         try:
             return load_config(trial)
         except ConfigError as error:
@@ -66,7 +66,7 @@ def replace(path: Path, text: str) -> Path:
         mode = path.stat().st_mode & 0o777
         kept.write_bytes(path.read_bytes())
         kept.chmod(mode)
-        with _beside(path, text) as fresh:
+        with _temporary_file(path, text) as fresh:
             fresh.chmod(mode)
             os.replace(fresh, path)
     except OSError as error:
@@ -75,7 +75,7 @@ def replace(path: Path, text: str) -> Path:
 
 
 def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, str]]:
-    """(key, default, description) of every setting."""
+    """(key, default, description) of every setting of the model; keys begin with `where`."""
     lines = []
     for name, field in settings(model).items():
         nested = nested_models(field.annotation)
@@ -89,7 +89,7 @@ def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, 
 
 
 @contextlib.contextmanager
-def _beside(path: Path, text: str) -> Iterator[Path]:
+def _temporary_file(path: Path, text: str) -> Iterator[Path]:
     """A temporary file with that text in the same folder."""
     try:
         number, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".yaml", dir=path.parent)

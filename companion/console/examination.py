@@ -13,7 +13,7 @@ _MOST_LINES = 400
 
 
 class Examination:
-    """Runs one check at a time."""
+    """Runs `companion doctor` as a process, one at a time."""
 
     def __init__(self, deployment: Path) -> None:
         self._deployment = deployment
@@ -22,15 +22,15 @@ class Examination:
         self._code: int | None = None
 
     def report(self) -> dict[str, Any]:
-        """The output so far. code: exit code of the doctor, None while it runs or
-        before the first.
+        """The output so far. code: exit code of the doctor, None while it runs or before the first
+        run.
         """
         running = self._task is not None and not self._task.done()
         return {"running": running, "lines": list(self._lines), "code": self._code}
 
     def begin(self, beside_flight: bool) -> bool:
-        """Start it; False if one is running. beside_flight: a flight uses the vehicle
-        and the feed.
+        """Start the doctor; False if it is running. beside_flight: a flight uses the vehicle and
+        the feed, which are not checked then.
         """
         if self._task is not None and not self._task.done():
             return False

@@ -10,7 +10,7 @@ _STALE = timedelta(seconds=30)
 
 
 def geojson(targets: list[dict[str, Any]]) -> dict[str, Any]:
-    """Points with what is known of them; heights above the ellipsoid."""
+    """The targets of a state document as GeoJSON points; heights above the ellipsoid."""
     return {
         "type": "FeatureCollection",
         "features": [
@@ -30,7 +30,7 @@ def geojson(targets: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def cursor_on_target(targets: list[dict[str, Any]], now: datetime | None = None) -> str:
-    """One event for each target."""
+    """The targets of a state document as Cursor on Target: one event for each."""
     now = now or datetime.now(timezone.utc)
     root = ElementTree.Element("events")
     for t in targets:

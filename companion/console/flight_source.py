@@ -1,4 +1,4 @@
-"""The running flight as a source, over its local socket; it may end and start again."""
+"""The running flight as a source, over its local socket; the flight may end and start again."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _READ = 1 << 20
 
 
 class FlightSource:
-    """Reconnects again and again; the last data stay, marked as not connected."""
+    """Connects to the flight again and again. The last data stay, marked as not connected."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -38,7 +38,7 @@ class FlightSource:
         return self._connection is not None
 
     async def changed(self) -> None:
-        """Returns when there are new data, or the connection changed."""
+        """Wait until there are new data, or the connection changes."""
         await self._event.wait()
 
     def watch(self, wanted: bool) -> None:
@@ -48,7 +48,7 @@ class FlightSource:
             self._send({"kind": "watch", "frames": wanted})
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """Send an order and wait for its result."""
+        """Send an order and wait for its result: whether it was executed, and a text."""
         if self._connection is None:
             return False, "no flight is connected"
         number = next(self._numbers)
@@ -69,11 +69,11 @@ class FlightSource:
                 await self._serve()
             except (OSError, LinkError) as error:
                 _log.debug("no flight at %s: %s", self._path, error)
-            self._tell()
+            self._wake_waiters()
             await asyncio.sleep(_AGAIN_S)
 
     async def _serve(self) -> None:
-        """One connection, until it ends."""
+        """Serve one connection until it ends."""
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         arrivals = SharedMemoryReader(connection)
         try:
@@ -88,7 +88,7 @@ class FlightSource:
             arrivals.close()
 
     async def _read(self, connection: socket.socket, arrivals: SharedMemoryReader) -> None:
-        """What came until now is taken whole; of it the newest is shown."""
+        """Read all messages that have arrived; only the newest of them is shown."""
         loop, decoder = asyncio.get_running_loop(), MessageDecoder()
         readable = asyncio.Event()
         loop.add_reader(connection, readable.set)
@@ -104,7 +104,7 @@ class FlightSource:
                     return
                 for message in decoder.feed(data):
                     self._take(message, arrivals)
-                self._tell()
+                self._wake_waiters()
         finally:
             loop.remove_reader(connection)
 
@@ -118,20 +118,20 @@ class FlightSource:
                 raise LinkError("a picture whose size is no number")
             message = Message(head, arrivals.read(size))
             self._send({"kind": "read"})
-        self.newest.take(message)
+        self.newest.add(message)
 
     def _answer(self, head: dict[str, Any]) -> None:
         future = self._answers.get(head.get("number", 0))
         if future is not None and not future.done():
             future.set_result((bool(head.get("ok")), str(head.get("text", ""))))
 
-    def _tell(self) -> None:
-        """Wake everybody that waits now."""
+    def _wake_waiters(self) -> None:
+        """Wake everybody that waits in `changed`."""
         event, self._event = self._event, asyncio.Event()
         event.set()
 
     def _send(self, head: dict[str, Any]) -> None:
-        """Whole or not at all: the flight reads at once, or it hangs and is left."""
+        """Send a message whole, or close: a flight that does not read at once hangs."""
         if self._connection is not None:
             data = encode(head)
             try:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.console.record_rows import ABSURD, estimate_of, last
+from companion.console.record_rows import ABSURD, estimate_of, last_row
 from companion.errors import StreamDecodeError
 from companion.live.protocol import Message
 from companion.offline.record import RecordTables, is_time_ns
@@ -20,7 +20,7 @@ from localizer.geometry.pose import Pose, quaternion_from_matrix
 
 class KeptPictures:
     """Returns each recorded frame once, at its time, with the map's view. pictures: renderer of the
-    map, None: no map view.
+    map, None: without map view.
     """
 
     def __init__(self, tables: RecordTables, pictures: MapPictures | None) -> None:
@@ -51,7 +51,7 @@ class KeptPictures:
             "image": [camera.width, camera.height], "estimate": None, "view": None,
         }  # fmt: skip
         parts = [rgb.tobytes()]
-        row = last(self._tables.estimates, "exposure_time_ns", time_ns)
+        row = last_row(self._tables.estimates, "exposure_time_ns", time_ns)
         if row is not None and self._tables.estimates["exposure_time_ns"][row] == time_ns:
             pose = _pose_of(self._tables.estimates, row)
             if pose is not None:
@@ -61,7 +61,7 @@ class KeptPictures:
         return Message(head, b"".join(parts))
 
     def _seen_from(self, pose: Pose, camera: Camera, head: dict[str, Any]) -> list[bytes]:
-        """The map's colours and depth at that pose; none without the map."""
+        """The map's colours and depth at that pose; [] without the map."""
         if self._map is None or self._map.renderer is None:
             return []
         target = camera.without_distortion()
@@ -71,7 +71,7 @@ class KeptPictures:
 
 
 def _pose_of(columns: Columns, row: int) -> Pose | None:
-    """world_from_camera of a row; None where a number lacks."""
+    """Pose world_from_camera of a row; None if a number is missing."""
     names = ("east_m", "north_m", "up_m", "qw", "qx", "qy", "qz")
     values = {name: np.asarray(columns[name][row : row + 1]) for name in names if name in columns}
     if len(values) < len(names) or not all(abs(v[0]) < ABSURD for v in values.values()):

@@ -1,7 +1,7 @@
 """Images for the page: the video as JPEG, the map's edges in it, and the map from the same pose.
 
-Nothing is rendered: what the localizer compared the frame with comes along with its depth, and is
-carried to the estimated pose.
+Nothing is rendered: the view with which the localizer compared the frame arrives with its depth,
+and is warped to the estimated pose.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class OverlayFrame:
 
 
 def unpack(message: Message) -> OverlayFrame:
-    """The arrays of a frame's message."""
+    """Unpack the arrays of a frame's message."""
     head, body = message.head, message.body
     width, height = head["image"]
     camera = Camera.from_dict(head["camera"]).resized(width, height)
@@ -78,7 +78,7 @@ def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]
     The header's `parts` are the lengths of the JPEG, the edges (uint16 pairs, pixels) and the map's
     JPEG. width_px: largest width of the image.
     """
-    picture = narrowed(unpack(message), width_px)
+    picture = reduced(unpack(message), width_px)
     parts = [_jpeg(picture.image), edges(picture).tobytes(), b""]
     if with_map and (warped := map_at_pose(picture)) is not None:
         parts[2] = _jpeg(warped)
@@ -102,8 +102,8 @@ def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]
     return struct.pack("<I", len(text)) + text + b"".join(parts)
 
 
-def narrowed(picture: OverlayFrame, width_px: int) -> OverlayFrame:
-    """The image reduced to this width, because a screen cannot show more."""
+def reduced(picture: OverlayFrame, width_px: int) -> OverlayFrame:
+    """The frame reduced to this width, because a screen cannot show more."""
     camera = picture.camera
     if camera.width <= width_px:
         return picture
@@ -114,7 +114,7 @@ def narrowed(picture: OverlayFrame, width_px: int) -> OverlayFrame:
 
 
 def utc_ms(monotonic_ns: int) -> float:
-    """A time of CLOCK_MONOTONIC, which all processes of a machine share, on its UTC clock."""
+    """UTC (ms since 1970) of a CLOCK_MONOTONIC time, which all processes of a machine share."""
     return time.time() * 1e3 - (time.monotonic_ns() - monotonic_ns) * 1e-6
 
 
@@ -170,7 +170,7 @@ def map_at_pose(picture: OverlayFrame) -> np.ndarray | None:
 
 
 def _knots(size: int) -> np.ndarray:
-    """Every `_GRID_PX` pixels from the first pixel's centre, the last at or beyond the last's."""
+    """A coordinate each `_GRID_PX` from the first pixel's centre to the last's or beyond."""
     return np.arange(-(-(size - 1) // _GRID_PX) + 1) * _GRID_PX + 0.5
 
 

@@ -15,8 +15,8 @@ _TARGET_NUMBERS = (
 )  # fmt: skip
 
 
-def last(columns: Columns, name: str, now_ns: int) -> int | None:
-    """Index of the last row at or before a time."""
+def last_row(columns: Columns, name: str, now_ns: int) -> int | None:
+    """Index of the last row whose column `name` is at or before now_ns; None without one."""
     if not columns:
         return None
     row = int(np.searchsorted(columns[name], now_ns, side="right")) - 1
@@ -56,7 +56,7 @@ def _last_fix_ns(columns: Columns, row: int) -> int | None:
 
 
 def _heading_deg(columns: Columns, row: int) -> float | None:
-    """Where the picture's top or the camera's axis points, whichever lies flatter."""
+    """Direction of the image's top or of the camera's axis, whichever is flatter."""
     w, x, y, z = (float(columns[k][row]) for k in ("qw", "qx", "qy", "qz"))
     forward = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     up = (-2 * (x * y - w * z), -(1 - 2 * (x * x + z * z)))
@@ -83,6 +83,6 @@ def target_of(columns: Columns, name: str, row: int) -> dict[str, Any] | None:
 
 
 def _pixel(columns: Columns, row: int) -> list[float] | None:
-    """Where it was in the picture of its time; None where it was not seen."""
+    """Pixel of the target in its frame; None if it was not seen."""
     pixel = [float(columns[k][row]) for k in ("u", "v") if k in columns]
     return pixel if len(pixel) == 2 and all(abs(x) < ABSURD for x in pixel) else None

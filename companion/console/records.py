@@ -19,7 +19,7 @@ _CHUNK = 256 << 10
 
 @dataclass(frozen=True)
 class RecordFolder:
-    """One record. started_utc_ns: None if unknown."""
+    """One record. started_utc_ns: None if unknown; ended: how the flight ended, "" if unknown."""
 
     name: str
     path: Path
@@ -28,12 +28,12 @@ class RecordFolder:
 
 
 class Records:
-    """Finds records by names that it listed itself, so that a request cannot give a path."""
+    """Lists records and finds them by listed names, so that a request cannot give a path."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
 
-    def listed(self) -> list[RecordFolder]:
+    def list_records(self) -> list[RecordFolder]:
         """Every record, newest first; links are left out."""
         if self._folder is None or not self._folder.is_dir():
             return []
@@ -50,8 +50,8 @@ class Records:
         return found[:_MOST]
 
     def find(self, name: str) -> RecordFolder | None:
-        """The record of exactly that name."""
-        return next((r for r in self.listed() if r.name == name), None)
+        """The record of exactly that name; None without one."""
+        return next((r for r in self.list_records() if r.name == name), None)
 
 
 def archive(record: RecordFolder) -> Iterator[bytes]:
@@ -70,8 +70,8 @@ def archive(record: RecordFolder) -> Iterator[bytes]:
 
 
 def _content(file: BinaryIO, size: int) -> Iterator[bytes]:
-    """So many bytes of a file, then zeros up to a whole block; zeros, too, for what it lost since
-    its size was reported. What was added since is left out.
+    """Yield `size` bytes of a file, then zeros up to a whole block. If the file has shrunk, zeros
+    fill it; if it has grown, the rest is left out.
     """
     left = size
     while left > 0:

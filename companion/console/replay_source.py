@@ -1,7 +1,7 @@
 """A finished flight as a source: plays its record, with a time bar.
 
-The map's view of a kept picture is rendered again at the recorded pose; where autopilot and
-receiver were comes from the .tlog.
+The map's view of a kept frame is rendered again at the recorded pose. The positions of autopilot
+and GNSS receiver come from the .tlog.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from companion.console.kept_pictures import KeptPictures
-from companion.console.record_rows import ABSURD, estimate_of, last, target_of
+from companion.console.record_rows import ABSURD, estimate_of, last_row, target_of
 from companion.console.source import Newest, sample_of
 from companion.live.protocol import Message
 from companion.offline.record import RecordTables
@@ -26,8 +26,8 @@ _HEARD_NS = 2_000_000_000  # a place of autopilot or receiver holds so long
 
 
 class ReplaySource:
-    """Plays the record's rows at their original speed. pictures: of its map; without it there is
-    neither the map view nor the autopilot's track.
+    """Plays the record's rows at their original speed. pictures: renderer of the map; without it
+    there is neither the map view nor the autopilot's track.
     """
 
     def __init__(self, tables: RecordTables, pictures: MapPictures | None = None) -> None:
@@ -57,11 +57,11 @@ class ReplaySource:
         """Does nothing: frames are read when their time comes."""
 
     async def changed(self) -> None:
-        """Return at the next step."""
+        """Wait for the next step."""
         await self._event.wait()
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """share: jump to this part of the flight, 0 to 1; play: continue or pause."""
+        """Execute. share: jump to this part of the flight, 0 to 1; play: continue or pause."""
         share, play = order.get("share"), order.get("play")
         if isinstance(share, int | float) and 0 <= share <= 1:
             self._at_s = float(share) * self._length_s
@@ -75,8 +75,8 @@ class ReplaySource:
         return True, "done"
 
     async def run(self) -> None:
-        """Play until cancelled; stops at the end."""
-        self.newest.take(Message({"kind": "hello", "mode": "record", **self._limits()}))
+        """Play until cancelled; pauses at the end of the record."""
+        self.newest.add(Message({"kind": "hello", "mode": "record", **self._limits()}))
         while True:
             await self._show()
             await asyncio.sleep(_STEP_S)
@@ -88,13 +88,13 @@ class ReplaySource:
 
     async def _show(self) -> None:
         now_ns = self._start_ns + round(self._at_s * 1e9)
-        self.newest.take(Message(self._state(now_ns)))
+        self.newest.add(Message(self._state(now_ns)))
         await self._take_picture(now_ns)
         event, self._event = self._event, asyncio.Event()
         event.set()
 
     def _fill_samples(self) -> None:
-        """The plots and tracks up to where the time bar stands."""
+        """Fill plots and tracks up to the time of the time bar."""
         self.newest.samples.clear()
         told, self._told = self._told, len(self._tables.events.get("time_ns", ()))
         first_s = max(self._at_s - _PLOTTED, 0.0)
@@ -109,7 +109,7 @@ class ReplaySource:
 
     def _state(self, now_ns: int) -> dict[str, Any]:
         tables = self._tables
-        row = last(tables.estimates, "exposure_time_ns", now_ns)
+        row = last_row(tables.estimates, "exposure_time_ns", now_ns)
         utc_ns = tables.utc_ns - tables.start_ns + now_ns
         estimate = None if row is None else estimate_of(tables.estimates, row)
         state = "-" if estimate is None else str(estimate["state"])
@@ -131,7 +131,7 @@ class ReplaySource:
         }  # fmt: skip
 
     def _rows(self, now_ns: int, seconds: float) -> slice:
-        """The estimates of the last seconds."""
+        """The rows of the estimates of the last `seconds`."""
         times = self._tables.estimates.get("exposure_time_ns", np.empty(0, np.int64))
         ends = np.searchsorted(times, [now_ns - round(seconds * 1e9), now_ns], side="right")
         return slice(int(ends[0]), int(ends[1]))
@@ -163,7 +163,7 @@ class ReplaySource:
         return told
 
     def _place(self, track: TimedTrack | None, now_ns: int) -> tuple[float, float] | None:
-        """Latitude and longitude, degrees, if told not long before."""
+        """Latitude and longitude, degrees, of a track at now_ns; None if it is outdated."""
         if track is None or self._map is None or self._map.cache is None:
             return None
         i = int(np.searchsorted(track.time_ns, now_ns, side="right")) - 1
@@ -197,7 +197,7 @@ class ReplaySource:
         ]  # fmt: skip
 
     async def _take_picture(self, now_ns: int) -> None:
-        """The newest kept picture, if it is another than the last."""
+        """Send the newest kept frame, if it is another than the last."""
         message = await asyncio.to_thread(self._pictures.newest, now_ns)
         if message is not None:
-            self.newest.take(message)
+            self.newest.add(message)

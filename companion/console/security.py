@@ -93,7 +93,7 @@ class _Bucket:
 
 
 class RequestGuard:
-    """An ASGI application that passes allowed requests to `app`."""
+    """An ASGI application that passes allowed requests to `app` and refuses the others."""
 
     def __init__(
         self,
@@ -125,10 +125,10 @@ class RequestGuard:
         headers: dict[bytes, list[bytes]] = {}
         for name, value in scope["headers"]:
             headers.setdefault(name.lower(), []).append(value)
-        length = _only(headers, b"content-length")
+        length = _single_header(headers, b"content-length")
         if not self._requests.take(self._clock()):
             refusal = (429, "too many requests")
-        elif not self._is_ours(_only(headers, b"host")):
+        elif not self._is_ours(_single_header(headers, b"host")):
             refusal = (421, "this console is not reached by that name (console.hosts)")
         elif self._is_foreign(scope, headers):
             refusal = (403, "a page of another site asked, or actions lack the header X-Console: 1")
@@ -142,20 +142,20 @@ class RequestGuard:
 
     def _is_foreign(self, scope: Scope, headers: dict[bytes, list[bytes]]) -> bool:
         """Whether the request may come from another site's page."""
-        host, origin = _only(headers, b"host"), _only(headers, b"origin")
+        host, origin = _single_header(headers, b"host"), _single_header(headers, b"origin")
         same = f"{'https' if self._config.tls_certificate else 'http'}://{host}".lower()
         if b"origin" in headers and (origin is None or origin.lower() != same):
             return True
-        if _only(headers, b"sec-fetch-site") not in (None, "same-origin", "none"):
+        if _single_header(headers, b"sec-fetch-site") not in (None, "same-origin", "none"):
             return True
         if scope["type"] == "websocket":
             return origin is None
         acts = scope["method"] not in ("GET", "HEAD")
-        return acts and _only(headers, ACTION_HEADER) != "1"
+        return acts and _single_header(headers, ACTION_HEADER) != "1"
 
     def _is_ours(self, host: str | None) -> bool:
         """Whether the Host header names this console: an IP address, localhost or a configured
-        name. Another name may be one that an attacker has made to point here.
+        name. An attacker may have made another name point here.
         """
         if host is None:
             return False
@@ -179,7 +179,7 @@ class RequestGuard:
         return any(hmac.compare_digest(g.encode(), self._token.encode()) for g in shown)
 
     def _login(self, scope: Scope) -> str | None:
-        """The cookie to set where the token came in the address, so that it does not stay there."""
+        """The cookie to set if the token came in the address, to remove the token there."""
         if self._token is None or scope["type"] != "http" or scope["path"] != "/":
             return None
         if not parse_qs(_query(scope)).get("token"):
@@ -188,8 +188,8 @@ class RequestGuard:
         return f"{COOKIE}={self._token}; HttpOnly; SameSite=Strict; Path=/{secure}"
 
 
-def _only(headers: dict[bytes, list[bytes]], name: bytes) -> str | None:
-    """The header's value; None where it is missing or there are several."""
+def _single_header(headers: dict[bytes, list[bytes]], name: bytes) -> str | None:
+    """The header's value; None if it is missing or there are several."""
     values = headers.get(name, [])
     return values[0].decode("latin-1") if len(values) == 1 else None
 
@@ -197,14 +197,14 @@ def _only(headers: dict[bytes, list[bytes]], name: bytes) -> str | None:
 def _cookie(headers: dict[bytes, list[bytes]]) -> str:
     jar: SimpleCookie = SimpleCookie()
     try:
-        jar.load(_only(headers, b"cookie") or "")
+        jar.load(_single_header(headers, b"cookie") or "")
     except Exception:  # what is no cookie is none
         return ""
     return jar[COOKIE].value if COOKIE in jar else ""
 
 
 def _bearer(headers: dict[bytes, list[bytes]]) -> str:
-    scheme, _, token = (_only(headers, b"authorization") or "").partition(" ")
+    scheme, _, token = (_single_header(headers, b"authorization") or "").partition(" ")
     return token if scheme.lower() == "bearer" else ""
 
 
@@ -213,7 +213,7 @@ def _query(scope: Scope) -> str:
 
 
 def _bounded(receive: Receive) -> Receive:
-    """Stops a body that is longer than it said, or than is taken at all."""
+    """Stop a body that is longer than stated, or than allowed."""
     taken = 0
 
     async def bounded() -> MutableMapping[str, Any]:

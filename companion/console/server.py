@@ -45,7 +45,7 @@ Answer = Callable[[Request], Awaitable[Response]]
 @dataclass(frozen=True)
 class ConsoleSite:
     """What the server serves. deployment: the file, None in a replay; token: required from every
-    client, None on loopback without one.
+    client, None: loopback without one.
     """
 
     config: ConsoleConfig
@@ -62,7 +62,7 @@ class RefusedError(CompanionError):
 
 
 class Pages:
-    """The connected browser pages and their shared images."""
+    """The connected browser pages and the images that they share."""
 
     def __init__(self, source: ConsoleSource) -> None:
         self._source = source
@@ -120,7 +120,7 @@ class Pages:
         }
 
     async def _picture(self, with_map: bool, width_px: int) -> bytes:
-        """Of the newest frame; made once for all pages that wish the same."""
+        """Message of the newest frame; made once for all pages with the same wishes."""
         newest, key = self._source.newest, (with_map, width_px)
         async with self._making:
             made = self._made.get(key)
@@ -132,7 +132,7 @@ class Pages:
             return made[1]
 
     async def _listen(self, socket: WebSocket, wishes: dict[str, Any]) -> None:
-        """What the page wants to see, and how many pictures it showed; anything else ends it."""
+        """Receive what the page wants, and how many frames it showed; anything else ends it."""
         while True:
             message = await socket.receive()
             if message["type"] != "websocket.receive":
@@ -153,7 +153,7 @@ class Pages:
 
 
 def _width_px(wished: Any) -> int:
-    """The smallest of the widths that fills so much of a screen; the largest if none was wished."""
+    """The smallest offered width that fills enough of a screen; the largest without a wish."""
     if not isinstance(wished, int | float):
         return WIDTHS_PX[-1]
     return next((width for width in WIDTHS_PX if width >= wished), WIDTHS_PX[-1])
@@ -172,19 +172,19 @@ class Views:
         return HTMLResponse((_STATIC / "index.html").read_text(encoding="utf-8"))
 
     async def about(self, _: Request) -> Response:
-        """The page's rights, and the map."""
+        """The reader's rights, and the map's position."""
         tiles = await run_in_threadpool(self._opened_tiles)
         return JSONResponse(
             {
                 "control": self._site.config.control and not self._site.replay,
                 "replay": self._site.replay,
                 "deployment": self._site.deployment is not None,
-                "map": tiles.about(),
+                "map": tiles.map_position(),
             }
         )
 
     async def history(self, _: Request) -> Response:
-        """The last ten minutes, and the events."""
+        """The samples of the last ten minutes, and the events."""
         newest = self._site.source.newest
         return JSONResponse({"samples": list(newest.samples), "events": list(newest.events)})
 
@@ -236,7 +236,9 @@ class Views:
         if path is None:
             raise RefusedError("there is no deployment to show")
         if request.method == "GET":
-            shown = await run_in_threadpool(deployment.shown, path, self._site.config.control)
+            shown = await run_in_threadpool(
+                deployment.read_for_page, path, self._site.config.control
+            )
             return JSONResponse(shown)
         self._require_control()
         self._require_disarmed()
@@ -254,9 +256,9 @@ class Views:
 
     async def records(self, _: Request) -> Response:
         """List of the records for download."""
-        listed = await run_in_threadpool(self._site.records.listed)
+        list_records = await run_in_threadpool(self._site.records.list_records)
         keys = ("name", "started_utc_ns", "ended")
-        return JSONResponse([{k: asdict(r)[k] for k in keys} for r in listed])
+        return JSONResponse([{k: asdict(r)[k] for k in keys} for r in list_records])
 
     async def record(self, request: Request) -> Response:
         """One record as .tar, or its report."""
@@ -283,7 +285,7 @@ class Views:
         return JSONResponse({"ok": ok, "text": text}, status_code=200 if ok else 409)
 
     def close(self) -> None:
-        """Close what is open."""
+        """End the map's loader."""
         if self._tiles is not None:
             self._tiles.close()
 
@@ -321,24 +323,24 @@ def make_application(site: ConsoleSite) -> RequestGuard:
 
     routes = [
         Route("/", views.page),
-        Route("/api/about", _named(views.about)),
-        Route("/api/history", _named(views.history)),
-        Route("/api/targets.{kind:str}", _named(views.targets)),
-        Route("/api/order", _named(views.order), methods=["POST"]),
-        Route("/api/seek", _named(views.seek), methods=["POST"]),
-        Route("/api/doctor", _named(views.examine), methods=["GET", "POST"]),
-        Route("/api/deployment", _named(views.settings), methods=["GET", "POST"]),
-        Route("/api/records", _named(views.records)),
-        Route("/api/records/{name:str}/{kind:str}", _named(views.record)),
-        Route("/tiles/{z:int}/{x:int}/{y:int}.jpg", _named(views.tile)),
+        Route("/api/about", _with_named_errors(views.about)),
+        Route("/api/history", _with_named_errors(views.history)),
+        Route("/api/targets.{kind:str}", _with_named_errors(views.targets)),
+        Route("/api/order", _with_named_errors(views.order), methods=["POST"]),
+        Route("/api/seek", _with_named_errors(views.seek), methods=["POST"]),
+        Route("/api/doctor", _with_named_errors(views.examine), methods=["GET", "POST"]),
+        Route("/api/deployment", _with_named_errors(views.settings), methods=["GET", "POST"]),
+        Route("/api/records", _with_named_errors(views.records)),
+        Route("/api/records/{name:str}/{kind:str}", _with_named_errors(views.record)),
+        Route("/tiles/{z:int}/{x:int}/{y:int}.jpg", _with_named_errors(views.tile)),
         WebSocketRoute("/ws", pages.serve),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]
     return RequestGuard(Starlette(routes=routes, lifespan=lifespan), site.config, site.token)
 
 
-def _named(answer: Answer) -> Answer:
-    """Errors with a name become their text; others are logged, and the page learns nothing."""
+def _with_named_errors(answer: Answer) -> Answer:
+    """Answer a named error by its text; others are logged, and the page learns nothing."""
 
     async def answered(request: Request) -> Response:
         try:

@@ -32,7 +32,7 @@ class RequestTimeoutProtocol(H11Protocol):
         return None if self._deadline is None else self._deadline.when()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait; see asyncio."""
+        """Start the time limit; see asyncio."""
         super().connection_made(transport)
         self._begin()
         waiting = [
@@ -43,7 +43,7 @@ class RequestTimeoutProtocol(H11Protocol):
             min(waiting)[-1].give_up()
 
     def data_received(self, data: bytes) -> None:
-        """Take what came; see asyncio."""
+        """Process received data; see asyncio."""
         if self._deadline is None:
             self._begin()
         super().data_received(data)
@@ -51,12 +51,12 @@ class RequestTimeoutProtocol(H11Protocol):
             self._end()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """The request is whole; what follows is the page's own."""
+        """End the time limit, because the request is complete; the page continues."""
         self._end()
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nobody is waited for; see asyncio."""
+        """End the time limit; see asyncio."""
         self._end()
         super().connection_lost(exc)
 
@@ -75,9 +75,9 @@ class RequestTimeoutProtocol(H11Protocol):
 
 
 class Server(uvicorn.Server):
-    """The console's HTTP server. told: called once the page can be opened."""
+    """The console's HTTP server. on_ready: called once the page can be opened."""
 
-    def __init__(self, site: ConsoleSite, told: Callable[[], None]) -> None:
+    def __init__(self, site: ConsoleSite, on_ready: Callable[[], None]) -> None:
         config = site.config
         super().__init__(
             uvicorn.Config(
@@ -90,10 +90,10 @@ class Server(uvicorn.Server):
                 ssl_certfile=config.tls_certificate, ssl_keyfile=config.tls_key,
             )
         )  # fmt: skip
-        self._told = told
+        self._told = on_ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen; see uvicorn."""
+        """Listen, then call `on_ready`; see uvicorn."""
         await super().startup(sockets=sockets)
         if self.started:
             self._told()

@@ -14,8 +14,8 @@ _EVENTS = 1000
 
 @dataclass
 class Newest:
-    """The newest messages of a flight, and a short history. states, frames: counters by which a
-    page notices new data.
+    """The newest messages of a flight, and a short history. states, frames: counts by which a page
+    notices new data.
     """
 
     hello: dict[str, Any] | None = None
@@ -26,8 +26,8 @@ class Newest:
     samples: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_TEN_MINUTES))
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
 
-    def take(self, message: Message) -> None:
-        """Store a message of the flight."""
+    def add(self, message: Message) -> None:
+        """Store a message of the flight by its kind."""
         kind = message.head.get("kind")
         if kind == "hello":
             self.hello = message.head
@@ -66,11 +66,11 @@ class ConsoleSource(Protocol):
         ...
 
     def watch(self, wanted: bool) -> None:
-        """Request or stop frames."""
+        """Request frames, or stop."""
         ...
 
     async def changed(self) -> None:
-        """Return when there are new data."""
+        """Wait until there are new data."""
         ...
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
@@ -78,12 +78,12 @@ class ConsoleSource(Protocol):
         ...
 
     async def run(self) -> None:
-        """Run until cancelled."""
+        """Read the source until cancelled."""
         ...
 
 
 def sample_of(state: dict[str, Any]) -> dict[str, Any]:
-    """One sample of the plots from a state document: t in seconds UTC; None if unknown."""
+    """A sample of the plots from a state document: t in seconds UTC; None for unknown values."""
     estimate = state.get("estimate") or {}
     health = state.get("health") or {}
     integrity_monitor = health.get("guardian") or {}

@@ -43,7 +43,7 @@ class TileName:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Latitude and longitude, degrees."""
+        """Latitude and longitude of the tile's centre, degrees."""
         side = 1 << self.zoom
         longitude = (self.x + 0.5) / side * 360.0 - 180.0
         latitude = math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * (self.y + 0.5) / side))))
@@ -51,12 +51,12 @@ class TileName:
 
     @property
     def side_m(self) -> float:
-        """Side length on the ground, m."""
+        """Side length of the tile on the ground, m."""
         return _EQUATOR_M * math.cos(math.radians(self.centre[0])) / (1 << self.zoom)
 
 
 class TopTiles:
-    """Renders tiles of the map on demand, with a cache."""
+    """Renders tiles of the map seen from above, on demand, with a cache."""
 
     def __init__(self, map_path: Path) -> None:
         self._cache = TileCache.open(map_path)
@@ -65,9 +65,9 @@ class TopTiles:
         self._streamer: TileStreamer | None = None
         self._renderer: NumbaRenderer | None = None
 
-    def about(self) -> dict[str, Any]:
+    def map_position(self) -> dict[str, Any]:
         """Position of the map for the page. Across the 180th meridian, longitudes continue beyond
-        180.
+        180 degrees.
         """
         manifest, frame = self._cache.manifest, self._cache.frame
         low, high = self._cache.index.box_min[0], self._cache.index.box_max[0]

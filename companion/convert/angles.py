@@ -34,7 +34,7 @@ class Angles:
 
     @property
     def radians(self) -> tuple[float, float, float]:
-        """(roll, pitch, yaw)."""
+        """(roll, pitch, yaw), rad."""
         roll, pitch, yaw = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
         return float(roll), float(pitch), float(yaw)
 
@@ -42,7 +42,7 @@ class Angles:
 @dataclass(frozen=True)
 class AutopilotAngles:
     """Pose of a camera as an autopilot reports it: its position, the body's attitude (FRD to NED),
-    and the gimbal's (relative to `GimbalFrame`).
+    and the gimbal's (relative to `gimbal_frame`).
     """
 
     name: str
@@ -70,7 +70,8 @@ def pose_of_autopilot(angles: AutopilotAngles, frame: LocalFrame) -> Pose:
 def autopilot_of_pose(
     name: str, time_ns: int | None, pose: Pose, frame: LocalFrame
 ) -> AutopilotAngles:
-    """A vehicle with this view: level, heading as the camera, roll and pitch by the gimbal.
+    """Angles of a vehicle with this view: level, heading as the camera, roll and pitch by the
+    gimbal.
 
     A camera's pose alone does not determine the vehicle's attitude.
     """

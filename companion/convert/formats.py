@@ -42,8 +42,8 @@ _IMAGES_TXT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 @dataclass(frozen=True)
 class MapReference:
-    """What is known of the map. heights: datum of photo tags, None if unknown. tell: called with
-    warnings about a source.
+    """The map's frame and what else is known of heights. map_frame: None if not given; heights:
+    datum of photo tags, None if unknown. tell: called with warnings about a source.
     """
 
     map_frame: LocalFrame | None
@@ -52,7 +52,7 @@ class MapReference:
 
     @property
     def frame(self) -> LocalFrame:
-        """The ENU frame: between formats in map metres and such in latitude and longitude.
+        """The ENU frame, for conversions between map metres and latitude and longitude.
         `ConfigError` if neither map nor origin was given.
         """
         if self.map_frame is None:
@@ -113,8 +113,8 @@ def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
 
 
 def _are_points(line: str) -> bool:
-    """Whether it is an image's second line: X Y POINT3D_ID, any number of times. An image's own
-    has ten fields.
+    """Whether the line is an image's second line: X Y POINT3D_ID, any number of times. The first
+    line has ten fields.
     """
     try:
         numbers = [float(x) for x in line.split()]

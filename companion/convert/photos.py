@@ -1,6 +1,7 @@
 """Converts photo tags to poses, and poses to XMP sidecars.
 
-Uses `companion.recorded.photo_tags`; a pose also needs all angles, and heights above one surface.
+Uses `companion.recorded.photo_tags`; a pose also needs all angles, and all heights above one
+surface.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ _SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 @dataclass(frozen=True)
 class Heights:
-    """Datum of the heights in photo tags. separation_m: of the geoid from the ellipsoid."""
+    """Datum of the heights in photo tags. separation_m: geoid above the ellipsoid."""
 
     datum: Literal["amsl", "ellipsoidal"]
     separation_m: float = 0.0
 
     @property
     def lift_m(self) -> float:
-        """Value to add to a tag's height to obtain the ellipsoidal height, m."""
+        """Metres to add to a tag's height to obtain the ellipsoidal height."""
         return self.separation_m if self.datum == "amsl" else 0.0
 
 
@@ -84,8 +85,8 @@ def _read_tags(path: Path) -> PhotoTags:
 
 
 def _require_measured(path: Path, photos: Mapping[str, PhotoTags]) -> None:
-    """Raise if all angles of a photo are 0.00: no gimbal is level and north to a hundredth of a
-    degree.
+    """`PoseFileError` if all angles of a photo are 0.00: no gimbal is level and north to a
+    hundredth of a degree.
     """
     zero = [name for name, tags in photos.items() if tags.has_zero_view]
     if zero:
@@ -100,7 +101,7 @@ def _require_measured(path: Path, photos: Mapping[str, PhotoTags]) -> None:
 def _require_one_datum(
     path: Path, photos: Mapping[str, PhotoTags], tell: Callable[[str], None]
 ) -> None:
-    """All heights of a flight are above the same surface, as far as the tags say."""
+    """`PoseFileError` if the tags state different datums for the heights of a flight."""
     kinds: dict[str, list[str]] = {}
     for name, tags in photos.items():
         if tags.altitude is not None:
@@ -128,7 +129,7 @@ def _require_one_datum(
 
 
 def _home_m(tags: PhotoTags) -> float:
-    """Height of the take-off point from the photo's tags; NaN if unknown."""
+    """Height of the take-off point from the photo's tags, m; NaN if unknown."""
     height, above = tags.number("AbsoluteAltitude"), tags.number("RelativeAltitude")
     return float("nan") if height is None or above is None else height - above
 

@@ -1,4 +1,4 @@
-"""A flight's record as one MCAP file."""
+"""Exports a flight's record as one MCAP file."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _rows(
 
 
 def _require_free(path: Path) -> None:
-    """It takes the file's place at the end: never a device's, nor that of a record's table."""
+    """`ReportError` if the result would replace a device or a table of a record."""
     if path.exists() and not path.is_file():
         raise ReportError(f"{path}: cannot be written: is not a plain file")
     if path.suffix != ".mcap":
@@ -152,13 +152,13 @@ def _pictures(folder: Path, offset_ns: int, take: Callable[[bytes, int], None]) 
 
 
 def _take_picture(take: Callable[[bytes, int], None], path: Path, time_ns: int) -> None:
-    """Read when its turn comes: a flight's pictures do not fit in memory together."""
+    """Read an image when its time comes: the images of a flight do not fit in memory together."""
     take(plain_bytes(path), time_ns)
 
 
 def _mavlink(file: Any, path: Path, tables: RecordTables) -> Iterator[Step]:
-    """STATUSTEXT, and where autopilot and receiver are. A .tlog is appended to: what stands before
-    the record is an earlier flight's.
+    """STATUSTEXT and positions of autopilot and receiver, from the .tlog. What it holds from before
+    the record is of an earlier flight and left out.
     """
     from companion.export import messages
 
@@ -187,7 +187,7 @@ def _mavlink(file: Any, path: Path, tables: RecordTables) -> Iterator[Step]:
 
 
 def _geoid_separation_m(tables: RecordTables) -> float:
-    """Of the map that was flown on: MAVLink's altitudes are AMSL."""
+    """Geoid above the ellipsoid at the flown map, m, because MAVLink's altitudes are AMSL."""
     if tables.map_path is None:
         raise RecordError("the record does not say which map was flown on, so no height is known")
     try:

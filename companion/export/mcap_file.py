@@ -68,7 +68,7 @@ class McapFile:
         self.put("/camera/image", messages.image(jpeg, time_ns), time_ns)
 
     def put(self, topic: str, message: Any, time_ns: int) -> None:
-        """Write a message of Foxglove's schemas."""
+        """Write a message of Foxglove's schemas. time_ns: UTC."""
         kind = type(message)
         name = kind.DESCRIPTOR.full_name
         if name not in self._schemas:
@@ -83,7 +83,7 @@ class McapFile:
         )
 
     def close(self) -> None:
-        """Write the index and close."""
+        """Write the index and close the file."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
         finally:

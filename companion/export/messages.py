@@ -216,7 +216,7 @@ def target_on_map(row: Row) -> GeoJSON:
 
 
 def event(row: Row, time_ns: int) -> Log:
-    """An event of the companion."""
+    """A row of ``events.csv`` as a log message."""
     level = _LEVELS.get(str(row["level"]), Log.INFO)
     alert, text = str(row.get("alert") or ""), str(row["text"])  # of 0.1 a record has no alerts
     return Log(timestamp=stamp(time_ns), level=level, message=text, name="companion", file=alert)
@@ -237,7 +237,7 @@ def _quaternion(row: Row) -> Quaternion:
 
 
 def _number(value: Any) -> float | None:
-    """None for an empty field and for what is not finite: JSON knows no NaN."""
+    """The number; None for an empty field and for NaN or infinity, which JSON does not have."""
     if value is None or value == "":
         return None
     number = float(value)

@@ -38,9 +38,9 @@ _SWITCH_S = 0.0002
 class Companion:
     """The flight process of one deployment.
 
-    `run` blocks until `stop` is called or the feed ends. pulse: descriptor of the supervisor's
+    `run` blocks until `stop` is called or the feed ends. pulse: file descriptor of the supervisor's
     pipe, see `Pulse`; None without a supervisor. restart: whether an earlier process of this flight
-    died. lost_settings: why `config` is not that of the deployment file; empty if it is.
+    died. lost_settings: why `config` is not that of the deployment file; "" if it is.
     """
 
     def __init__(
@@ -61,20 +61,20 @@ class Companion:
         self._is_up = False
 
     def prepare(self) -> None:
-        """Build what takes long and needs neither link nor camera, for a standby process."""
+        """Build what takes long and needs neither link nor camera; called by a standby."""
         try:
             self._parts.make(self._up, ahead=True)
         except BaseException:
-            self.put_away()
+            self.discard_prepared()
             raise
 
-    def put_away(self) -> None:
-        """Close what was prepared but is not used."""
+    def discard_prepared(self) -> None:
+        """Close the components that `prepare` built, because they are not used."""
         self._up.close()
         self._parts.forget()
 
     def run(self) -> None:
-        """Fly until stopped.
+        """Build and start all components, fly until stopped, then stop them.
 
         Raises the error that ended the video, after the shutdown. If the start fails, all
         components that were started are stopped, because a remaining thread would keep the process
@@ -108,7 +108,7 @@ class Companion:
             raise feed.error
 
     def _fly(self, up: ExitStack, lost: str) -> Feed:
-        """Run from the start of the components to the end of the video or the call of `stop`."""
+        """Start the components; wait for the end of the video or `stop`. lost: disks left out."""
         self._parts.start(up)
         integrity_monitor = self._parts.get(IntegrityMonitor)
         if integrity_monitor is not None:
@@ -118,7 +118,7 @@ class Companion:
             pulse.start()
             # First of all: what comes down takes no turns.
             up.push(lambda error, *_: pulse.stop(clean_shutdown=self._is_clean_shutdown(error)))
-        self._tell_what_runs(lost)
+        self._report_start(lost)
         feed = self._parts[Feed]
         # In slices: signals are handled between them.
         while not (self._is_stopping or feed.ended.wait(0.2)):
@@ -139,7 +139,7 @@ class Companion:
         return self._is_up
 
     def discard_record(self) -> None:
-        """Remove the record of a failed start, at any of its steps."""
+        """Remove the record of a failed start; may be called at any of its steps."""
         for undo in self._parts.abandonments:
             undo()
 
@@ -163,7 +163,7 @@ class Companion:
         ends = self._is_stopping or self._parts[Feed].ended.is_set()
         return {} if health is None or ends else {"health": health.last_tick_ns}
 
-    def _tell_what_runs(self, lost: str) -> None:
+    def _report_start(self, lost: str) -> None:
         events = self._parts.channels.events
         events.send("info", f"map {self._config.map}, feed {redacted(self._config.camera.source)}")
         events.send("info", f"renderer {self._parts[MapStack].renderer.name}")
@@ -172,7 +172,7 @@ class Companion:
             events.send("info", f"record {keeper.folder}")
         if keeper is not None and lost:
             events.send("warning", f"left out, since it was gone at the restart: {lost}")
-            keeper.failed("disk gone")
+            keeper.mark_incomplete("disk gone")
         bridge = self._parts.get(Bridge)
         if bridge is not None and self._lost_settings:
             bridge.report_alert(alert(AlertId.DEPLOYMENT_LOST))

@@ -1,4 +1,4 @@
-"""Pass some estimates a second to the calibration watch, with the distance to the ground."""
+"""Passes some registrations a second to the calibration watch, with the distance to the ground."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _EVERY = 8  # pixel of the depth
 
 
 class CalibrationObserver:
-    """Runs on the localization thread, four times a second."""
+    """Passes an observation to `take` four times a second; runs on the localization thread."""
 
     def __init__(
         self, extrinsics: CameraExtrinsics, take: Callable[[CalibrationObservation], None]
@@ -26,16 +26,16 @@ class CalibrationObserver:
         self._next_ns = 0
 
     def add_fix(self, estimate: PoseEstimate, bundle: ReferenceBundle, fix: VisionFix) -> None:
-        """Pass on a registration against the map. Never blocks."""
+        """Pass on a registration against the map (`bundle`), while TRACKING. Never blocks."""
         time_ns = estimate.exposure_time_ns
         if estimate.state is not TrackingState.TRACKING or time_ns < self._next_ns:
             return
         self._next_ns = time_ns + _INTERVAL_NS
         depth_m = middle_depth_m(bundle.view.depth)
         if depth_m is not None:
-            self._take(self._sighting(estimate, fix, depth_m))
+            self._take(self._observation(estimate, fix, depth_m))
 
-    def _sighting(
+    def _observation(
         self, estimate: PoseEstimate, fix: VisionFix, depth_m: float
     ) -> CalibrationObservation:
         pose, frame = estimate.world_from_camera, self._extrinsics.frame

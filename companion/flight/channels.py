@@ -1,6 +1,6 @@
 """Channels between the components of the process.
 
-Each part subscribes to what it needs when it is made; the sender knows none of them.
+Each component subscribes to what it needs when it is built; the sender knows none of them.
 """
 
 from __future__ import annotations

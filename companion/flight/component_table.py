@@ -27,10 +27,10 @@ from companion.flight.feed import Feed
 from companion.flight.health import HealthInputs, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
-from companion.flight.priors import AutopilotPose, PriorSources, local_about
+from companion.flight.priors import AutopilotPose, PriorSources, local_near
 from companion.flight.reachable_region import ReachableRegion
 from companion.flight.recorder import RecordKeeper, remove_empty
-from companion.flight.search import PlaceSearch, place_on_map
+from companion.flight.search import PlaceSearch, enu_on_map
 from companion.flight.view_reporter import ViewReporter
 from companion.ground.vital_signs import VitalSigns
 from companion.inertial import InertialTrack
@@ -42,7 +42,7 @@ from companion.klv.relay import KlvRelay
 from companion.live.orders import OrderContext, OrderError, Orders
 from companion.live.protocol import socket_path
 from companion.live.publisher import Publisher
-from companion.live.shown import Instruments, Shown
+from companion.live.shown import ConsoleData, Instruments
 from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import readable_map_hash, require_pinned
 from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
@@ -80,8 +80,8 @@ _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 _BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT)
 
 
-def _map(making: BuildContext) -> MapStack:
-    config = making.config
+def _map(context: BuildContext) -> MapStack:
+    config = context.config
     require_pinned(config.map, config.map_sha256)
     stack = MapStack(config.map, config.localizer)
     try:
@@ -92,48 +92,48 @@ def _map(making: BuildContext) -> MapStack:
     return stack
 
 
-def _extrinsics(making: BuildContext) -> CameraExtrinsics:
-    cache = making[MapStack].cache
-    arm = np.array(making.config.camera.lever_arm_m)
+def _extrinsics(context: BuildContext) -> CameraExtrinsics:
+    cache = context[MapStack].cache
+    arm = np.array(context.config.camera.lever_arm_m)
     return CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
 
 
-def _bridge(making: BuildContext) -> Bridge:
-    search = making.later(PlaceSearch)
+def _bridge(context: BuildContext) -> Bridge:
+    search = context.later(PlaceSearch)
     bridge = Bridge(
-        _bridge_config(making.config),
-        making[MapStack].cache.manifest.geoid_separation_m,
-        on_track=making.channels.clicks.send,
+        _bridge_config(context.config),
+        context[MapStack].cache.manifest.geoid_separation_m,
+        on_track=context.channels.clicks.send,
         on_hint=lambda hint: search().hint_at(hint),
-        on_alert=making.channels.alerts.send,
-        clock=making.clock,
+        on_alert=context.channels.alerts.send,
+        clock=context.clock,
     )
-    bridge.set_map_id(readable_map_hash(making.config.map) or "")
+    bridge.set_map_id(readable_map_hash(context.config.map) or "")
     return bridge
 
 
-def _record(making: BuildContext) -> RecordKeeper:
-    bridge, channels, config = making[Bridge], making.channels, making.config
+def _record(context: BuildContext) -> RecordKeeper:
+    bridge, channels, config = context[Bridge], context.channels, context.config
 
     def incomplete(why: str) -> None:
         _log.warning("the record is incomplete: %s", why)
         bridge.report_alert(alert(AlertId.RECORD_INCOMPLETE))
 
-    keeper = RecordKeeper(making[MapStack].cache.frame, incomplete)
+    keeper = RecordKeeper(context[MapStack].cache.frame, incomplete)
     if config.record is None:
         return keeper
 
     def claim(folder: Path) -> None:
-        making.if_abandoned(lambda: remove_empty(folder))
+        context.on_failed_start(lambda: remove_empty(folder))
 
     keeper.open(config, config.record, claim)
     recorder = keeper.recorder
     if recorder is not None:
         channels.frames.subscribe(recorder.snapshot)
-        integrity_monitor = making.get(IntegrityMonitor)
+        integrity_monitor = context.get(IntegrityMonitor)
 
         def record(estimate: PoseEstimate, _: ReferenceBundle) -> None:
-            recorder.estimate(estimate, _levels(integrity_monitor, estimate))
+            recorder.estimate(estimate, _protection_levels(integrity_monitor, estimate))
 
         channels.estimates.subscribe(record)
         channels.targets.subscribe(lambda target: recorder.target(target.fix))
@@ -147,8 +147,8 @@ def _record(making: BuildContext) -> RecordKeeper:
     return keeper
 
 
-def _source(making: BuildContext) -> FrameSource:
-    camera, events, bridge = making.config.camera, making.channels.events, making[Bridge]
+def _source(context: BuildContext) -> FrameSource:
+    camera, events, bridge = context.config.camera, context.channels.events, context[Bridge]
 
     def on_state(state: StreamState, text: str) -> None:
         events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
@@ -157,21 +157,21 @@ def _source(making: BuildContext) -> FrameSource:
         bridge.report_alert(alert(AlertId.VIDEO_SENDER_IGNORED, host=Name(host)))
 
     model = camera.model.camera()
-    wanted: tuple[PacketTap | None, ...] = (making.get(KlvRelay), making.get(FrameTimes))
+    wanted: tuple[PacketTap | None, ...] = (context.get(KlvRelay), context.get(FrameTimes))
     taps = [tap for tap in wanted if tap is not None]
     tap = PacketTaps(taps) if taps else None
     return open_source(camera.source, model, camera.settings, on_state, on_stranger, tap)
 
 
-def _frame_times(making: BuildContext) -> FrameTimes:
-    targets = making.later(TargetReporter)
+def _frame_times(context: BuildContext) -> FrameTimes:
+    targets = context.later(TargetReporter)
     times = FrameTimes(lambda detection: targets().add_detection(detection))
-    making.channels.frames.subscribe(times.add_frame)
+    context.channels.frames.subscribe(times.add_frame)
     return times
 
 
-def _klv(making: BuildContext) -> KlvRelay:
-    config, bridge, cache = making.config, making[Bridge], making[MapStack].cache
+def _klv(context: BuildContext) -> KlvRelay:
+    config, bridge, cache = context.config, context[Bridge], context[MapStack].cache
     assert config.klv is not None  # or the part is not wanted
     if not config.camera.is_video:
         raise ConfigError(f"klv: {config.camera.source} is no video that could be sent on")
@@ -183,42 +183,42 @@ def _klv(making: BuildContext) -> KlvRelay:
         return None if known is None else matrix_from_quaternion(known.quaternion)
 
     relay = KlvRelay(config.klv, scene, attitude, system_minus_monotonic())
-    making.channels.estimates.subscribe(lambda estimate, _: relay.add_estimate(estimate))
-    making.channels.targets.subscribe(relay.add_target)
+    context.channels.estimates.subscribe(lambda estimate, _: relay.add_estimate(estimate))
+    context.channels.targets.subscribe(relay.add_target)
     return relay
 
 
-def _health(making: BuildContext) -> HealthMonitor:
-    engine, keeper = making.later(DualThreadEngine), making[RecordKeeper]
-    streamer = making[MapStack].streamer
-    autopilot, search = making.later(AutopilotPose), making.later(PlaceSearch)
-    source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+def _health(context: BuildContext) -> HealthMonitor:
+    engine, keeper = context.later(DualThreadEngine), context[RecordKeeper]
+    streamer = context[MapStack].streamer
+    autopilot, search = context.later(AutopilotPose), context.later(PlaceSearch)
+    source = context[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
     inputs = HealthInputs(
         lambda: keeper.is_complete,
         lambda: autopilot().sigma_m,
-        making.get(IntegrityMonitor),
+        context.get(IntegrityMonitor),
         lambda: streamer.counters().unreadable,
-        making[MapOffsetEstimator].report,
-        _target_counts(making),
+        context[MapOffsetEstimator].report,
+        _target_counts(context),
         lambda: search().lacks,
     )
     health = HealthMonitor(
         lambda: engine().health,
-        making[Bridge],
+        context[Bridge],
         lambda: source.state,
-        making.channels.events.send,
+        context.channels.events.send,
         keeper.folder,
         inputs,
     )
-    making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
+    context.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health
 
 
-def _targets(making: BuildContext) -> TargetReporter:
-    channels, bridge = making.channels, making[Bridge]
-    cache, numbers = making[MapStack].cache, TargetNumbers()
+def _targets(context: BuildContext) -> TargetReporter:
+    channels, bridge = context.channels, context[Bridge]
+    cache, numbers = context[MapStack].cache, TargetNumbers()
     reporter = TargetReporter(
-        making.config.targets.over(map_kind(cache)),
+        context.config.targets.for_map(map_kind(cache)),
         MapSurface(cache).cast,
         channels.targets.send,
         channels.gone.send,
@@ -226,46 +226,47 @@ def _targets(making: BuildContext) -> TargetReporter:
     )
 
     def report(target: TargetEstimate) -> None:
-        camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
+        camera, number = target.estimate.camera, numbers.number_of(target.fix.target_id)
         bridge.report(target_report(target.fix, camera, cache.frame, number))
 
     channels.frames.subscribe(reporter.add_frame)
     channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
     channels.targets.subscribe(report)
-    channels.gone.subscribe(lambda name: bridge.forget(numbers.of(name)))
+    channels.gone.subscribe(lambda name: bridge.forget(numbers.number_of(name)))
     return reporter
 
 
-def _clicks(making: BuildContext) -> ClickPolicy:
-    clicks = ClickPolicy(making[TargetReporter], making[Bridge].report_alert, making.config.targets)
-    making.channels.estimates.subscribe(clicks.add_estimate)
-    making.channels.clicks.subscribe(clicks.on_request)
-    making.channels.gone.subscribe(clicks.on_gone)
+def _clicks(context: BuildContext) -> ClickPolicy:
+    report, config = context[Bridge].report_alert, context.config.targets
+    clicks = ClickPolicy(context[TargetReporter], report, config)
+    context.channels.estimates.subscribe(clicks.add_estimate)
+    context.channels.clicks.subscribe(clicks.on_request)
+    context.channels.gone.subscribe(clicks.on_gone)
     return clicks
 
 
-def _detections(making: BuildContext) -> DetectionListener:
-    address = making.config.targets.detections
+def _detections(context: BuildContext) -> DetectionListener:
+    address = context.config.targets.detections
     assert address is not None  # or the part is not wanted
-    return DetectionListener(address, making[FrameTimes].add_detection)
+    return DetectionListener(address, context[FrameTimes].add_detection)
 
 
-def _detector(making: BuildContext) -> BoxDetector:
-    channels, reporter = making.channels, making[TargetReporter]
-    config = making.config.targets.detector
+def _detector(context: BuildContext) -> BoxDetector:
+    channels, reporter = context.channels, context[TargetReporter]
+    config = context.config.targets.detector
     assert config is not None  # or the part is not wanted
-    cast = MapSurface(making[MapStack].cache).cast
-    detector = BoxDetector(config, cast, reporter.add_detection, making[Bridge].report_alert)
+    cast = MapSurface(context[MapStack].cache).cast
+    detector = BoxDetector(config, cast, reporter.add_detection, context[Bridge].report_alert)
     channels.frames.subscribe(detector.add_frame)
     channels.estimates.subscribe(lambda estimate, _: detector.add_estimate(estimate))
     return detector
 
 
-def _target_counts(making: BuildContext) -> Callable[[], dict[str, int]]:
-    """Counts of clicks and detections without a position, for health and report."""
-    targets, times = making.later(TargetReporter), making.get(FrameTimes)
-    has_detector = making.config.targets.detector is not None
-    detector = making.later(BoxDetector) if has_detector else None
+def _target_counts(context: BuildContext) -> Callable[[], dict[str, int]]:
+    """A function that counts clicks and detections without a position, for health and report."""
+    targets, times = context.later(TargetReporter), context.get(FrameTimes)
+    has_detector = context.config.targets.detector is not None
+    detector = context.later(BoxDetector) if has_detector else None
 
     def counts() -> dict[str, int]:
         reporter = targets()
@@ -280,50 +281,51 @@ def _target_counts(making: BuildContext) -> Callable[[], dict[str, int]]:
     return counts
 
 
-def _view(making: BuildContext) -> ViewReporter:
-    cache, bridge = making[MapStack].cache, making[Bridge]
-    rate_hz = making.config.bridge.targets.rate_hz
-    view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.look)
-    making.channels.estimates.subscribe(lambda estimate, _: view.add_estimate(estimate))
+def _view(context: BuildContext) -> ViewReporter:
+    cache, bridge = context[MapStack].cache, context[Bridge]
+    rate_hz = context.config.bridge.targets.rate_hz
+    view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.report_view)
+    context.channels.estimates.subscribe(lambda estimate, _: view.add_estimate(estimate))
     return view
 
 
-def _vital_signs(making: BuildContext) -> VitalSigns:
-    signs = VitalSigns(making[Bridge].tell_figures)
-    making.channels.estimates.subscribe(lambda estimate, _: signs.add_estimate(estimate))
+def _vital_signs(context: BuildContext) -> VitalSigns:
+    signs = VitalSigns(context[Bridge].send_named_values)
+    context.channels.estimates.subscribe(lambda estimate, _: signs.add_estimate(estimate))
     return signs
 
 
-def _autopilot(making: BuildContext) -> AutopilotPose:
-    bridge = making[Bridge]
+def _autopilot(context: BuildContext) -> AutopilotPose:
+    bridge = context[Bridge]
     autopilot = AutopilotPose(
-        bridge, making[CameraExtrinsics], making.config.prior, lambda: bridge.on_gnss
+        bridge, context[CameraExtrinsics], context.config.prior, lambda: bridge.on_gnss
     )
-    making.channels.estimates.subscribe(
+    context.channels.estimates.subscribe(
         lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
     )
     return autopilot
 
 
-def _last_fix(making: BuildContext) -> FixMemory:
-    config, integrity_monitor, bridge = making.config, making.get(IntegrityMonitor), making[Bridge]
+def _last_fix(context: BuildContext) -> FixMemory:
+    config, bridge = context.config, context[Bridge]
+    integrity_monitor = context.get(IntegrityMonitor)
     folder = config.state_folder
     memory = FixMemory(
         folder and folder / "last-fix.json",
         config.prior,
-        making[AutopilotPose],
-        making[CameraExtrinsics],
-        lambda time_ns: local_about(bridge, time_ns),
+        context[AutopilotPose],
+        context[CameraExtrinsics],
+        lambda time_ns: local_near(bridge, time_ns),
         lambda: integrity_monitor is None or not integrity_monitor.reason,
         bridge.state,
     )
-    making.channels.estimates.subscribe(memory.add_estimate)
+    context.channels.estimates.subscribe(memory.add_estimate)
     return memory
 
 
-def _localizer(making: BuildContext) -> Localizer:
+def _localizer(context: BuildContext) -> Localizer:
     _log.info("making the localizer ready; the first start on a machine compiles its kernels")
-    config, autopilot = making.config, making.later(AutopilotPose)
+    config, autopilot = context.config, context.later(AutopilotPose)
     camera = config.camera.model.camera()
     sensors = AuxiliarySensors(
         lambda time_ns: autopilot().rotation(time_ns),
@@ -334,29 +336,29 @@ def _localizer(making: BuildContext) -> Localizer:
     settings, zoom = config.localizer, config.camera.zoom
     if zoom is not None and zoom.refine and not settings.focal_fit_s:
         settings = settings.model_copy(update={"focal_fit_s": _FOCAL_FIT_S})
-    return build_localizer(making[MapStack], camera, settings, sensors)
+    return build_localizer(context[MapStack], camera, settings, sensors)
 
 
-def _injection(making: BuildContext) -> FixInjection:
-    injection = FixInjection(making[Bridge], making[CameraExtrinsics])
-    making.channels.estimates.subscribe(injection.add_estimate)
+def _injection(context: BuildContext) -> FixInjection:
+    injection = FixInjection(context[Bridge], context[CameraExtrinsics])
+    context.channels.estimates.subscribe(injection.add_estimate)
     return injection
 
 
-def _map_shift(making: BuildContext) -> MapOffsetEstimator:
-    injection = making.config.bridge.injection
+def _map_shift(context: BuildContext) -> MapOffsetEstimator:
+    injection = context.config.bridge.injection
     shift = MapOffsetEstimator(
-        making[Bridge],
+        context[Bridge],
         injection.map_shift,
-        making.channels.events.send,
+        context.channels.events.send,
         gnss_is_ours=injection.message == "gps_input",
     )
-    making[FixInjection].add_check(shift.check)
+    context[FixInjection].add_check(shift.check)
     return shift
 
 
-def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
-    config, injection = making.config, making.config.bridge.injection
+def _integrity_monitor(context: BuildContext) -> IntegrityMonitor:
+    config, injection = context.config, context.config.bridge.injection
     limits = IntegrityLimits(
         injection.alert_limit_m,
         injection.time_to_alert_s,
@@ -366,36 +368,37 @@ def _integrity_monitor(making: BuildContext) -> IntegrityMonitor:
     calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
     protection = config.integrity_monitor.protection.of_camera(calibrated=calibrated)
     watched = config.integrity_monitor.model_copy(update={"protection": protection})
+    memory, track = _inhibit_memory(config), context[InertialTrack]
     integrity_monitor = IntegrityMonitor(
-        watched, limits, making[Bridge], _forbid_memory(config), making.clock, making[InertialTrack]
+        watched, limits, context[Bridge], memory, context.clock, track
     )
-    making[FixInjection].add_check(lambda _, fix: integrity_monitor.check(fix))
-    making.channels.frames.subscribe(
+    context[FixInjection].add_check(lambda _, fix: integrity_monitor.check(fix))
+    context.channels.frames.subscribe(
         lambda f: integrity_monitor.add_frame(f.exposure_time_ns, f.image)
     )
-    observer = CalibrationObserver(making[CameraExtrinsics], integrity_monitor.add_observation)
-    making[FixInjection].add_observer(observer.add_fix)
+    observer = CalibrationObserver(context[CameraExtrinsics], integrity_monitor.add_observation)
+    context[FixInjection].add_observer(observer.add_fix)
     return integrity_monitor
 
 
-def _feed(making: BuildContext) -> Feed:
-    source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
-    return Feed(source, making.channels.frames.send)
+def _feed(context: BuildContext) -> Feed:
+    source = context[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+    return Feed(source, context.channels.frames.send)
 
 
-def _console(making: BuildContext) -> Publisher:
+def _console(context: BuildContext) -> Publisher:
     """Build the console's server. It only reads from the flight. It subscribes last and keeps
     references to frames, no copies.
     """
-    config, bridge, channels = making.config, making[Bridge], making.channels
+    config, bridge, channels = context.config, context[Bridge], context.channels
     assert config.console is not None  # or the part is not wanted
-    cache, search, health = making[MapStack].cache, making[PlaceSearch], making[HealthMonitor]
+    cache, search, health = context[MapStack].cache, context[PlaceSearch], context[HealthMonitor]
     geoid_m = cache.manifest.geoid_separation_m
     instruments = Instruments(
         lambda: health.newest, bridge.state, bridge.shadow_score, bridge.loop_verdict,
         lambda: bridge.injecting and bridge.reaches_ekf, bridge.mission,
     )  # fmt: skip
-    folder = making[RecordKeeper].folder
+    folder = context[RecordKeeper].folder
     about = {
         "map": str(config.map),
         "record": None if folder is None else str(folder),
@@ -404,10 +407,10 @@ def _console(making: BuildContext) -> Publisher:
         "delay_ms": config.bridge.injection.delay_ms,
         "alert_limit_m": config.bridge.injection.alert_limit_m,
     }
-    shown = Shown(cache.frame, geoid_m, instruments, about)
+    shown = ConsoleData(cache.frame, geoid_m, instruments, about)
 
     def hint(latitude_deg: float, longitude_deg: float, radius_m: float) -> None:
-        place = place_on_map(cache, latitude_deg, longitude_deg, radius_m)
+        place = enu_on_map(cache, latitude_deg, longitude_deg, radius_m)
         if place is None:
             raise OrderError("the hint lies off the map")
         search.hint(*place, radius_m)
@@ -418,8 +421,8 @@ def _console(making: BuildContext) -> Publisher:
     def track(request: TrackRequest) -> None:
         bridge.track(replace(request, time_ns=request.time_ns + late_ns))
 
-    helm = OrderContext(bridge.report_alert, track, hint)
-    orders = Orders(config.console.control, helm)
+    order_context = OrderContext(bridge.report_alert, track, hint)
+    orders = Orders(config.console.control, order_context)
     record = None if config.record is None else config.record.folder
     path = socket_path(config.map, record, config.console.listen)
     publisher = Publisher(path, shown, orders, config.console.frames_hz)
@@ -442,33 +445,33 @@ def _console(making: BuildContext) -> Publisher:
     return publisher
 
 
-def _search(making: BuildContext) -> PlaceSearch:
+def _search(context: BuildContext) -> PlaceSearch:
     cache, channels, reach = (
-        making[MapStack].cache,
-        making.channels,
-        ReachableRegion(making[Bridge], making[InertialTrack]),
+        context[MapStack].cache,
+        context.channels,
+        ReachableRegion(context[Bridge], context[InertialTrack]),
     )
     channels.estimates.subscribe(reach.add_estimate)
     channels.frames.subscribe(lambda _frame: reach.follow())
     return PlaceSearch(
-        cache, making.config.localizer, making[AutopilotPose], channels.events.send, reach.region
+        cache, context.config.localizer, context[AutopilotPose], channels.events.send, reach.region
     )
 
 
-def _engine(making: BuildContext) -> DualThreadEngine:
-    channels = making.channels
+def _engine(context: BuildContext) -> DualThreadEngine:
+    channels = context.channels
     engine = DualThreadEngine(
-        making[Localizer],
+        context[Localizer],
         (channels.estimates.send,),
-        making[PriorSources].at,
-        making[PlaceSearch].search,
+        context[PriorSources].at,
+        context[PlaceSearch].search,
     )
-    table, bridge = making.config.camera.zoom, making[Bridge]
+    table, bridge = context.config.camera.zoom, context[Bridge]
     if table is None:
         channels.frames.subscribe(engine.submit)
         return engine
     zoomed = ZoomedFrames(table, bridge.zoom_at, bridge.report_alert)
-    channels.frames.subscribe(zoomed.before(engine.submit))
+    channels.frames.subscribe(zoomed.zoom_filter(engine.submit))
     channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))
     return engine
 
@@ -540,7 +543,7 @@ COMPONENTS: tuple[Component[Any], ...] = (
     ),
     Component(
         "priors", PriorSources,
-        lambda making: PriorSources(making[FixMemory].prior, making[AutopilotPose].prior),
+        lambda context: PriorSources(context[FixMemory].prior, context[AutopilotPose].prior),
         depends=(FixMemory, AutopilotPose),
     ),
     Component(
@@ -577,11 +580,11 @@ COMPONENTS: tuple[Component[Any], ...] = (
 )  # fmt: skip
 
 
-def _levels(
+def _protection_levels(
     integrity_monitor: IntegrityMonitor | None, estimate: PoseEstimate
 ) -> tuple[float, float] | None:
-    """The estimate's protection levels. Injection runs before, so the monitor has judged the
-    estimate; estimates that are not for injection have none.
+    """Horizontal and vertical protection level of the estimate, m; None if it is not for injection.
+    The monitor has checked it before, because injection subscribes earlier.
     """
     level = None if integrity_monitor is None else integrity_monitor.level
     if level is None or not is_for_injection(estimate):
@@ -594,8 +597,8 @@ def _level(severity: int) -> str:
 
 
 def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
-    """Raise if the configured origin is far from the map: the vehicle keeps a wrong origin until it
-    is switched off.
+    """Raise `ConfigError` if the configured EKF origin is far from the map: the vehicle keeps a
+    wrong origin until it is switched off.
     """
     if config.bridge.origin is not None:
         finding = check_origin(config.bridge.origin, cache)
@@ -624,8 +627,8 @@ def _state_file(config: CompanionConfig) -> Path | None:
     return folder and folder / "injection-gate.json"
 
 
-def _forbid_memory(config: CompanionConfig) -> InhibitMemory | None:
-    """File of inhibitions for this map and camera; those of another map or camera are ignored."""
+def _inhibit_memory(config: CompanionConfig) -> InhibitMemory | None:
+    """Memory of inhibitions for this map and camera; None without a state folder."""
     file = _state_file(config)
     if file is None:
         return None

@@ -1,4 +1,4 @@
-"""Build and start the components of the table in order; stop and close them in reverse."""
+"""Builds and starts the components of the table in order; stops and closes them in reverse."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ def _always(_: CompanionConfig) -> bool:
 
 @dataclass(frozen=True)
 class Component(Generic[T]):
-    """One row of the table. All components are built before the first is started.
+    """One row of the table: how a component is built, started, stopped and closed.
 
-    close is called only for a component that was built, and stop only for one that was started. A
-    component looks up the components that it needs in `BuildContext`, by their class.
+    All components are built before the first is started. close is called only for a component that
+    was built, and stop only for one that was started. A component looks up the components that it
+    needs in `BuildContext`, by their class.
     """
 
     name: str
@@ -48,7 +49,7 @@ class Component(Generic[T]):
 
 
 class BuildContext:
-    """What a component is built from: the settings, the channels, and its dependencies."""
+    """What a component is built from: settings, channels, clock, and its dependencies."""
 
     def __init__(self, part: Component[Any], assembly: Assembly) -> None:
         self._part = part
@@ -57,7 +58,7 @@ class BuildContext:
         self.channels, self.clock = assembly.channels, assembly.clock
 
     def __getitem__(self, kind: type[T]) -> T:
-        """The component of that class."""
+        """The component of that class; LookupError if `depends` does not name it."""
         self._require_named(kind, self._part.depends)
         return self._assembly[kind]
 
@@ -67,11 +68,11 @@ class BuildContext:
         return self._assembly.get(kind)
 
     def later(self, kind: type[T]) -> Callable[[], T]:
-        """A function that returns a component which is not built yet; call it after the start."""
+        """A function that returns a component which is built later; call it after the start."""
         self._require_named(kind, self._part.later)
         return lambda: self._assembly[kind]
 
-    def if_abandoned(self, undo: Callable[[], None]) -> None:
+    def on_failed_start(self, undo: Callable[[], None]) -> None:
         """Call `undo` if this start fails. A signal handler may call it at any time from now on."""
         self._assembly.abandonments.append(undo)
 
@@ -100,19 +101,19 @@ class Assembly:
         self._made: dict[type, Any] = {}
 
     def __getitem__(self, kind: type[T]) -> T:
-        """A component that is built."""
+        """The component of that class; KeyError if it is not built."""
         found: T = self._made[kind]
         return found
 
     def get(self, kind: type[T]) -> T | None:
-        """A component, or None if it is not built."""
+        """The component of that class; None if it is not built."""
         found: T | None = self._made.get(kind)
         return found
 
     def make(self, up: ExitStack, *, ahead: bool = False) -> None:
         """Build every component that is not built yet; `up` closes them in reverse.
 
-        ahead: only what a standby makes.
+        ahead: only the components that a standby builds before it may fly.
         """
         for part in self._parts:
             if part.kind in self._made or (ahead and not part.ahead):
@@ -123,13 +124,13 @@ class Assembly:
                 up.callback(part.close, made)
 
     def hand_over(self) -> None:
-        """The following stop is no clean shutdown: state for a restart is kept."""
+        """A restart follows the coming stop, which is not clean: keep state for the restart."""
         for part in self._parts:
             if part.hand_over is not None and part.kind in self._made:
                 part.hand_over(self._made[part.kind])
 
     def forget(self) -> None:
-        """The built components were closed; they will be built again."""
+        """Forget the built components after they were closed; `make` builds them again."""
         self._made.clear()
 
     def start(self, up: ExitStack) -> None:

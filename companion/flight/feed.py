@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.sources import FrameSource
 from localizer.types import Frame
 
@@ -15,8 +15,9 @@ _log = logging.getLogger(__name__)
 
 
 class Feed:
-    """Passes on every frame of a source. ended: set when the source ends; error: what ended it,
-    None for a normal end. failures: number of frames whose receiver raised; the flight continues.
+    """Passes every frame of a source to `take`, on its own thread. ended: set when the source ends;
+    error: what ended it, None for a normal end. failures: number of frames for which `take` raised;
+    the flight continues.
     """
 
     def __init__(self, source: FrameSource, take: Callable[[Frame], None]) -> None:
@@ -35,11 +36,11 @@ class Feed:
     def stop(self) -> None:
         """Close the source and wait for the thread."""
         self._source.close()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     @property
     def last_tick_ns(self) -> int:
-        """Since when a frame is being processed, CLOCK_MONOTONIC; now while waiting for one."""
+        """When the present frame came, CLOCK_MONOTONIC; now while waiting for a frame."""
         taken_ns = self._taken_ns
         return time.monotonic_ns() if taken_ns is None else taken_ns
 
@@ -47,13 +48,13 @@ class Feed:
         try:
             for frame in self._source.frames():
                 self._taken_ns = time.monotonic_ns()
-                self._hand_on(frame)
+                self._pass_on(frame)
                 self._taken_ns = None
         except Exception as error:
             self.error = error
         self.ended.set()
 
-    def _hand_on(self, frame: Frame) -> None:
+    def _pass_on(self, frame: Frame) -> None:
         try:
             self._take(frame)
         except Exception:  # a part's fault, which the others and the next frames do not share

@@ -1,4 +1,4 @@
-"""Assess the health once a second and report it to the bridge, the record and the log."""
+"""Assesses the health once a second and reports it to the bridge, the record and the log."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.sources import StreamState
 from companion.writing import NewestFile
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
-from mavlink_bridge.alerts.catalogue import alert, body, named
+from mavlink_bridge.alerts.catalogue import alert, body, values_by_name
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel
@@ -49,8 +49,8 @@ _OF_STATE = {
 
 @dataclass(frozen=True)
 class HealthStatus:
-    """alerts: the active ones, most severe first. is_reported: another component has already
-    reported the first.
+    """Result of an assessment. alerts: the active ones, most severe first. is_reported: another
+    component has already reported the first alert.
     """
 
     level: HealthLevel
@@ -59,15 +59,15 @@ class HealthStatus:
 
     @property
     def line(self) -> str:
-        """For health.json."""
+        """The alerts' texts in one line, for health.json."""
         return ", ".join(body(alert) for alert in self.alerts)
 
 
 @dataclass(frozen=True)
 class HealthInputs:
-    """Further inputs: completeness of the record, sigma of the autopilot's position in metres,
-    integrity monitor, unreadable map nodes, map offset, counts of targets, and why no search is
-    possible.
+    """Further inputs of the assessment. is_recorded: the record is complete; position_sigma_m: of
+    the autopilot's position, None if unknown; unreadable_nodes: of the map; map_shift: map offset,
+    None without; targets: counts; search_lacks: why no search is possible, None if one is.
     """
 
     is_recorded: Callable[[], bool] = lambda: True
@@ -80,7 +80,10 @@ class HealthInputs:
 
 
 class HealthMonitor:
-    """Assesses all components, reports changes, and writes ``health.json``.
+    """Assesses all components once a second, reports changes, and writes ``health.json``.
+
+    feed_state: state of the video; event: receives (level, text) for log and record; record_folder:
+    for health.json, None without.
 
     Above 200 lines: every condition that can be true is ranked here, in one place.
     """
@@ -107,7 +110,7 @@ class HealthMonitor:
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
-        self._file = _file(record_folder, event) if record_folder is not None else None
+        self._file = None if record_folder is None else _health_file(record_folder, event)
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._came: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._failures = 0
@@ -117,7 +120,7 @@ class HealthMonitor:
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
 
     def start(self) -> None:
-        """Start watching."""
+        """Start the thread."""
         if self._file is not None:
             self._file.start()
         # Since it was made, kernels were compiled for a minute.
@@ -125,18 +128,18 @@ class HealthMonitor:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, after one last report."""
+        """Stop the thread, after one last report."""
         self._stop.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
         if self._file is not None:
             self._file.stop()
 
     def end(self, how: str) -> None:
-        """The flight ends for this reason; the last report states it."""
+        """Set the reason for which the flight ends; the last report states it."""
         self._ended = how
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Note an estimate. Never blocks."""
+        """Add an estimate, accepted or not. Never blocks."""
         self._estimates.append((time.monotonic(), estimate))
 
     def _run(self) -> None:
@@ -163,16 +166,16 @@ class HealthMonitor:
         self._write(status.level.value, status.line, status.alerts)
 
     def _last_state(self, status: HealthStatus) -> str:
-        """State before the end. If the camera ended earlier, the state before that."""
+        """Text of the state before the end. If the camera ended earlier, the state before that."""
         if status.alerts[0].id is AlertId.NO_FRAME:
             arrived, estimate = self._estimates[-1]
             age_s = time.monotonic() - arrived
-            before = body(_of_state(estimate)[1])
+            before = body(_state_alert(estimate)[1])
             return f"{before} until {age_s:.0f} s before, then {status.line}"
         return f"{status.line} until then"
 
     def assess(self) -> HealthStatus:
-        """The current health."""
+        """Rank the conditions and return the current health."""
         feed = self._feed_state()
         if feed in _OF_FEED:
             level, of = _OF_FEED[feed]
@@ -181,7 +184,7 @@ class HealthMonitor:
             return HealthStatus(HealthLevel.DEGRADED, (alert(AlertId.FC_SILENT),), is_reported=True)
         engine = self._engine_health()
         if not self._estimates:
-            waiting = _waiting_for(engine, self._lacks(engine))
+            waiting = _waiting_for(engine, self._search_obstacle(engine))
             return HealthStatus(HealthLevel.STARTING, (alert(waiting),))
         arrived, estimate = self._estimates[-1]
         is_old = time.monotonic() - arrived > _STALE_S
@@ -197,14 +200,14 @@ class HealthMonitor:
 
     def _tracking(self, estimate: PoseEstimate, engine: EngineHealth) -> HealthStatus:
         """Health while frames are processed and the position is not lost."""
-        level, news = _of_state(estimate)
+        level, news = _state_alert(estimate)
         overload = self._overload(engine)
         held = self._integrity_monitor.reason if self._integrity_monitor is not None else None
         if held is not None:  # the monitor told it
             return HealthStatus(HealthLevel.FAILED, (held,), is_reported=True)
         if level is not HealthLevel.OK:
             return HealthStatus(level, (news,))
-        fault, lacks = self._bridge.injection_fault, self._lacks(engine)
+        fault, lacks = self._bridge.injection_fault, self._search_obstacle(engine)
         if fault is not None:  # the bridge told it
             return HealthStatus(HealthLevel.DEGRADED, (fault,), is_reported=True)
         if lacks not in (None, AlertId.SEARCH_NOT_READY):
@@ -214,7 +217,7 @@ class HealthMonitor:
         return HealthStatus(level, (news,))
 
     def _notes(self, feed: StreamState) -> tuple[Alert, ...]:
-        """Further active alerts, for example unreadable parts of the map."""
+        """Further active alerts: unreadable parts of the map, scaled video, incomplete record."""
         notes = (
             (self._unreadable_nodes() > 0, AlertId.MAP_UNREADABLE),
             (feed is StreamState.SCALED, AlertId.VIDEO_SCALED),
@@ -223,7 +226,7 @@ class HealthMonitor:
         return tuple(alert(of) for holds, of in notes if holds)
 
     def _overload(self, engine: EngineHealth) -> Alert | None:
-        """Alert if too few of the received frames are localized."""
+        """Alert if fewer than 3 frames/s are localized of at least 6 received; otherwise None."""
         now_s, came = time.monotonic(), engine.frames_in
         self._came.append((now_s, came))
         while now_s - self._came[0][0] > _RATE_S:
@@ -246,14 +249,14 @@ class HealthMonitor:
         fix_ns = estimate.last_fix_ns
         since_s = 0.0 if fix_ns is None else (time.monotonic_ns() - fix_ns) * 1e-9
         alerts = [alert(AlertId.LOST, seconds=since_s)]
-        sigma_m, lacks = self._position_sigma_m(), self._lacks(engine)
+        sigma_m, lacks = self._position_sigma_m(), self._search_obstacle(engine)
         if sigma_m is not None:
             alerts.append(alert(AlertId.EKF_UNCERTAIN, metres=2.0 * sigma_m))
         if lacks is not None:
             alerts.append(alert(lacks))
         return tuple(alerts)
 
-    def _lacks(self, engine: EngineHealth) -> AlertId | None:
+    def _search_obstacle(self, engine: EngineHealth) -> AlertId | None:
         """Why the map cannot be searched now; None if it can."""
         return AlertId.SEARCH_HANGS if engine.search_hangs else self._search_lacks()
 
@@ -262,7 +265,7 @@ class HealthMonitor:
         report: dict[str, Any] = {
             "level": level,
             "text": text,
-            "alerts": {a.id.value: named(a) for a in alerts},
+            "alerts": {a.id.value: values_by_name(a) for a in alerts},
             "time_ns": time.monotonic_ns(),
             "pid": os.getpid(),
             "engine": asdict(self._engine_health()),
@@ -290,20 +293,20 @@ def _monitor_report(monitor: IntegrityMonitor | None) -> dict[str, Any] | None:
         return None
     level = monitor.level
     return {
-        "findings": monitor.standing(),
+        "findings": monitor.active_values(),
         "hpl_m": None if level is None else level.horizontal_m,
         "vpl_m": None if level is None else level.vertical_m,
     }
 
 
-def _file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:
+def _health_file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:
     """Writer of ``health.json``; a failing disk is reported once."""
     path = folder / "health.json"
     return NewestFile(path, lambda e: event("warning", f"{path} cannot be written: {e}"))
 
 
 def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
-    """p50 and p95 of each stage, ms."""
+    """p50 and p95 of each stage's duration in the estimates, ms."""
     recent = [e.stage_ms for e in estimates]
     stages = {name for stage_ms in recent for name in stage_ms}
     return {
@@ -320,8 +323,8 @@ def _error(engine: EngineHealth) -> AlertId:
 
 
 def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
-    """Alert that says what is missing before the first estimate. lacks: why no search
-    is possible.
+    """Alert that says what is missing before the first estimate. lacks: why no search is possible,
+    or None.
     """
     if engine.searching or (lacks is not None and engine.searches):
         return lacks or AlertId.SEARCHING
@@ -330,8 +333,8 @@ def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
     return AlertId.WAITING_FOR_PRIOR if engine.frames_in > 0 else AlertId.WAITING_FOR_VIDEO
 
 
-def _of_state(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
-    """Alert of the tracking state. BRIDGING: duration and 95 % bound of the error.
+def _state_alert(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
+    """Health level and alert of the tracking state. BRIDGING: duration and 95 % bound of the error.
 
     BRIDGING of less than two seconds counts as TRACKING: the cause may be a cloud's shadow, or a
     car that fills the frame.

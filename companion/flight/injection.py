@@ -1,6 +1,6 @@
-"""Convert estimates to fixes and pass them to the bridge, unless a check holds them.
+"""Converts estimates to fixes and passes them to the bridge, unless a check holds them.
 
-Each fix is made once, for injection and for those who only observe.
+Each estimate is converted once, for injection and for the observers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 
 
 def is_for_injection(estimate: PoseEstimate) -> bool:
-    """Whether the estimate is converted to a fix and checked at all."""
+    """Whether an estimate is converted to a fix and checked: accepted, TRACKING or BRIDGING."""
     return estimate.accepted and estimate.state in _INJECTED
 
 
@@ -40,15 +40,15 @@ class JumpCounter:
     position.
 
     A jump is each start after LOST, also the first. A registration after BRIDGING is a jump, too,
-    because it corrects the drift. DEGRADED causes no jump.
+    because it corrects the drift. DEGRADED causes no jump. count: jumps so far, from 1.
     """
 
     def __init__(self) -> None:
         self.count = 1
         self._state = TrackingState.INITIALIZING
 
-    def note(self, state: TrackingState) -> None:
-        """Process the tracking state of a frame."""
+    def add_state(self, state: TrackingState) -> None:
+        """Add the tracking state of the next frame."""
         before, self._state = self._state, state
         is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
         found_again = before is TrackingState.BRIDGING and state is TrackingState.TRACKING
@@ -56,11 +56,11 @@ class JumpCounter:
 
 
 class FixInjection:
-    """Passes a fix to the bridge for every accepted estimate while tracking.
+    """Converts each accepted estimate to a fix, has it checked, and passes it to the bridge.
 
-    It runs on the localization thread and converts there. The conversion takes 0.12 ms in the
-    median (two geodetic conversions and two rotations, no access to the map). To wake another
-    thread would take as long and make the fix older.
+    It runs on the localization thread. The conversion takes 0.12 ms in the median (two geodetic
+    conversions and two rotations, no access to the map). To wake another thread would take as long
+    and make the fix older.
     """
 
     def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:
@@ -72,18 +72,18 @@ class FixInjection:
         self._checks_failed = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
 
     def add_check(self, check: FixCheck) -> None:
-        """Call `check` with every fix from now on, after the earlier ones; it may hold or change
-        it.
+        """Add a check that is called with every fix, after the earlier ones; it may hold or change
+        the fix.
         """
         self._checks = (*self._checks, check)
 
     def add_observer(self, observer: Observer) -> None:
-        """Call `observer` with every fix from now on, after its injection."""
+        """Call `observer` with every fix from now on, after its injection, also if it is held."""
         self._observers = (*self._observers, observer)
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
-        """Inject an estimate if all checks pass. Never blocks."""
-        self._jumps.note(estimate.state)
+        """Convert an estimate, inject the fix if all checks pass, call observers. Never blocks."""
+        self._jumps.add_state(estimate.state)
         if not is_for_injection(estimate):
             return
         time_ns = estimate.exposure_time_ns

@@ -21,7 +21,7 @@ import numpy as np
 
 from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
@@ -42,10 +42,12 @@ LocalAt = Callable[[int], tuple[float, ...] | None]
 
 @dataclass(frozen=True)
 class LastFix:
-    """A confirmed position, as it is kept for a restart. time_ns: CLOCK_MONOTONIC of `boot`.
-    latitude_deg, longitude_deg, height_m: of the camera, WGS84; sigma_m: of its worst axis.
-    local_ned: the EKF's position at that time, m; autopilot_ns: time since the autopilot's boot;
-    origin: of local_ned, latitude, longitude, altitude AMSL; None where unknown.
+    """A confirmed position, as it is stored for a restart.
+
+    boot: id of this computer's boot; time_ns: CLOCK_MONOTONIC of that boot. latitude_deg,
+    longitude_deg, height_m: of the camera, WGS84; sigma_m: of its worst axis. local_ned: the EKF's
+    position at that time, m; autopilot_ns: time since the autopilot's boot; origin: of local_ned,
+    latitude, longitude, altitude AMSL; None where unknown.
     """
 
     boot: str
@@ -59,8 +61,8 @@ class LastFix:
     origin: tuple[float, float, float] | None = None
 
     def has_same_origin(self, state: VehicleState, time_ns: int) -> bool:
-        """Whether the EKF still uses the same origin: not after a reboot of the autopilot, and not
-        with another origin.
+        """Whether the EKF still uses the same origin at time_ns: False after a reboot of the
+        autopilot, or if the origin was moved.
         """
         offset_ns, origin = state.clock_offset_ns, _place(state.origin)
         since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS
@@ -79,7 +81,7 @@ def _place(origin: Origin | None) -> tuple[float, float, float] | None:
 
 
 def read_last_fix(path: Path, boot: str) -> LastFix | None:
-    """The position that a process of this boot wrote; None if it cannot be trusted."""
+    """The position that a process of this boot wrote; None without one that can be trusted."""
     try:
         status = os.lstat(path)
         if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
@@ -123,10 +125,11 @@ def _is_place(fix: LastFix) -> bool:
 
 
 class FixMemory:
-    """Writes the newest confirmed position in flight, and reads that of the previous process.
+    """Writes the newest confirmed position twice a second, and gives a prior from that of the
+    previous process.
 
-    trusted: whether no check holds the output now; state: the vehicle's telemetry. Thread-safe; its
-    own thread writes the file.
+    path: the file, None for none. trusted: whether no check holds the output now; state: the
+    vehicle's telemetry. Thread-safe; its own thread writes the file.
     """
 
     def __init__(
@@ -150,29 +153,32 @@ class FixMemory:
         self._thread = threading.Thread(target=self._run, name="last-fix", daemon=True)
 
     def start(self) -> None:
-        """Start keeping."""
+        """Start the thread that writes the file."""
         self._thread.start()
 
     def hand_over(self) -> None:
-        """The following stop is no clean shutdown: the file stays for the next process."""
+        """A restart follows the coming stop: keep the file for the next process."""
         self._leaves = True
 
     def stop(self) -> None:
         """Stop. After a clean shutdown the file is removed. Does not wait for a disk that hangs."""
         self._stop.set()
-        if joined(self._thread) and self._path is not None and not self._leaves:
+        if wait_for_end(self._thread) and self._path is not None and not self._leaves:
             try:
                 self._path.unlink(missing_ok=True)
             except OSError as error:  # its age and the boot still tell the next process
                 _log.warning("the last fix is not removed: %s", error)
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Note a position that the map confirmed. Never blocks."""
+        """Store a position that the map confirmed, to be written. Never blocks."""
         if estimate.accepted and estimate.state is TrackingState.TRACKING:
             self._newest, self._before = estimate, None
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """Prior from the process before, until this one has found the position itself."""
+        """Prior for time_ns (CLOCK_MONOTONIC) by the previous process's position and the EKF's
+        displacement since; None if unknown or too old, or after this process has found a position
+        itself.
+        """
         last = self._before
         if last is None:
             return None

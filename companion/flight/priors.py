@@ -46,28 +46,26 @@ class AutopilotSource(Protocol):
         ...
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time."""
+        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
         ...
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a CLOCK_MONOTONIC time."""
+        """The camera's attitude to NED at a CLOCK_MONOTONIC time; None if unknown."""
         ...
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's position (north, east, down) from its origin, m."""
+        """The EKF's position (north, east, down) from its origin, m; None if unknown."""
         ...
 
 
 def drift_sigma_m(seconds: float) -> float:
-    """Horizontal sigma of an EKF's position, so many seconds after its last absolute
-    measurement.
-    """
+    """Horizontal sigma of an EKF's position, m, `seconds` after its last absolute measurement."""
     return min(SENSORS.ekf_drift.sigma_m(seconds), _LARGEST_SIGMA_M)
 
 
-def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] | None:
-    """The EKF's position (north, east, down), m, at a time. It is extrapolated by the velocity if
-    the frame is newer than the last report (10 Hz).
+def local_near(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] | None:
+    """The EKF's position (north, east, down) from its origin at time_ns, m; None if unknown. It is
+    extrapolated by the velocity for up to 0.3 s after the last report (10 Hz).
     """
     known = autopilot.local_at(time_ns)
     if known is not None:
@@ -81,18 +79,17 @@ def local_about(autopilot: AutopilotSource, time_ns: int) -> tuple[float, ...] |
 
 
 @dataclass(frozen=True)
-class Belief:
-    """Quality of the autopilot's position. independent: not derived from our own fixes. sigma_m:
-    horizontal, one sigma; None: unknown.
+class PositionQuality:
+    """Quality of the autopilot's position. independent: the position is not derived from our own
+    fixes. sigma_m: horizontal, one sigma; None: unknown.
     """
 
     sigma_m: float | None
     independent: bool
 
 
-class PositionBelief:
-    """Estimates the quality of the EKF's position at any time from GNSS and our own fixes.
-
+class PositionQualityMonitor:
+    """Estimates the quality of the EKF's position from the time of the last GNSS or own fix.
     Thread-safe: the localization thread passes estimates, the bridge's thread states.
     """
 
@@ -103,12 +100,12 @@ class PositionBelief:
         self._fix_ns: int | None = None
 
     def note_fix(self, time_ns: int) -> None:
-        """Our fix was accepted and sent to the EKF."""
+        """Set the time of the newest own fix that was sent to the EKF."""
         with self._lock:
             self._fix_ns = time_ns
 
-    def at(self, state: VehicleState, now_ns: int, *, on_gnss: bool = True) -> Belief:
-        """Quality of this state's position now. on_gnss: whether healthy GNSS determines it."""
+    def at(self, state: VehicleState, now_ns: int, *, on_gnss: bool = True) -> PositionQuality:
+        """Quality of this state's position at now_ns. on_gnss: whether the EKF uses GNSS."""
         healthy = on_gnss and gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
         with self._lock:
             if healthy:
@@ -116,19 +113,19 @@ class PositionBelief:
             known = [t for t in (self._gnss_ns, self._fix_ns) if t is not None]
         if healthy:
             own_m = state.gps_h_accuracy_m or 0.0
-            return Belief(max(self._base_m, own_m), independent=True)
+            return PositionQuality(max(self._base_m, own_m), independent=True)
         if state.ekf_flags and not state.ekf_flags & _HORIZONTAL:
-            return Belief(None, independent=False)
+            return PositionQuality(None, independent=False)
         if not known:
-            return Belief(_UNTOLD_SIGMA_M, independent=False)
-        return Belief(
+            return PositionQuality(_UNTOLD_SIGMA_M, independent=False)
+        return PositionQuality(
             math.hypot(self._base_m, drift_sigma_m((now_ns - max(known)) * 1e-9)),
             independent=False,
         )
 
 
 def _is_beside_receiver(state: VehicleState) -> bool:
-    """Whether the EKF's position agrees with the receiver's."""
+    """Whether the EKF's position agrees with the GNSS receiver's."""
     ekf = (state.latitude_deg, state.longitude_deg)
     receiver = (state.gps_latitude_deg, state.gps_longitude_deg)
     if ekf[0] is None or ekf[1] is None or receiver[0] is None or receiver[1] is None:
@@ -142,8 +139,8 @@ class AutopilotPose:
     """The camera's pose from the autopilot's position, attitude and gimbal angles.
 
     on_gnss: whether the EKF uses GNSS, None if unknown; then it counts as using GNSS if the
-    receiver reports the same position. A position that results from our own fixes is not used as a
-    start.
+    receiver reports the same position. A position that results from our own fixes is not marked
+    `independent`.
     """
 
     def __init__(
@@ -156,13 +153,13 @@ class AutopilotPose:
         self._autopilot, self._on_gnss = autopilot, on_gnss
         self._extrinsics = extrinsics
         self._config = config
-        self.belief = PositionBelief(config)
+        self.belief = PositionQualityMonitor(config)
 
     def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
-        """Note one of our fixes.
+        """Note the time of an accepted estimate. Never blocks.
 
-        Never blocks. reaches_ekf: whether positions are sent to the EKF. A fix in shadow mode or on
-        hold does not correct the EKF, which may drift; the search region must allow for that.
+        reaches_ekf: whether positions are sent to the EKF. A fix in shadow mode or on hold does not
+        correct the EKF, which may drift; the search region must allow for that.
         """
         if estimate.accepted and reaches_ekf:
             self.belief.note_fix(estimate.exposure_time_ns)
@@ -170,19 +167,19 @@ class AutopilotPose:
     @property
     def sigma_m(self) -> float | None:
         """Horizontal sigma of the autopilot's position now; None where unknown."""
-        return self._believed(self._autopilot.state(), time.monotonic_ns()).sigma_m
+        return self._quality(self._autopilot.state(), time.monotonic_ns()).sigma_m
 
     @property
     def sensors(self) -> AuxiliarySensors:
-        """These data in the form that the localizer needs."""
+        """Rotation, displacement, height and clearance as functions, for the localizer."""
         return AuxiliarySensors(
             self.rotation, self.displacement, lambda _time_ns: self.height_m, self.clearance_m
         )
 
     @property
     def height_m(self) -> float | None:
-        """Barometric height above the map's origin, m; None: unknown. The world's z is smaller by
-        the Earth's curvature.
+        """The autopilot's altitude as height above the map's origin, m; None: unknown. The world's
+        z is smaller by the Earth's curvature.
         """
         altitude_m = self._autopilot.state().altitude_amsl_m
         if altitude_m is None or not math.isfinite(altitude_m):
@@ -191,8 +188,8 @@ class AutopilotPose:
         return altitude_m + self._extrinsics.geoid_separation_m - origin_m
 
     def clearance_m(self, time_ns: int) -> float | None:
-        """Height above the ground by the rangefinder, m; None without a reading at about that
-        CLOCK_MONOTONIC time, or if the vehicle is tilted too much.
+        """Height above the ground by the rangefinder, m. None without a reading within 0.5 s of
+        that CLOCK_MONOTONIC time, or if the vehicle is tilted by more than 25 degrees.
         """
         state, attitude = self._autopilot.state(), self._autopilot.attitude_at(time_ns)
         away_s = abs(time_ns - state.rangefinder_time_ns) * 1e-9
@@ -215,9 +212,9 @@ class AutopilotPose:
         return bool(self._autopilot.state().ekf_flags & _ATTITUDE)
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """The camera's pose at a CLOCK_MONOTONIC time; None while unknown."""
+        """Prior of the camera's pose at a CLOCK_MONOTONIC time; None while unknown."""
         state = self._autopilot.state()
-        belief = self._believed(state, time_ns)
+        belief = self._quality(state, time_ns)
         if belief.sigma_m is None:
             return None
         prior = vehicle_prior(
@@ -231,14 +228,15 @@ class AutopilotPose:
         return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
-        """The camera's rotation (3, 3) in the map's axes, from the autopilot's attitude
-        and gimbal.
+        """The camera's rotation (3, 3), map axes from camera, at that time, from attitude and
+        gimbal; None if unknown.
         """
         gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
 
     def displacement(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
-        """Displacement (3,) in the map's axes between two times by the EKF, and its sigma (m).
+        """Displacement (3,) in the map's axes between two times by the EKF, and its sigma (m); None
+        if unknown.
 
         It is inertial while no fix of ours is sent, as during a tentative track. The axes at the
         map's origin are used instead of the vehicle's: 0.1° at 10 km.
@@ -250,7 +248,7 @@ class AutopilotPose:
         if begin is None or end is None:
             return None
         way = NED_FROM_ENU.T @ (np.array(end[:3]) - np.array(begin[:3]))
-        belief = self._believed(state, end_ns)
+        belief = self._quality(state, end_ns)
         if belief.sigma_m is None:
             return None
         # The position's sigma now against that at the begin is what the velocity may be off.
@@ -260,20 +258,20 @@ class AutopilotPose:
         speed_error = math.hypot(drift.speed_mps, drift.acceleration_mps2 * since_s)
         return way, 0.5 + speed_error * elapsed_s
 
-    def _believed(self, state: VehicleState, now_ns: int) -> Belief:
+    def _quality(self, state: VehicleState, now_ns: int) -> PositionQuality:
         known = self._on_gnss()
         on_gnss = _is_beside_receiver(state) if known is None else known
         return self.belief.at(state, now_ns, on_gnss=on_gnss)
 
 
 class PriorSources:
-    """Sources of a pose prior; the first that has one is used."""
+    """Ordered sources of a pose prior; the first that has one is used."""
 
     def __init__(self, *sources: PriorProvider) -> None:
         self._sources = sources
 
     def add(self, source: PriorProvider) -> None:
-        """Add a source that is used if the earlier ones have no prior."""
+        """Add a source, used if the earlier ones have no prior."""
         self._sources = (*self._sources, source)
 
     def at(self, time_ns: int) -> PosePrior | None:

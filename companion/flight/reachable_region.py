@@ -1,8 +1,8 @@
 """The region in which the camera can be since the last registration.
 
-An EKF that has lost its position gives none, but the aircraft was located seconds ago, moved as its
-IMU says, and no faster than it can. So a search need not begin with the whole map, where other
-ground looks similar.
+If the EKF has lost its position, it gives no region. But the aircraft was located seconds ago,
+moved as its IMU says, and no faster than it can. So a search need not begin with the whole map,
+where other ground looks similar.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ _GUST_M_S = 8.0  # by which a wind carries an aircraft that holds nothing, beyon
 
 @dataclass(frozen=True)
 class _ConfirmedPosition:
-    """A confirmed position (2,), east and north, m, with its velocity (2,), m/s. begun: the IMU's
-    integral at that time, of its run number `run`; None until the IMU record reaches it.
+    """A confirmed position (2,), east and north, m, with its velocity (2,), m/s.
+
+    begun: the IMU's integral at that time, None until the IMU record reaches it; run: the
+    integral's number of restarts.
     """
 
     time_ns: int
@@ -38,8 +40,10 @@ class _ConfirmedPosition:
 
 
 class ReachableRegion:
-    """Estimates arrive on the localization thread. `follow` is called on the video thread some
-    times a second, `region` on the search thread.
+    """Computes the reachable region from the last confirmed position and the IMU (`track`).
+
+    `add_estimate` is called on the localization thread, `follow` on the video thread some times a
+    second, `region` on the search thread.
     """
 
     def __init__(self, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
@@ -48,7 +52,7 @@ class ReachableRegion:
         self._seen: _ConfirmedPosition | None = None
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Note a position that the map confirmed."""
+        """Store a position that the map confirmed."""
         if not estimate.accepted or estimate.state is not TrackingState.TRACKING:
             return
         velocity = self._vehicle.state().local_velocity_ned or (0.0, 0.0, 0.0)
@@ -58,12 +62,12 @@ class ReachableRegion:
             self._seen = _ConfirmedPosition(estimate.exposure_time_ns, place, moving)
 
     def follow(self) -> None:
-        """Process the new IMU samples, about ten."""
+        """Integrate the new IMU samples, about ten a call."""
         with self._lock:
             self._follow()
 
     def region(self, time_ns: int) -> SearchRegion | None:
-        """Region of the camera at a CLOCK_MONOTONIC time; None before the first fix."""
+        """Region of the camera at a CLOCK_MONOTONIC time, map axes; None before the first fix."""
         with self._lock:
             self._follow()
             seen, end, run = self._seen, self._track.at(self._track.newest_ns), self._track.restarts
@@ -72,7 +76,7 @@ class ReachableRegion:
         t = (time_ns - seen.time_ns) * 1e-9
         speed = float(np.linalg.norm(seen.velocity))
         farthest_m = _LEAST_M + (speed + _GUST_M_S) * t
-        way = _way(seen, end) if run == seen.run else None
+        way = _displacement(seen, end) if run == seen.run else None
         radius_m = _LEAST_M + _SIGMAS * SENSORS.inertial_drift.sigma_m(t)
         # An integral that lies beyond what can be flown is a wrong one.
         if way is None or radius_m > farthest_m or float(np.linalg.norm(way)) > farthest_m:
@@ -87,9 +91,9 @@ class ReachableRegion:
             self._seen = replace(seen, begun=begun, run=self._track.restarts)
 
 
-def _way(seen: _ConfirmedPosition, end: InertialDisplacement | None) -> Array | None:
-    """East and north displacement since then by the IMU, m; None where its record does not reach
-    back.
+def _displacement(seen: _ConfirmedPosition, end: InertialDisplacement | None) -> Array | None:
+    """Displacement (east, north), m, from the confirmed position to `end` by the IMU; None if the
+    IMU record does not reach back.
     """
     if seen.begun is None or end is None:
         return None

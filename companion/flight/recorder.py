@@ -21,7 +21,7 @@ from companion.errors import DiskFaultError, ReportError
 from companion.ground.target_files import write_target_files
 from companion.preflight.map_pin import readable_map_hash
 from companion.redaction import redacted
-from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
+from companion.trajectory import TrajectoryFiles, snapshot_name, to_stamped_pose
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import quaternion_from_matrix
@@ -54,8 +54,8 @@ EVENT_COLUMNS = ("time_ns", "level", "text", "alert")
 
 
 def fresh_folder(folder: Path) -> Path:
-    """`folder`, or `folder` with a number if it already holds a record, so that a restart in flight
-    does not overwrite it.
+    """`folder`, or a numbered one beside it if it already holds a record, so that a restart in
+    flight does not overwrite the record.
     """
     candidate, number = folder, 2
     while (candidate / "estimates.csv").exists():
@@ -82,7 +82,7 @@ def remove_empty(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, config: CompanionConfig) -> None:
-    """Write ``record.json``: settings, the map's hash, versions, and the time on both clocks.
+    """Write ``record.json``: settings, the map's hash, versions, and one time on both clocks.
 
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
     `ReportError` if it cannot be written, `DiskFaultError` if the disk is the cause.
@@ -211,7 +211,7 @@ class Recorder:
         self._put("events", lambda: row)
 
     def snapshot(self, frame: Frame) -> None:
-        """Keep the frame's image, named by its exposure time, if the interval has passed."""
+        """Store the frame's image, named by its exposure time, if the interval has passed."""
         if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
             self._next_snapshot_ns = frame.exposure_time_ns + self._interval_ns
             with self._pictures_lock:
@@ -224,9 +224,7 @@ class Recorder:
                 self._written(frame)
 
     def close(self) -> bool:
-        """Write the queue and close the files. Returns False if the disk hangs; it is not waited
-        for.
-        """
+        """Write the queue and close the files. False if the disk hangs, which is not waited for."""
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)
@@ -245,7 +243,7 @@ class Recorder:
         return writer
 
     def _put(self, name: str, row: Callable[[], Iterable[Any]]) -> bool:
-        """Queue the data of a row; the recorder's thread computes coordinates and figures."""
+        """Queue a row, computed by the recorder's thread; False if the queue is full."""
         try:
             self._rows.put_nowait((name, row))
         except queue.Full:
@@ -279,7 +277,7 @@ class Recorder:
         if self._trajectory is None:
             self._trajectory = TrajectoryFiles(self._folder, self._frame)
             self._files.append(self._trajectory)
-        self._trajectory.append(stamped(snapshot_name(estimate.exposure_time_ns), estimate))
+        self._trajectory.append(to_stamped_pose(snapshot_name(estimate.exposure_time_ns), estimate))
 
     def _run(self) -> None:
         flushed = time.monotonic()
@@ -308,7 +306,8 @@ class Recorder:
 
 
 class RecordKeeper:
-    """The record of one process, if the disk allows one. A start may be a restart in flight.
+    """Opens and closes the record of one process. If the disk fails, the flight continues without a
+    record.
 
     say_incomplete: tells the operator why a part of the record is missing; called from any thread.
     """
@@ -328,11 +327,11 @@ class RecordKeeper:
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
-            self.recorder = Recorder(record, self._frame, self.failed)
+            self.recorder = Recorder(record, self._frame, self.mark_incomplete)
             self.folder = record.folder
             write_manifest(record.folder, config)
         except DiskFaultError as error:
-            self.failed(str(error.__cause__))
+            self.mark_incomplete(str(error.__cause__))
         except BaseException:
             self.close()
             raise
@@ -353,7 +352,7 @@ class RecordKeeper:
             _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
-        """Write the queue, close the files, and write the targets' map files."""
+        """Write the queue, close the files, and write map files (KML etc.) of the targets."""
         answers = self.recorder is None or self.recorder.close()
         if self.folder is not None and answers:
             try:
@@ -361,7 +360,7 @@ class RecordKeeper:
             except OSError as error:
                 _log.warning("no maps of the targets: %s", error)
 
-    def failed(self, why: str) -> None:
-        """Mark the record as incomplete."""
+    def mark_incomplete(self, why: str) -> None:
+        """Mark the record as incomplete and tell the operator why."""
         self.is_complete = False
         self._say_incomplete(why)

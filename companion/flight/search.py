@@ -56,7 +56,9 @@ Event = Callable[[str, str], None]
 
 @dataclass(frozen=True)
 class Hint:
-    """The operator's approximate position: east and north in the map's frame, metres."""
+    """The operator's approximate position: east and north in the map's frame, metres;
+    CLOCK_MONOTONIC.
+    """
 
     centre: tuple[float, float]
     radius_m: float
@@ -65,20 +67,23 @@ class Hint:
 
 @dataclass(frozen=True)
 class RelocalizationHypothesis:
-    """A found pose, the query that it answers, and the region of the camera at that time by its
-    IMU; None where unknown.
+    """Result of a search that took too long, for a second search near it.
+
+    found: the pose at the query's frame; reachable: region of the camera at that time by its IMU,
+    None if unknown.
     """
 
     query: PlaceQuery
     found: Relocalization
-    reach: SearchRegion | None = None
+    reachable: SearchRegion | None = None
 
     def predicted_query(
-        self, query: PlaceQuery, velocity: Array | None, reach: SearchRegion | None
+        self, query: PlaceQuery, velocity: Array | None, reachable: SearchRegion | None
     ) -> PlaceQuery | None:
-        """A later frame's query, limited to where the camera can be; None after too long.
+        """`query`, of a later frame, limited to where the camera can be by then; None after more
+        than 10 s.
 
-        velocity: (3,) m/s in the map's axes, of the EKF, None if unknown; reach: the reachable
+        velocity: (3,) m/s in the map's axes, of the EKF, None if unknown; reachable: the reachable
         region at the time of the later frame.
         """
         elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
@@ -87,10 +92,10 @@ class RelocalizationHypothesis:
         way, sigma_m = np.zeros(2), _speed_sigma(velocity) * elapsed_s
         if velocity is not None:
             way = velocity[:2] * elapsed_s
-        elif self.reach is not None and reach is not None:
+        elif self.reachable is not None and reachable is not None:
             by_imu, grown_m = (
-                reach.centre - self.reach.centre,
-                _radius_m(reach) - _radius_m(self.reach),
+                reachable.centre - self.reachable.centre,
+                _radius_m(reachable) - _radius_m(self.reachable),
             )
             # A record of the IMU that broke meanwhile has another centre, and says nothing.
             if 0.0 < grown_m <= sigma_m and np.linalg.norm(by_imu) <= sigma_m:
@@ -108,7 +113,7 @@ class RelocalizationHypothesis:
         )
 
     def velocity_to(self, later: Relocalization) -> Array | None:
-        """The camera's velocity (3,), m/s, from this position to a later one."""
+        """Mean velocity (3,), m/s, from this position to a later one; None below 0.3 s."""
         elapsed_s = self._elapsed_s(later.exposure_time_ns)
         if elapsed_s < _LEAST_BASE_S:
             return None
@@ -120,8 +125,8 @@ class RelocalizationHypothesis:
 
 
 def _on_plane(query: PlaceQuery) -> PlaceQuery:
-    """The query with its height above the tangent plane at the map's origin, which is 8 m above the
-    Earth's surface at 10 km; unchanged if the region is unknown.
+    """The query with its height above the tangent plane at the map's origin instead of the Earth's
+    surface, which lies 8 m below the plane at 10 km; unchanged if the region is unknown.
     """
     if query.region is None:
         return query
@@ -137,10 +142,10 @@ def _speed_sigma(velocity: Array | None) -> float:
     return _UNKNOWN_SPEED_M_S if velocity is None else _SPEED_SIGMA_M_S
 
 
-def place_on_map(
+def enu_on_map(
     cache: TileCache, latitude_deg: float, longitude_deg: float, radius_m: float
 ) -> tuple[float, float] | None:
-    """East and north, metres; None if no part of the map's box is within the radius."""
+    """East and north of a position, metres; None if it is more than radius_m from the map's box."""
     place = cache.frame.enu_from_geodetic(
         latitude_deg, longitude_deg, cache.manifest.origin.height_m
     )
@@ -151,11 +156,12 @@ def place_on_map(
 
 
 class PlaceSearch:
-    """Searches the position with a frame and the autopilot's data.
+    """Searches the map for the position of a frame, with the autopilot's attitude and height.
 
     A thread of its own opens the map's overview, or computes it at the first start, so that neither
-    the start nor a search waits for it. reach: region that the camera can have reached at a time
-    since the last position on the map; used if the autopilot knows no position.
+    the start nor a search waits for it. event: receives (level, text) for log and record.
+    reachable: region that the camera can have reached at a time since the last position on the map;
+    used if the autopilot knows no position.
     """
 
     def __init__(
@@ -164,13 +170,13 @@ class PlaceSearch:
         config: LocalizerConfig,
         autopilot: AutopilotPose,
         event: Event,
-        reach: Callable[[int], SearchRegion | None] = lambda _time_ns: None,
+        reachable: Callable[[int], SearchRegion | None] = lambda _time_ns: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
-        self._sighting: RelocalizationHypothesis | None = None  # too old to be given out
+        self._hypothesis: RelocalizationHypothesis | None = None  # too old to be given out
         self._cache, self._config = cache, config
-        self._autopilot, self._event, self._reach = autopilot, event, reach
+        self._autopilot, self._event, self._reach = autopilot, event, reachable
         self._in_reach = 0  # searches since the whole map was searched
         self._hint: Hint | None = None
         self._open: OpenRelocalizer | None = None
@@ -181,11 +187,11 @@ class PlaceSearch:
         self._thread = threading.Thread(target=self.prepare, name="overview", daemon=True)
 
     def start(self) -> None:
-        """Start to prepare the search."""
+        """Start the thread that prepares the search."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Cancel the preparation."""
+        """Cancel the preparation, if it still runs."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(_STOP_S)
@@ -198,15 +204,15 @@ class PlaceSearch:
             self._open = None
 
     def hint(self, east_m: float, north_m: float, radius_m: float) -> None:
-        """Set the operator's position, map frame: the next searches look there. It is
-        never a fix.
+        """Set the operator's position (map frame): for 120 s searches look within radius_m of it.
+        It is never a fix.
         """
         self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
 
     def hint_at(self, hint: PlaceHint) -> bool:
-        """The same in WGS84, with twice the operator's sigma; False if it is off the map."""
+        """As `hint`, for a position in WGS84 and twice its radius; False if it is off the map."""
         radius_m = _HINT_SIGMAS * hint.radius_m
-        at = place_on_map(self._cache, hint.latitude_deg, hint.longitude_deg, radius_m)
+        at = enu_on_map(self._cache, hint.latitude_deg, hint.longitude_deg, radius_m)
         if at is None:
             return False
         self.hint(*at, radius_m)
@@ -222,7 +228,7 @@ class PlaceSearch:
         query = self._query(frame)
         if query is None:
             return None
-        seen, self._sighting = self._sighting, None
+        seen, self._hypothesis = self._hypothesis, None
         velocity, about = self._autopilot.velocity, self._reach(frame.exposure_time_ns)
         predicted = seen.predicted_query(query, velocity, about) if seen is not None else None
         began = self._clock()
@@ -231,7 +237,7 @@ class PlaceSearch:
             return None
         seconds = self._clock() - began
         if predicted is None and seconds * _speed_sigma(velocity) > _STALE_M:
-            self._sighting = RelocalizationHypothesis(query, found, about)
+            self._hypothesis = RelocalizationHypothesis(query, found, about)
             self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
             return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")
@@ -247,7 +253,7 @@ class PlaceSearch:
         )
 
     def _query(self, frame: Frame) -> PlaceQuery | None:
-        """The autopilot's data; None while attitude and height are unknown."""
+        """Query from frame and autopilot's data; None while attitude or height is unknown."""
         rotation = self._autopilot.rotation(frame.exposure_time_ns)
         height_m = self._autopilot.height_m
         if rotation is None or height_m is None:
@@ -264,7 +270,7 @@ class PlaceSearch:
 
     def region(self, time_ns: int) -> SearchRegion | None:
         """Search region: the operator's position, else that of the autopilot, else the reachable
-        region; None: the whole map, which some searches always cover.
+        region. None: the whole map, which every fifth search without autopilot's position covers.
         """
         hint = self._hint
         if hint is not None and time.monotonic() - hint.time_s < _HINT_S:
@@ -277,17 +283,17 @@ class PlaceSearch:
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 
     def prepare(self) -> None:
-        """Prepare the search on this thread; report what prevents it."""
+        """Open the map's overview on this thread; set `lacks` and report if that fails."""
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)
             self.lacks = None
         except (LocalizerError, OSError) as error:
-            self._without(str(error))
+            self._disable(str(error))
         except Exception as error:  # the flight goes on without it, and says so
             _log.exception("the search could not be made ready")
-            self._without(f"{type(error).__name__}: {error}")
+            self._disable(f"{type(error).__name__}: {error}")
 
-    def _without(self, why: str) -> None:
+    def _disable(self, why: str) -> None:
         self.lacks = AlertId.NO_SEARCH
         self._event("warning", f"no search for a lost place: {why}")

@@ -1,4 +1,4 @@
-"""A flight process that waits with map and network open and kernels compiled."""
+"""A standby: a flight process that waits with map and network open and kernels compiled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from localizer.errors import LocalizerError
 _log = logging.getLogger(__name__)
 
 
-def ready(
+def released_companion(
     config: CompanionConfig,
     *,
     standby: bool,
@@ -21,7 +21,8 @@ def ready(
     restart: bool = False,
     lost_settings: str = "",
 ) -> Companion | None:
-    """Return the flight process: at once, or when the standby is released; None if it never is.
+    """Return the flight process: at once, or for a standby when the supervisor releases it. None if
+    it never does.
 
     pulse, restart, lost_settings: see `Companion`. For a standby, restart is always true.
     """
@@ -43,5 +44,5 @@ def _stand_by(companion: Companion) -> Companion | None:
         _log.warning("standby is not warm: %s", error)
     if sys.stdin.readline():
         return companion
-    companion.put_away()
+    companion.discard_prepared()
     return None

@@ -1,4 +1,4 @@
-"""Report the camera's view a few times a second, as `CameraView` of the newest estimate."""
+"""Reports the camera's view a few times a second, as `CameraView` of the newest estimate."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 
 from companion.conversions import camera_view
-from companion.ending import joined
+from companion.ending import wait_for_end
 from localizer.geometry.geo import LocalFrame
 from localizer.targets.locate import RayCaster
 from localizer.types import PoseEstimate
@@ -17,9 +17,9 @@ _log = logging.getLogger(__name__)
 
 
 class ViewReporter:
-    """Computes the ground point on its own thread, at most `rate_hz` times a second.
+    """Computes the view and its ground point on its own thread, at most `rate_hz` times a second.
 
-    look: takes the view; must not block.
+    cast: intersects rays with the map. look: receives the view; must not block.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class ViewReporter:
         """Stop the thread."""
         self._stop.set()
         self._came.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Submit an estimate; only accepted ones are reported. Never blocks."""
+        """Add an estimate; only accepted ones are reported. Never blocks."""
         if estimate.accepted:
             self._newest = estimate
             self._came.set()

@@ -1,4 +1,5 @@
-"""A flight's targets for maps: ``targets.geojson`` (RFC 7946) and ``targets.kml`` (OGC KML 2.2).
+"""Writes a flight's targets for maps: ``targets.geojson`` (RFC 7946), ``targets.kml`` (OGC KML
+2.2).
 
 Made from ``targets.csv`` when the record is closed, or later from any record.
 """
@@ -24,7 +25,9 @@ _LONGEST_TRACK = 3600
 
 @dataclass
 class _TargetRows:
-    """What the rows of one target say. track: (longitude, latitude, height) while it moved."""
+    """Collected rows of one target. place: newest (longitude, latitude, height); track: the same
+    while it moved.
+    """
 
     name: str
     reports: int = 0
@@ -39,7 +42,7 @@ class _TargetRows:
     tracked_ns: int = -_TRACK_STEP_NS
 
     def add(self, row: dict[str, str]) -> None:
-        """Take a row; ValueError for one that was cut off, as of a full disk."""
+        """Add a row; ValueError for one that was cut off, as by a full disk."""
         time_ns = int(row["exposure_time_ns"])
         place = tuple(float(row[k]) for k in ("longitude_deg", "latitude_deg", "height_m"))
         sigma = float(row["sigma_horizontal_m"]), float(row["sigma_up_m"])
@@ -96,7 +99,7 @@ def _read(path: Path) -> Iterator[_TargetRows]:
 
 
 def _clock_offset_ns(manifest: Path) -> int | None:
-    """UTC minus CLOCK_MONOTONIC; None where the record does not say."""
+    """UTC minus CLOCK_MONOTONIC, ns; None if the record does not state it."""
     try:
         document = json.loads(manifest.read_text(encoding="utf-8"))
         return int(document["utc_ns"]) - int(document["monotonic_ns"])
@@ -131,7 +134,9 @@ def _properties(target: _TargetRows, offset_ns: int | None) -> dict[str, Any]:
 
 
 def _feature(target: _TargetRows, offset_ns: int | None) -> dict[str, Any]:
-    """A point at the newest place; of a target that moved, with its line. Ellipsoidal heights."""
+    """GeoJSON of a target: a point at the newest position, and a line if it moved. Ellipsoidal
+    heights.
+    """
     point: dict[str, Any] = {"type": "Point", "coordinates": list(target.place)}
     geometry = point
     if len(target.track) > 1:
@@ -146,7 +151,7 @@ def _feature(target: _TargetRows, offset_ns: int | None) -> dict[str, Any]:
 
 
 def _kml(targets: list[_TargetRows], offset_ns: int | None) -> ElementTree.Element:
-    """Marks on the ground: KML's heights are above a geoid that the viewer chooses."""
+    """KML marks on the ground, because KML's heights are above a geoid that the viewer chooses."""
     root = ElementTree.Element("kml", xmlns=_KML)
     document = ElementTree.SubElement(root, "Document")
     ElementTree.SubElement(document, "name").text = "Targets"

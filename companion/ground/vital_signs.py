@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from localizer.types import PoseEstimate, TrackingState
 
 _log = logging.getLogger(__name__)
@@ -45,10 +45,10 @@ class VitalSigns:
     def stop(self) -> None:
         """Stop the thread."""
         self._stop.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Note an estimate. Never blocks."""
+        """Add an estimate, accepted or not. Never blocks."""
         self._state = estimate.state
         if estimate.accepted:
             self._accepted.append(estimate)

@@ -50,8 +50,8 @@ _QUEUE = 256
 
 @dataclass(frozen=True)
 class IntegrityLimits:
-    """Settings from other parts of the configuration. gnss_is_ours: the vehicle's receiver is our
-    GPS_INPUT; horizontal_fov_deg: of the camera.
+    """Settings from other parts of the configuration. gnss_is_ours: the vehicle's GNSS input is our
+    GPS_INPUT, so that it is no independent evidence; horizontal_fov_deg: of the camera.
     """
 
     alert_limit_m: float = 10.0
@@ -61,7 +61,8 @@ class IntegrityLimits:
 
 
 class IntegrityChecks:
-    """Call every method under one lock, or from one thread.
+    """Holds the checks and their alerts. Call every method under one lock, or from one thread.
+    track: the IMU's integrated acceleration.
 
     Above 200 lines: a few lines for each check pass its evidence to it and take its result.
     """
@@ -121,7 +122,7 @@ class IntegrityChecks:
         return frozenset(one.spec.id for one in self._active() if one.spec.inhibits)
 
     def to_remember(self) -> ActiveAlerts:
-        """The active alerts that inhibit injection."""
+        """The active calibration alerts that inhibit injection, to be restored after a restart."""
         return {
             one.spec.id: (one.figure, one.word)
             for one in self._active()
@@ -133,40 +134,38 @@ class IntegrityChecks:
 
     @property
     def _is_only_uncertain(self) -> bool:
-        """Whether the protection level alone holds the output, so that position changes
-        are valid.
-        """
+        """Whether only the protection level holds the output: position changes are valid then."""
         holding = {one.spec.id for one in self._active() if one.spec.action >= OutputAction.HOLD}
         return holding == {AlertId.HPL_OVER_LIMIT}
 
     def restore(self, found: ActiveAlerts) -> None:
-        """Keep alerts of the previous process active until evidence clears them."""
+        """Activate alerts of the process before a restart; evidence clears them as usual."""
         for of, (figure, word) in found.items():
             self._debouncers[of].restore(figure, word)
 
     @property
     def level(self) -> ProtectionLevel | None:
-        """The newest fix's protection level."""
+        """Protection level of the newest fix; None before the first."""
         return self._level
 
-    def standing(self) -> dict[str, float]:
-        """The active alerts by identifier, with their values."""
+    def active_values(self) -> dict[str, float]:
+        """The active alerts by identifier, with their values (0.0 if an alert has none)."""
         return {one.spec.id.value: one.figure for one in self._active()}
 
     # --- evidence -----------------------------------------------------------------------------
 
     def add_frame(self, time_ns: int, image: Image) -> None:
-        """Add a frame (H, W, 3) uint8 at its exposure time."""
+        """Add a frame (H, W, 3) uint8 at its exposure time (ns), for the video checks."""
         if self._picture is not None and time_ns <= self._picture[0]:
             self._backwards += 1
             return
         self._backwards = 0
         self._picture = (time_ns, self._pictures.add(time_ns, image))
 
-    def add_observation(self, sighting: CalibrationObservation) -> None:
-        """Add a registered frame, for the checks of calibration and ground."""
-        self._calibration.add(sighting)
-        self._ground.add(sighting)
+    def add_observation(self, observation: CalibrationObservation) -> None:
+        """Add a registered frame, for the calibration watch and the height above the ground."""
+        self._calibration.add(observation)
+        self._ground.add(observation)
 
     def admit(
         self,
@@ -176,32 +175,33 @@ class IntegrityChecks:
         *,
         held: bool = False,
     ) -> VisionFix | None:
-        """Return the fix if it may be injected, with a new reset count if earlier fixes were wrong;
-        None holds it. A fix of the odometry that only its protection level holds is marked
-        `position_withheld`; each of the odometry gets the scale error that the IMU has shown.
+        """Return a fix, with protection level and covariance completed, if it may be injected; None
+        holds it.
 
-        attitude: the autopilot's at the fix's time, None if unknown; held: whether another check
-        holds the fix.
+        Its reset count is increased if earlier fixes were wrong. A fix of the odometry that only
+        its protection level holds is marked `position_withheld`; each fix of the odometry gets the
+        scale error that the IMU has shown. attitude: the autopilot's at the fix's time, None if
+        unknown; held: whether another check holds the fix.
         """
         self._tilt.add(fix, attitude)
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
         admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
-        self._doubt_steps(fix, state, admitted=admitted)
+        self._update_steps(fix, state, admitted=admitted)
         height_m = self._ground.height_m(state, fix.time_ns)
-        known_m = self._known_m(state, height_m)
+        position_error_m = self._estimated_error_m(state, height_m)
         moving = _moving_now(state, fix.time_ns)
         self._level = level = protection_level(
-            fix, moving, self._config.protection, known_m, height_m
+            fix, moving, self._config.protection, position_error_m, height_m
         )
-        scale = None if fix.scale_sigma is None else max(fix.scale_sigma, self._scale.wrong_by)
+        scale = None if fix.scale_sigma is None else max(fix.scale_sigma, self._scale.scale_error)
         levels = (level.horizontal_m, level.vertical_m)
         fix = replace(fix, protection_m=levels, scale_sigma=scale)
         self._jump_held = not admitted
         # The jump has a line of its own; how the place moves after it is judged again.
         before, self._newest = self._newest, fix
-        leaps = before is not None and fix.reset_count != before.reset_count
-        self._waiting.append((fix, self._jumps.leaps or leaps))
+        jumped = before is not None and fix.reset_count != before.reset_count
+        self._waiting.append((fix, self._jumps.jumped or jumped))
         if self.action >= OutputAction.HOLD or not admitted:
             self._wrong += self._jump_held or self.action is OutputAction.EXCLUDE_AND_RESET
             moves_right = fix.by_odometry and admitted and not held and self._is_only_uncertain
@@ -212,37 +212,37 @@ class IntegrityChecks:
             return None
         # The EKF must not believe what is known to be off to what noise alone would leave. The
         # checks above keep the noise: what they look for is what it does not explain.
-        covariance = fix.position_covariance_ned + known_m**2 * np.eye(3)
+        covariance = fix.position_covariance_ned + position_error_m**2 * np.eye(3)
         resets = fix.reset_count + self._wrong
         return replace(fix, reset_count=resets, position_covariance_ned=covariance)
 
     def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[Alert]:
-        """Run all checks, a few times a second; returns the alerts to report."""
+        """Run all checks, a few times a second; returns the alerts to report, raised or cleared."""
         state = vehicle.state()
         self._track.follow(vehicle)
         self._jumps.add_state(state)
         self._follow(now_ns, state)
-        self._leave_out_old_pictures()
+        self._exclude_stale_frames()
         self._calibration.step(now_ns, vehicle, self._track)
         results = self._results(now_ns, _moving_now(state, now_ns))
         updates = (one.update(now_ns, results[of]) for of, one in self._debouncers.items())
         return [alert for alert in updates if alert is not None]
 
-    def _doubt_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
-        """Position uncertainty from recent steps of the position or the timestamps."""
+    def _update_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
+        """Update the uncertainty from position steps. admitted: the jump check passed the fix."""
         if not state.armed:
-            self._steps.begins_anew()
+            self._steps.reset()
         elif self._jumps.announced and admitted:
-            self._steps.is_found_again()
+            self._steps.confirm_position()
         elif self._jumps.step is not None:
             found = self._steps.add(self._jumps.step)
             if found is not None:
-                self._calibration.doubt_stamps(found.time_ns)
+                self._calibration.suspect_timestamps(found.time_ns)
         no_delay_s = max(self._config.calibration.time_s, 0.5 * self._steps.delay_s)
         if self._calibration.figures().late_s.is_within(no_delay_s):
-            self._steps.stamps_are_right()
+            self._steps.confirm_timestamps()
 
-    def _leave_out_old_pictures(self) -> None:
+    def _exclude_stale_frames(self) -> None:
         """Exclude frozen or repeated frames from the calibration watch: without motion they look
         like late timestamps.
         """
@@ -251,25 +251,25 @@ class IntegrityChecks:
         time_ns, verdict = self._picture
         if verdict.repeat_lag_s > 0.0 or self._debouncers[AlertId.VIDEO_REPEATS].raised:
             found_s = self._config.picture.repeat_s + _REPEATS_BEFORE_S
-            self._calibration.distrust(time_ns - int(found_s * 1e9))
+            self._calibration.exclude_since(time_ns - int(found_s * 1e9))
         elif verdict.still_s >= _IDENTICAL_S or self._debouncers[AlertId.VIDEO_FROZEN].raised:
-            self._calibration.distrust(time_ns - int(verdict.still_s * 1e9))
+            self._calibration.exclude_since(time_ns - int(verdict.still_s * 1e9))
 
     def _follow(self, now_ns: int, state: VehicleState) -> None:
         """Process the fixes whose time the IMU record has reached, in order."""
         while self._waiting:
-            fix, leaps = self._waiting[0]
+            fix, jumped = self._waiting[0]
             if not self._motion.ready(fix) and now_ns - fix.time_ns < _WAITS_NS:
                 return
             self._waiting.popleft()
-            self._verdict = self._motion.add(fix, leaps=leaps)
-            self._scale.add(fix, leaps=leaps)
+            self._verdict = self._motion.add(fix, jumped=jumped)
+            self._scale.add(fix, jumped=jumped)
             self._height_reading = self._height.add(fix, state)
 
     # --- judgement ----------------------------------------------------------------------------
 
     def _results(self, now_ns: int, state: VehicleState) -> dict[AlertId, CheckResult]:
-        """The result of each check at a time; `bad` is None without evidence."""
+        """The result of each check at now_ns; `bad` is None without evidence."""
         newest = self._newest
         fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
         height = state.altitude_relative_m
@@ -280,7 +280,9 @@ class IntegrityChecks:
             AlertId.VIDEO_FROZEN: lambda: (
                 self._frozen(now_ns, state) if flies else CheckResult(False)
             ),
-            AlertId.LOW_CONTRAST: lambda: self._dim(now_ns) if flies else CheckResult(False),
+            AlertId.LOW_CONTRAST: lambda: (
+                self._low_contrast(now_ns) if flies else CheckResult(False)
+            ),
             AlertId.VIDEO_REPEATS: lambda: self._repeats(now_ns) if flies else CheckResult(False),
             AlertId.VISION_IMU_MISMATCH: lambda: self._moves_otherwise() if fresh else none,
             AlertId.HEIGHT_MISMATCH: lambda: self._height_reading if fresh else none,
@@ -288,16 +290,16 @@ class IntegrityChecks:
             AlertId.POSITION_STEP: lambda: CheckResult(
                 self._steps.metres > 0.0, self._steps.metres
             ),
-            AlertId.TILT_MISMATCH: lambda: self._tilts() if fresh else none,
+            AlertId.TILT_MISMATCH: lambda: self._tilt_mismatch() if fresh else none,
             AlertId.GNSS_VISION_MISMATCH: lambda: (
-                self._against_gnss(state, now_ns) if fresh else none
+                self._gnss_mismatch(state, now_ns) if fresh else none
             ),
             AlertId.EKF_REJECTS_VISION: lambda: (
-                self._ekf.refuses(state) if fresh else CheckResult(False)
+                self._ekf.check_rejection(state) if fresh else CheckResult(False)
             ),
             AlertId.EKF_JUMP: lambda: self._ekf_jump(state, now_ns),
             AlertId.VIDEO_TIMESTAMPS: lambda: CheckResult(self._backwards >= _BACKWARDS),
-            AlertId.HPL_OVER_LIMIT: lambda: self._beyond_limit() if fresh else none,
+            AlertId.HPL_OVER_LIMIT: lambda: self._level_over_limit() if fresh else none,
             **self._calibration_checks(),
         }
         return {of: check() for of, check in checks.items()}
@@ -315,15 +317,15 @@ class IntegrityChecks:
             AlertId.TIME_OFFSET: lambda: _beyond(late, limits.time_s, 1e3, when),
         }
 
-    def _known_m(self, state: VehicleState, height_m: float | None) -> float:
-        """Position error from the estimated calibration and tilt errors, metres."""
+    def _estimated_error_m(self, state: VehicleState, height_m: float | None) -> float:
+        """Position error from estimated calibration, steps and tilt, m. height_m: above ground."""
         speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
         focal, late = (
             self._debouncers[AlertId.FOCAL_LENGTH].raised,
             self._debouncers[AlertId.TIME_OFFSET].raised,
         )
-        focal_m = self._calibration.known_m(speed, focal=focal, time=False)
-        late_m = self._calibration.known_m(speed, focal=False, time=late)
+        focal_m = self._calibration.position_error_m(speed, focal=focal, time=False)
+        late_m = self._calibration.position_error_m(speed, focal=False, time=late)
         # Late stamps are how a step is explained, and a tilt shifts as a step does.
         return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(height_m))
 
@@ -340,7 +342,7 @@ class IntegrityChecks:
         still = still or self._should_have_moved(state, verdict)
         return CheckResult(identical or still, verdict.still_s)
 
-    def _dim(self, now_ns: int) -> CheckResult:
+    def _low_contrast(self, now_ns: int) -> CheckResult:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
             return CheckResult(None)
         shown = self._picture[1].detail
@@ -348,7 +350,7 @@ class IntegrityChecks:
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
-        """Whether the EKF moved by metres during a frozen frame; unknown in a hover.
+        """Whether the EKF moved by metres since the frame froze; False in a hover.
 
         The EKF keeps its speed at first. Only after a second or two it follows the frozen position.
         """
@@ -358,7 +360,7 @@ class IntegrityChecks:
         return speed >= _MOVED_SPEED_MPS and speed * verdict.still_s >= _MOVED_M
 
     def _still_s(self, now_ns: int, state: VehicleState) -> float:
-        """How long a hover may show no motion; the limit depends on the distance to the ground."""
+        """How long the image of a hover may show no motion, s; longer high above the ground."""
         ground_m = self._config.picture.still_share * self._ground.width_m(state, now_ns)
         return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)
 
@@ -378,12 +380,12 @@ class IntegrityChecks:
         calm = verdict.share < _CALM_SHARE and verdict.still_s < _MOVES_S
         return CheckResult(not calm, verdict.deviation_m)
 
-    def _against_gnss(self, state: VehicleState, now_ns: int) -> CheckResult:
+    def _gnss_mismatch(self, state: VehicleState, now_ns: int) -> CheckResult:
         if self._newest is None or self._level is None or self._limits.gnss_is_ours:
             return CheckResult(None)
         return self._gnss.read(self._newest, state, self._level.horizontal_m, now_ns)
 
-    def _tilts(self) -> CheckResult:
+    def _tilt_mismatch(self) -> CheckResult:
         return CheckResult(self._tilt.tilts if self._tilt.is_known else None, self._tilt.off_deg)
 
     def _ekf_jump(self, state: VehicleState, now_ns: int) -> CheckResult:
@@ -395,9 +397,9 @@ class IntegrityChecks:
             and verdict.still_s < _MOVES_S
             and self.action is OutputAction.NONE
         )
-        return self._ekf.jumped(state, now_ns, agrees=agrees)
+        return self._ekf.check_jump(state, now_ns, agrees=agrees)
 
-    def _beyond_limit(self) -> CheckResult:
+    def _level_over_limit(self) -> CheckResult:
         if self._level is None:
             return CheckResult(None)
         level_m = self._level.horizontal_m
@@ -407,7 +409,9 @@ class IntegrityChecks:
 def _beyond(
     figure: CalibrationEstimate, limit: float, scale: float, word: CalibrationError
 ) -> CheckResult:
-    """Check result: bad if surely above the limit, good if surely below, otherwise unknown."""
+    """Bad if the estimate `exceeds` the limit, good if it `is_within`, otherwise no evidence.
+    scale: to the unit of the alert; word: for the alert.
+    """
     bad = figure.exceeds(limit)
     if not bad and not figure.is_within(limit):
         return CheckResult(None)
@@ -415,8 +419,8 @@ def _beyond(
 
 
 def _moving_now(state: VehicleState, time_ns: int) -> VehicleState:
-    """The state at a time, without an outdated velocity: an EKF without a position stops
-    LOCAL_POSITION_NED, and the last velocity would stay.
+    """The state with its velocity removed if that is older than 2 s at `time_ns`: an EKF without a
+    position stops LOCAL_POSITION_NED, and the last velocity would stay.
     """
     old = time_ns - state.local_time_ns > _OLD_NS
     return replace(state, local_velocity_ned=None) if old else state

@@ -53,7 +53,7 @@ class ProtectionConfig(StrictModel):
     time_bias_s: float = Field(SENSORS.time_bias_s, exclude=True)  # time error, times the speed
 
     def of_camera(self, *, calibrated: bool) -> ProtectionConfig:
-        """The constants for a camera with its stated calibration, or the defaults."""
+        """A copy for a camera with a recent calibration (`calibrated`), or without one."""
         share = self.calibrated_share if calibrated else self.calibration_share
         return self.model_copy(update={"calibration_share": share})
 

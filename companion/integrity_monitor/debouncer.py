@@ -21,8 +21,8 @@ _LARGEST = 1e4  # per cent, degrees, milliseconds; of what is kept
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of a check. bad: None without evidence, which changes nothing. figure, word: values of
-    the alert, such as its direction or component.
+    """Result of a check. bad: True raises the alert, False clears it; None: no evidence, nothing
+    changes. figure, word: values for the alert's text, such as metres and a direction.
     """
 
     bad: bool | None
@@ -31,9 +31,8 @@ class CheckResult:
 
 
 class AlertDebouncer:
-    """Raises an alert after raise_s of bad evidence and clears it after clear_s of good evidence.
-
-    Time without evidence counts for neither, and no alert is repeated during it.
+    """Raises an alert after `spec.raise_s` of bad results and clears it after `spec.clear_s` of
+    good ones. Time without evidence counts for neither, and no alert is repeated during it.
     """
 
     def __init__(self, spec: AlertSpec) -> None:
@@ -46,7 +45,7 @@ class AlertDebouncer:
         self._reported_ns = 0
 
     def update(self, now_ns: int, result: CheckResult) -> Alert | None:
-        """Add a result; returns the alert to report, if it changed."""
+        """Add a result; returns the alert to report now (raised, cleared, repeated), if any."""
         silent_ns, self._updated_ns = now_ns - self._updated_ns, now_ns
         if result.bad is None:
             if not self.raised:
@@ -68,7 +67,7 @@ class AlertDebouncer:
         return self.alert() if self.raised else cleared(self.spec.id)
 
     def restore(self, figure: float, word: CalibrationError) -> None:
-        """The alert was active in a previous process; evidence clears it as usual."""
+        """Activate the alert as before a restart; evidence clears it as usual."""
         self.raised, self.figure, self.word = True, figure, word
 
     def alert(self) -> Alert:
@@ -89,25 +88,26 @@ ActiveAlerts = Mapping[AlertId, tuple[float, CalibrationError]]
 
 
 class InhibitMemory:
-    """Remembers active alerts that inhibit injection; see `RestartMemory`."""
+    """Remembers over a restart the active alerts that inhibit injection; see `RestartMemory`."""
 
     def __init__(self, memory: RestartMemory) -> None:
         self._memory = memory
         self._kept: frozenset[AlertId] = frozenset()
 
     def recall(self) -> ActiveAlerts:
-        """The alerts that were active in the previous process."""
+        """The alerts that were active before the restart; empty after a clean shutdown."""
         kept = self._memory.recall()
-        told = None if kept is None else kept[0].get("inhibits")
-        rows = told.items() if isinstance(told, dict) else ()
+        kept_alerts = None if kept is None else kept[0].get("inhibits")
+        rows = kept_alerts.items() if isinstance(kept_alerts, dict) else ()
         known = {spec.id.value: spec.id for spec in CATALOGUE.values()
                  if Inhibits.INJECTION in spec.inhibits}  # fmt: skip
-        found = {known[name]: row for name, told in rows if name in known and (row := _row(told))}
-        self.note(found)
+        found = {known[name]: row for name, values in rows
+                 if name in known and (row := _parse_row(values))}  # fmt: skip
+        self.store(found)
         return found
 
-    def note(self, found: ActiveAlerts) -> None:
-        """Remember the active alerts."""
+    def store(self, found: ActiveAlerts) -> None:
+        """Store the alerts that are active now, if they changed; without any, delete the memory."""
         if found.keys() == self._kept:
             return
         self._kept = frozenset(found)
@@ -117,14 +117,14 @@ class InhibitMemory:
             self._memory.drop()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """Stop; see `RestartMemory.stop`."""
+        """End the memory; a clean shutdown deletes what is stored (see `RestartMemory.stop`)."""
         self._memory.stop(clean_shutdown=clean_shutdown)
 
 
-def _row(told: Any) -> tuple[float, CalibrationError] | None:
-    if not isinstance(told, list) or len(told) != 2:
+def _parse_row(value: Any) -> tuple[float, CalibrationError] | None:
+    if not isinstance(value, list) or len(value) != 2:
         return None
-    figure, word = told
+    figure, word = value
     if not isinstance(figure, float) or not abs(figure) <= _LARGEST:
         return None
     sense = next((one for one in CalibrationError if one.value == word), None)

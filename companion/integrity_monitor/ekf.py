@@ -15,22 +15,23 @@ _CONFIRMS_S = 10.0  # of agreement with the IMU after a jump
 
 
 class EkfWatch:
-    """Reads the vehicle's state ten times a second; one thread."""
+    """Checks the EKF's output; called ten times a second with the state, from one thread."""
 
     def __init__(self) -> None:
         self._last: VehicleState | None = None
         self._unconfirmed_m = 0.0
         self._agreed_since_ns: int | None = None
 
-    def refuses(self, state: VehicleState) -> CheckResult:
-        """Whether the EKF's innovation test refuses positions (EKF_STATUS_REPORT, 193)."""
+    def check_rejection(self, state: VehicleState) -> CheckResult:
+        """Bad if the EKF's innovation test rejects positions (EKF_STATUS_REPORT, 193)."""
         ratio = state.ekf_horizontal_variance
         if ratio is None or math.isinf(ratio):
             return CheckResult(None)
         return CheckResult(ratio > _REFUSED, ratio)
 
-    def jumped(self, state: VehicleState, now_ns: int, *, agrees: bool) -> CheckResult:
-        """Size of the EKF's jump, until the IMU has agreed with vision for a while.
+    def check_jump(self, state: VehicleState, now_ns: int, *, agrees: bool) -> CheckResult:
+        """Bad after a jump of the EKF's position (figure: metres), until the IMU has agreed for 10
+        s.
 
         agrees: whether there is evidence that vision moves as the IMU; False without evidence. A
         jump on the ground is ignored, because an EKF jumps from its origin to its first position
@@ -50,7 +51,7 @@ class EkfWatch:
         return CheckResult(self._unconfirmed_m > 0.0, self._unconfirmed_m)
 
     def _leap(self, state: VehicleState) -> float:
-        """Distance between the position and the one predicted by the last velocity, metres; 0 for
+        """Distance of the EKF's position from the one predicted by its last velocity, metres; 0 in
         normal flight.
         """
         last = self._last

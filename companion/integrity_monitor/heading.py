@@ -26,7 +26,7 @@ _KEPT = 64
 
 @dataclass(frozen=True)
 class HeadingChange:
-    """Of one fix: vision's heading minus the gyros' and minus the autopilot's, rad."""
+    """Vision's heading of a fix minus that of the gyros and of the autopilot, rad; its sigma."""
 
     time_ns: int
     against_gyros: float
@@ -34,8 +34,8 @@ class HeadingChange:
     sigma: float
 
 
-def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
-    """The heading change of a fix; None if one of the headings is unknown."""
+def heading_change(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
+    """The heading differences of a fix; None if one of the headings is unknown."""
     yaw_rad = fix.yaw_rad
     if attitude is None or yaw_rad is None:
         return None
@@ -48,17 +48,17 @@ def turn_of(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
 
 
 class HeadingHistory:
-    """Heading changes of the newest fixes in time order."""
+    """Heading differences of the newest 64 fixes in time order."""
 
     def __init__(self) -> None:
         self._turns: deque[HeadingChange] = deque(maxlen=_KEPT)
 
     def add(self, turn: HeadingChange | None) -> None:
-        """Add a fix; one without a heading is ignored."""
+        """Add a fix's heading difference; None is ignored."""
         if turn is not None:
             self._turns.append(turn)
 
-    def apart(self, turn: HeadingChange) -> float:
+    def rotation_from_median(self, turn: HeadingChange) -> float:
         """Rotation of a fix from the median of the history, rad; 0 with too few headings.
 
         The gyros' heading has errors after lost ATTITUDE messages, and the autopilot's may step; a
@@ -74,18 +74,18 @@ class HeadingHistory:
             ),
         )
 
-    def contradict(self, turn: HeadingChange) -> bool:
-        """Whether a fix is rotated by more than noise and gyro drift explain."""
+    def is_rotated(self, turn: HeadingChange) -> bool:
+        """Whether a fix's heading is rotated by more than noise and gyro drift explain."""
         if not self._turns:
             return False
         newest = self._turns[-1]
         # Errors of vision are alike within a second: a median has the sigma of one.
         noise = _SIGMAS * math.hypot(newest.sigma, turn.sigma)
         drift = VEHICLE_SENSORS.gyro_drift_radps * (turn.time_ns - newest.time_ns) * 1e-9
-        return self.apart(turn) > _OFF_RAD + noise + drift
+        return self.rotation_from_median(turn) > _OFF_RAD + noise + drift
 
     def _newest(self) -> list[HeadingChange]:
-        """Of the last second, and three at least where fixes are rarer."""
+        """Headings of the last second, and at least the newest three."""
         turns = list(self._turns)
         since_ns = turns[-1].time_ns - _SPAN_NS if turns else 0
         within = sum(turn.time_ns > since_ns for turn in turns)
@@ -93,5 +93,5 @@ class HeadingHistory:
 
 
 def _median(angles: list[float]) -> float:
-    """Of angles about the first one, for they wrap."""
+    """Median of angles (rad) near the first one, because angles wrap."""
     return wrap_pi(angles[0] + statistics.median(wrap_pi(a - angles[0]) for a in angles))

@@ -1,4 +1,4 @@
-"""Runs the integrity checks on their own thread and checks every fix before injection."""
+"""Runs the integrity checks on their own thread, and checks every fix before it is injected."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class IntegrityMonitor:
         self._thread = threading.Thread(target=self._run, name="integrity", daemon=True)
 
     def start(self) -> None:
-        """Start the thread, with the inhibitions of a process that was killed."""
+        """Start the thread. Inhibitions of a process that was killed are restored."""
         if self._memory is not None:
             self._monitor.restore(self._memory.recall())
             self._inhibit(self._monitor.inhibiting)
@@ -85,46 +85,46 @@ class IntegrityMonitor:
         self._thread.join(2.0 * _LOCK_S)
 
     def close(self) -> None:
-        """Clean shutdown: nothing is kept for a restart."""
+        """Clean shutdown: delete what is stored for a restart."""
         if self._memory is not None:
             self._memory.stop()
 
     def hand_over(self) -> None:
-        """The following stop is no clean shutdown: inhibitions are kept for the restart."""
+        """A restart follows the coming stop: keep the stored inhibitions for it."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=False)
 
     def watch(self, last_ticks_ns: Callable[[], Mapping[str, int]]) -> None:
-        """Report components that stall. last_ticks_ns: time of the last run of each,
-        CLOCK_MONOTONIC ns.
+        """Report components that stall for 4 s. last_ticks_ns: gives the time of each component's
+        last run, CLOCK_MONOTONIC ns.
         """
         self._last_ticks = last_ticks_ns
 
     def add_frame(self, time_ns: int, image: Image) -> None:
-        """Submit a frame; the newest is checked. Never blocks."""
+        """Store a frame (H, W, 3) for the next run, which checks the newest. Never blocks."""
         self._picture = (time_ns, image)
 
-    def add_observation(self, sighting: CalibrationObservation) -> None:
-        """Submit a registered frame for the calibration watch and the distance to the ground."""
-        with self._asked() as answers:
+    def add_observation(self, observation: CalibrationObservation) -> None:
+        """Pass a registered frame to the calibration watch and the height above the ground."""
+        with self._locked() as answers:
             if answers:
-                self._monitor.add_observation(sighting)
+                self._monitor.add_observation(observation)
 
     def check(self, fix: VisionFix) -> VisionFix | None:
-        """The fix as it may be injected; None holds it."""
+        """The fix as it may be injected (see `IntegrityChecks.admit`); None holds it."""
         try:
-            if self._hangs():
+            if self._is_stalled():
                 return None
             state, attitude = self._bridge.state(), self._bridge.attitude_at(fix.time_ns)
-            with self._asked() as answers:
+            with self._locked() as answers:
                 if not answers:
                     return None
                 blind = self._is_blind
                 admitted = self._monitor.admit(fix, state, attitude, held=blind)
         except Exception:
-            self._fail("judging")
+            self._note_failure("judging")
             return None
-        self._works("judging")
+        self._note_success("judging")
         return admitted
 
     def submit(self, fix: VisionFix) -> None:
@@ -136,40 +136,40 @@ class IntegrityMonitor:
     @property
     def reason(self) -> Alert | None:
         """Alert that holds the output; None while it is not held."""
-        if self._hangs() or self._failed.raised:
+        if self._is_stalled() or self._failed.raised:
             return self._failed.alert()
-        with self._asked() as answers:
+        with self._locked() as answers:
             return self._monitor.reason if answers else None
 
     @property
     def level(self) -> ProtectionLevel | None:
-        """The newest fix's protection level."""
-        with self._asked() as answers:
+        """The newest fix's protection level; None before it, or if the monitor hangs."""
+        with self._locked() as answers:
             return self._monitor.level if answers else None
 
-    def standing(self) -> dict[str, float]:
-        """The active alerts by name, with their values."""
-        with self._asked() as answers:
-            return self._monitor.standing() if answers else {}
+    def active_values(self) -> dict[str, float]:
+        """The active alerts by identifier, with their values; empty if the monitor hangs."""
+        with self._locked() as answers:
+            return self._monitor.active_values() if answers else {}
 
     @contextmanager
-    def _asked(self) -> Iterator[bool]:
-        """Acquire the monitor's lock; False after a time limit, so that the caller does
-        not hang.
+    def _locked(self) -> Iterator[bool]:
+        """Acquire the monitor's lock for at most 1 s; yields whether it was acquired, so that no
+        caller hangs.
         """
-        given = not self._hangs() and self._lock.acquire(timeout=_LOCK_S)
+        given = not self._is_stalled() and self._lock.acquire(timeout=_LOCK_S)
         try:
             yield given
         finally:
             if given:
                 self._lock.release()
 
-    def _hangs(self) -> bool:
-        """Whether the monitor's own thread has stalled; the calling threads report it."""
+    def _is_stalled(self) -> bool:
+        """Whether the monitor's thread has not run for 2 s; the calling thread reports it then."""
         now_ns = self._clock()
         if now_ns - self.last_tick_ns < _STALLED_NS:
             return False
-        self._fail("taking turns")
+        self._note_failure("taking turns")
         self._report_failure(now_ns)
         return True
 
@@ -180,17 +180,17 @@ class IntegrityMonitor:
     def run_checks(self) -> None:
         """Run all checks once; the thread calls it ten times a second."""
         self.last_tick_ns = self._clock()
-        self._works("taking turns")
+        self._note_success("taking turns")
         picture, self._picture = self._picture, None
         looks = picture is not None  # a turn without one is no word that pictures can be looked at
         try:
             self._step(picture)
         except Exception:
-            self._fail("looking" if looks else "watching")
+            self._note_failure("looking" if looks else "watching")
         else:
-            self._works("watching")
+            self._note_success("watching")
             if looks:
-                self._works("looking")
+                self._note_success("looking")
         self._report_failure(self.last_tick_ns)
         self._report_stalled(self.last_tick_ns)
 
@@ -201,7 +201,7 @@ class IntegrityMonitor:
             self._bridge.report_alert(alert)
 
     def _report_stalled(self, now_ns: int) -> None:
-        """Report a stalled component, because its last state is outdated."""
+        """Report the component that has not run for longest, if its last run is too old."""
         last_ticks_ns = self._last_ticks()
         name = min(last_ticks_ns, key=lambda one: last_ticks_ns[one], default="")
         age_ns = now_ns - last_ticks_ns.get(name, now_ns)
@@ -215,8 +215,8 @@ class IntegrityMonitor:
         with self._failures:
             return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_RUNS
 
-    def _fail(self, what: str) -> None:
-        """Note a failure of the monitor; the next run reports it."""
+    def _note_failure(self, what: str) -> None:
+        """Count a failure of the monitor's task `what`; logs the first in a row."""
         with self._failures:
             count = self._fails[what] = self._fails.get(what, 0) + 1
         if count == 1:
@@ -224,7 +224,7 @@ class IntegrityMonitor:
                 "the integrity monitor failed %s", what, exc_info=sys.exc_info()[0] is not None
             )
 
-    def _works(self, what: str) -> None:
+    def _note_success(self, what: str) -> None:
         with self._failures:
             self._fails.pop(what, None)
 
@@ -237,7 +237,7 @@ class IntegrityMonitor:
         self._inhibit(inhibiting)
         if self._memory is not None:
             # Injection that runs is not stopped, by a restart no more than by the alert.
-            self._memory.note({} if self._bridge.injecting else found)
+            self._memory.store({} if self._bridge.injecting else found)
         for alert in alerts:
             self._bridge.report_alert(alert)
 

@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from companion.integrity_monitor.config import IntegrityMonitorConfig
-from companion.integrity_monitor.heading import HeadingChange, HeadingHistory, turn_of
+from companion.integrity_monitor.heading import HeadingChange, HeadingHistory, heading_change
 from companion.integrity_monitor.position_checks import LocalPlace
 from companion.integrity_monitor.step import PositionStep
 from localizer.sensors.error_model import SENSORS
@@ -52,13 +52,13 @@ class EkfDisplacement:
                 self._way.clear()
         self._way.append((state.local_time_ns, (north, east), way))
 
-    def moved(self, from_ns: int, to_ns: int) -> Metres | None:
+    def displacement(self, from_ns: int, to_ns: int) -> Metres | None:
         """North and east displacement between two times, metres; None where unknown."""
         a, b = self._at(from_ns), self._at(to_ns)
         return None if a is None or b is None else (b[0] - a[0], b[1] - a[1])
 
     def _at(self, time_ns: int) -> Metres | None:
-        """The integral at a time: interpolated, or extrapolated by up to a second."""
+        """Integral (north, east), m: interpolated, or extrapolated by up to a second; or None."""
         if not self._way:
             return None
         k = min(bisect_left(self._way, time_ns, key=lambda one: one[0]), len(self._way) - 1)
@@ -80,7 +80,7 @@ class _Passed:
 
 
 class _Held:
-    """The held fixes, as long as each is consistent with the one before."""
+    """The series of held fixes, each consistent with the one before."""
 
     def __init__(self, first: VisionFix) -> None:
         self.first = self.newest = first
@@ -96,7 +96,7 @@ class _Held:
         return (self.newest.time_ns - self.first.time_ns) * 1e-9
 
     def add_heading(self, turn: HeadingChange | None, *, is_turned: bool) -> None:
-        """Of the newest. is_turned: against those that passed."""
+        """Add the newest fix's heading. is_turned: it is rotated against the accepted fixes."""
         self.headings.add(turn)
         if turn is not None:
             self._turned_in_a_row = self._turned_in_a_row + 1 if is_turned else 0
@@ -118,19 +118,19 @@ class JumpCheck:
         self._passed: _Passed | None = None
         self._held: _Held | None = None
         self._headings = HeadingHistory()  # of what passed
-        self._led = 0  # fixes in a row, up to the last that passed, to which the EKF's velocity led
+        self._predictions = 0  # passed fixes in a row that lay where the EKF's velocity led
         self.distance_m = 0.0
         self.step: PositionStep | None = None
         """Of the newest fix, if it passed: how far from where the one before led."""
         self.announced = False
         """Whether the newest fix says that the estimate jumped since the one that passed last."""
-        self.leaps = False
+        self.jumped = False
         """Whether the newest fix is at another place than the one before: how it moves is judged
         again from here on.
         """
 
     def add_state(self, state: VehicleState) -> None:
-        """Update with the vehicle's state, a few times a second, with or without fixes."""
+        """Integrate the EKF's velocity; a few times a second, with or without fixes."""
         self._reckoning.add(state)
 
     def admit(
@@ -141,13 +141,13 @@ class JumpCheck:
         *,
         agrees: bool,
     ) -> bool:
-        """Whether the fix may pass. attitude: the autopilot's at the fix's time; agrees: vision
-        moves as the IMU does, or this is unknown.
+        """Whether the fix may pass; called once for each fix. attitude: the autopilot's at the
+        fix's time; agrees: vision moves as the IMU does, or this is unknown.
         """
         self._reckoning.add(state)
         was_held = self._held
         passes = self._passes(fix, state, attitude, agrees=agrees)
-        self.leaps = self._held is not was_held
+        self.jumped = self._held is not was_held
         return passes
 
     def _passes(
@@ -155,16 +155,17 @@ class JumpCheck:
     ) -> bool:
         self.step = None
         self.announced = self._passed is None or (fix.reset_count != self._passed.fix.reset_count)
-        turn = turn_of(fix, attitude)
+        turn = heading_change(fix, attitude)
         is_turned = turn is not None and self._is_turned(turn)
-        step = None if self._passed is None else self._leap(self._passed, fix)
+        step = None if self._passed is None else self._step_from(self._passed, fix)
         jump_m = 0.0 if step is None else math.hypot(*step.offset_m) - step.allowed_m
         if step is not None and is_turned:
             jump_m += step.growth_m  # nor does time explain it
         explained = self.announced and not is_turned
         if jump_m <= (self._config.jump_m if explained else self._config.unreported_jump_m):
             self.step = step
-            self._led = self._led + 1 if step is not None and step.is_led else 0
+            is_predicted = step is not None and step.is_predicted
+            self._predictions = self._predictions + 1 if is_predicted else 0
             self._pass(fix, state)
             self._headings.add(turn)
             return True
@@ -173,7 +174,7 @@ class JumpCheck:
         held.add_heading(turn, is_turned=is_turned)
         speaks_against = held.contradicted or (held.turned and is_turned)
         if agrees and not speaks_against and held.seconds >= self._config.jump_hold_s:
-            self._led = 0
+            self._predictions = 0
             self._pass(fix, state)
             self._headings = held.headings
             return True
@@ -184,7 +185,7 @@ class JumpCheck:
         self._passed, self._held = _Passed(fix, (north, east)), None
 
     def _is_turned(self, turn: HeadingChange) -> bool:
-        """Whether a fix is rotated against the last accepted ones.
+        """Whether a fix's heading is rotated against the last accepted ones.
 
         The gyros' drift grows with time. Therefore, after a rotation was detected, a fix belongs to
         the frame of reference (accepted or held) whose heading is nearer.
@@ -193,11 +194,12 @@ class JumpCheck:
             return False
         held = self._held
         if held is not None and held.turned:
-            return held.headings.apart(turn) < self._headings.apart(turn)
-        return self._headings.contradict(turn)
+            passed = self._headings.rotation_from_median(turn)
+            return held.headings.rotation_from_median(turn) < passed
+        return self._headings.is_rotated(turn)
 
     def _hold(self, fix: VisionFix) -> _Held:
-        """The held fixes with this one; an inconsistent fix starts a new series."""
+        """Add the fix to the held series; if they are inconsistent, it starts a new series."""
         held = self._held
         if held is None or not self._follows(held.newest, fix):
             held = self._held = _Held(fix)
@@ -209,56 +211,54 @@ class JumpCheck:
         return held
 
     def _moves_otherwise(self, held: _Held, since_s: float) -> bool:
-        """Whether the held fixes move differently from the EKF's velocity, as in a
-        rotated frame.
-        """
-        led = self._reckoned(held.first, held.newest)
-        if led is None:
+        """Whether the held fixes move unlike the EKF's velocity. since_s: dead reckoning so far."""
+        predicted = self._predicted(held.first, held.newest)
+        if predicted is None:
             return False
-        apart_m = math.hypot(*self._off(held.first, led, held.newest))
+        apart_m = math.hypot(*self._off(held.first, predicted, held.newest))
         return apart_m > _SIGMAS * math.hypot(
-            _sigmas(held.first, held.newest), _reckoned_m(since_s)
+            _sigmas(held.first, held.newest), _drift_sigma_m(since_s)
         )
 
-    def _leap(self, last: _Passed, fix: VisionFix) -> PositionStep:
-        """Distance of the fix from the position predicted from the last one, and its limit."""
+    def _step_from(self, last: _Passed, fix: VisionFix) -> PositionStep:
+        """Offset of the fix from where the last accepted one leads, and its limit."""
         dt = max(_seconds(last.fix, fix), 0.0)
         sigma = _SIGMAS * _sigmas(last.fix, fix)
         # While another is held, to let the allowance grow would let it pass by waiting (5 degrees
         # of a turned frame, 10 m at 120 m from home: after 3.8 s), and hold the right one behind.
-        led = self._reckoned(last.fix, fix) if self._held is not None else None
-        if led is not None:
-            allowed = math.hypot(sigma, _SIGMAS * _reckoned_m(dt))
+        predicted = self._predicted(last.fix, fix) if self._held is not None else None
+        if predicted is not None:
+            allowed = math.hypot(sigma, _SIGMAS * _drift_sigma_m(dt))
         else:
-            led = (last.velocity[0] * dt, last.velocity[1] * dt)
+            predicted = (last.velocity[0] * dt, last.velocity[1] * dt)
             allowed = sigma + _SPEED_MPS * dt + 0.5 * _DRIFT_MPS2 * dt * dt
             if dt > _GAP_S and self._held is None:  # the way may have turned
-                allowed += math.hypot(*led)
-        off = self._off(last.fix, led, fix)
+                allowed += math.hypot(*predicted)
+        off = self._off(last.fix, predicted, fix)
         return PositionStep(
             fix.time_ns, off, last.velocity, fix.horizontal_sigma_m, allowed, allowed - sigma, dt
         )
 
-    def _reckoned(self, last: VisionFix, fix: VisionFix) -> Metres | None:
-        """Position predicted by the EKF's velocity; None where that prediction failed before."""
-        return (
-            self._reckoning.moved(last.time_ns, fix.time_ns) if self._led >= _CALM_FIXES else None
-        )
+    def _predicted(self, last: VisionFix, fix: VisionFix) -> Metres | None:
+        """Displacement by the EKF's velocity, m; None where its prediction failed before."""
+        if self._predictions < _CALM_FIXES:
+            return None
+        return self._reckoning.displacement(last.time_ns, fix.time_ns)
 
-    def _off(self, last: VisionFix, led: Metres, fix: VisionFix) -> Metres:
-        """Distance from the prediction of one fix to another, metres."""
+    def _off(self, last: VisionFix, predicted: Metres, fix: VisionFix) -> Metres:
+        """(north, east) offset of `fix` from `last` displaced by `predicted`, metres."""
         there, here = self._place.ned(last), self._place.ned(fix)
-        return here[0] - there[0] - led[0], here[1] - there[1] - led[1]
+        return here[0] - there[0] - predicted[0], here[1] - there[1] - predicted[1]
 
     def _follows(self, held: VisionFix, fix: VisionFix) -> bool:
-        """Whether the fix can follow the held one in flight; the EKF's speed may be unknown."""
+        """Whether an aircraft can fly from the held fix to this one, at up to 30 m/s."""
         apart_m = math.hypot(*self._off(held, (0.0, 0.0), fix))
         reach_m = _FASTEST_MPS * max(_seconds(held, fix), 0.0)
         return apart_m <= self._config.unreported_jump_m + reach_m + _SIGMAS * _sigmas(held, fix)
 
 
-def _reckoned_m(dt: float) -> float:
-    """One sigma of the EKF's displacement during dead reckoning."""
+def _drift_sigma_m(dt: float) -> float:
+    """One sigma of the EKF's displacement after dt seconds of dead reckoning, m."""
     known_s = min(dt, _RECKONS_S)
     return SENSORS.ekf_drift.sigma_m(known_s)
 

@@ -40,9 +40,9 @@ _LEAST_FIXES = 3  # of a window
 
 @dataclass(frozen=True)
 class MotionVerdict:
-    """Result of the motion check. settled: whether there is evidence. share: the largest mean
-    deviation divided by its limit; deviation_m: that deviation. still_s: how long the position has
-    not moved.
+    """Result of the motion check. settled: False for the first 5 s, without evidence. share: the
+    largest mean deviation from the IMU divided by its limit; deviation_m: that deviation. still_s:
+    how long the position has not moved.
     """
 
     settled: bool
@@ -52,7 +52,7 @@ class MotionVerdict:
 
 
 class MotionCheck:
-    """Takes fixes in the order of their times; one thread."""
+    """Compares fixes with their prediction by the IMU (`track`); in time order, one thread."""
 
     def __init__(self, config: MotionCheckConfig, track: InertialTrack) -> None:
         self._config = config
@@ -69,9 +69,9 @@ class MotionCheck:
         self._deviations: deque[tuple[int, float, float, float, float]] = deque(maxlen=1024)
         self._still = StillPosition(config.still_m)
 
-    def add(self, fix: VisionFix, *, leaps: bool) -> MotionVerdict:
-        """Add a fix that the IMU's record reaches; see `ready`. leaps: start again from
-        this fix.
+    def add(self, fix: VisionFix, *, jumped: bool) -> MotionVerdict:
+        """Add a fix that the IMU's record reaches (`ready`). jumped: restart the prediction at this
+        fix.
         """
         here = np.array(self._place.ned(fix)[:2])
         still_s = self._still.add(fix.time_ns, here)
@@ -83,7 +83,7 @@ class MotionCheck:
         sigma = float(np.clip(fix.horizontal_sigma_m, _SIGMA_FLOOR_M, most_m))
         last = self._moved
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
-        anew = self._restarts != self._track.restarts or gap_s > _GAP_S or leaps
+        anew = self._restarts != self._track.restarts or gap_s > _GAP_S or jumped
         self._moved, self._restarts = moved, self._track.restarts
         if last is None or anew or gap_s <= 0.0:
             self._start(fix.time_ns, here, sigma)
@@ -94,7 +94,7 @@ class MotionCheck:
         return MotionVerdict(settled, share, deviation_m, still_s)
 
     def ready(self, fix: VisionFix) -> bool:
-        """Whether the IMU's record reaches the fix, or has been waited for long enough."""
+        """Whether the IMU's record reaches the time of the fix."""
         return self._track.newest_ns >= fix.time_ns
 
     def _start(self, time_ns: int, here: Array, sigma: float) -> None:
@@ -107,7 +107,7 @@ class MotionCheck:
     def _step(
         self, last: InertialDisplacement, moved: InertialDisplacement, here: Array, sigma: float
     ) -> None:
-        """Predict by the IMU, note the deviation, and take the fix in. Per axis: p, v, bias."""
+        """Predict by the IMU, store the deviation, update with the fix. Per axis: p, v, bias."""
         h = (moved.time_ns - last.time_ns) * 1e-9
         F = np.array([[1.0, h, -0.5 * h * h], [0.0, 1.0, -h], [0.0, 0.0, 1.0]])
         q, b = SENSORS.imu_noise**2, SENSORS.imu_bias_walk**2

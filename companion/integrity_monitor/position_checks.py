@@ -1,4 +1,4 @@
-"""Compare vision's position with barometer and GNSS."""
+"""Compares vision's position with barometer and GNSS."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cove
 
 
 class LocalPlace:
-    """Local north, east, down frame at the first fix."""
+    """Converts positions to north and east of the first fix."""
 
     def __init__(self) -> None:
         self._anchor: tuple[float, float] | None = None
 
     def ned(self, fix: VisionFix) -> tuple[float, float, float]:
-        """North, east of the first fix, and down of the ellipsoid; metres."""
+        """North and east of the first fix, and down from the ellipsoid, metres."""
         north, east = self.north_east(fix.latitude_deg, fix.longitude_deg)
         return north, east, -fix.height_m
 
     def north_east(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """North and east of the first fix, metres."""
+        """North and east of the first position, metres; the first call sets it."""
         if self._anchor is None:
             self._anchor = (latitude_deg, longitude_deg)
         return north_east(*self._anchor, latitude_deg, longitude_deg)
@@ -54,7 +54,7 @@ class HeightCheck:
         self._differences: deque[float] = deque(maxlen=_MEDIAN_OF)
 
     def add(self, fix: VisionFix, state: VehicleState) -> CheckResult:
-        """Add a fix and the state at about its time."""
+        """Add a fix and the state of about its time. Figure: difference of the heights, m."""
         if not state.armed:
             self._zero = None
             self._differences.clear()
@@ -82,7 +82,7 @@ class HeightCheck:
 
 
 class GnssCheck:
-    """Compares GNSS with vision while GNSS is there, in every mode. Either may be wrong."""
+    """Compares GNSS with vision in every mode, while GNSS is healthy. Either may be wrong."""
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
         self._cap_m = config.gnss_accuracy_cap_m
@@ -90,7 +90,7 @@ class GnssCheck:
     def read(
         self, fix: VisionFix, state: VehicleState, protection_m: float, now_ns: int
     ) -> CheckResult:
-        """Compare the newest fix with the newest GNSS report."""
+        """Compare the newest fix with GNSS. Figure: distance, m. protection_m: the fix's level."""
         latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
         if latitude is None or longitude is None or not gnss_healthy(state, now_ns):
             return CheckResult(None)

@@ -16,7 +16,7 @@ _UNKNOWN_MPS = (15.0, 3.0)  # horizontally and vertically, of a vehicle that doe
 
 @dataclass(frozen=True)
 class ProtectionLevel:
-    """Bounds that the error exceeds at most with the configured risk, metres."""
+    """Bounds of the error, metres; exceeded with the configured risk at most."""
 
     horizontal_m: float
     vertical_m: float
@@ -29,8 +29,8 @@ def protection_level(
     known_m: float,
     height_m: float | None,
 ) -> ProtectionLevel:
-    """The protection levels of a fix. known_m: estimated errors, added linearly; height_m: above
-    the ground, None where unknown.
+    """The protection level of a fix. state: gives the velocity. known_m: estimated position error,
+    added to the bound; height_m: above the ground, None where unknown.
     """
     velocity = state.local_velocity_ned or fix.velocity_ned
     speeds = _UNKNOWN_MPS

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Bend:
-    """Second differences (2,) of two ways: the odometry's and the IMU's."""
+    """Second differences (2,) of two paths, m: the odometry's and the IMU's."""
 
     time_ns: int
     seen: Array
@@ -39,7 +39,7 @@ class _Bend:
 
 
 class ScaleCheck:
-    """Takes the fixes in the order of their times; one thread."""
+    """Compares the odometry with the IMU (`track`); fixes in time order, one thread."""
 
     def __init__(self, track: InertialTrack) -> None:
         self._track = track
@@ -48,10 +48,10 @@ class ScaleCheck:
         self._bends: deque[_Bend] = deque()
         self._restarts = 0
 
-    def add(self, fix: VisionFix, *, leaps: bool) -> None:
-        """Add a fix that the IMU's record reaches, or a late one. leaps: it jumped."""
+    def add(self, fix: VisionFix, *, jumped: bool) -> None:
+        """Add a fix that the IMU's record reaches, or a late one. jumped: restart at this fix."""
         moved = self._track.at(fix.time_ns)
-        if leaps or moved is None or not fix.by_odometry or self._restarts != self._track.restarts:
+        if jumped or moved is None or not fix.by_odometry or self._restarts != self._track.restarts:
             self._restarts = self._track.restarts
             self._ways.clear()
             self._bends.clear()
@@ -84,8 +84,8 @@ class ScaleCheck:
         return nearest if abs(nearest[0] - time_ns) <= _LATE_S * 1e9 else None
 
     @property
-    def wrong_by(self) -> float:
-        """Relative scale error beyond the IMU's uncertainty; 0.0 if it is within."""
+    def scale_error(self) -> float:
+        """Relative scale error of the odometry (0.1: 10 %) if it exceeds 4 sigma, otherwise 0.0."""
         if not self._bends:
             return 0.0
         felt = np.concatenate([one.felt for one in self._bends])

@@ -28,10 +28,10 @@ _SPEED_MPS = 1.0  # what leads from one to the next may be off by
 
 @dataclass(frozen=True)
 class PositionStep:
-    """Offset of a position from its prediction.
+    """Offset of a fix from the position that was predicted for it.
 
     offset_m, velocity: (north, east), m, m/s; sigma_m: of the position; allowed_m: largest
-    explained offset; growth_m: part of it caused by the elapsed time after_s.
+    explained offset; growth_m: part of it caused by the elapsed time after_s, s.
     """
 
     time_ns: int
@@ -43,8 +43,8 @@ class PositionStep:
     after_s: float = 0.0
 
     @property
-    def is_led(self) -> bool:
-        """Whether the position came soon after the last one and near the prediction."""
+    def is_predicted(self) -> bool:
+        """Whether the fix came within 1 s of the last one and near the prediction."""
         return self.after_s <= _SOON_S and math.hypot(*self.offset_m) <= self.allowed_m
 
     @property
@@ -54,8 +54,8 @@ class PositionStep:
 
 
 @dataclass(frozen=True)
-class _Off:
-    """Sum of all steps at a time: metres from dead reckoning."""
+class _Offset:
+    """Sum of all steps up to a time, (north, east) m: the position minus dead reckoning."""
 
     time_ns: int
     north: float
@@ -68,23 +68,23 @@ class StepDetector:
 
     def __init__(self) -> None:
         self._north = self._east = 0.0
-        self._before: deque[_Off] = deque(maxlen=_FIXES)
-        self._after: list[_Off] = []
+        self._before: deque[_Offset] = deque(maxlen=_FIXES)
+        self._after: list[_Offset] = []
         self._suspect: PositionStep | None = None
 
     @property
     def suspected_m(self) -> float:
-        """Size of the newest step while it is not yet known whether it lasts."""
+        """Size of the newest step while it is not yet known whether it lasts, m; otherwise 0."""
         if self._suspect is None:
             return 0.0
         before, newest = _mean(self._before), self._after[-1]
         return math.hypot(newest.north - before.north, newest.east - before.east)
 
     def add(self, step: PositionStep) -> PositionStep | None:
-        """Add a position; returns a step once it has lasted."""
+        """Add an accepted fix's offset; returns a step once it has lasted, otherwise None."""
         self._north += step.offset_m[0]
         self._east += step.offset_m[1]
-        here = _Off(step.time_ns, self._north, self._east, step.sigma_m)
+        here = _Offset(step.time_ns, self._north, self._east, step.sigma_m)
         if step.is_suspect:
             if len(self._before) < _LEAST_BEFORE:
                 self.forget()
@@ -118,17 +118,17 @@ class StepDetector:
         return replace(suspect, offset_m=(north, east))
 
 
-def _drift(some: Sequence[_Off]) -> float:
-    """Expected growth of steps, m/s, from the error of the prediction."""
+def _drift(some: Sequence[_Offset]) -> float:
+    """Speed at which the offsets grow, m/s, from the error of the prediction."""
     first, last = some[0], some[-1]
     span_s = (last.time_ns - first.time_ns) * 1e-9
     return math.hypot(last.north - first.north, last.east - first.east) / span_s if span_s else 0.0
 
 
-def _mean(some: Sequence[_Off]) -> _Off:
+def _mean(some: Sequence[_Offset]) -> _Offset:
     """The mean, and its sigma."""
     n = len(some)
-    return _Off(
+    return _Offset(
         sum(one.time_ns for one in some) // n,
         sum(one.north for one in some) / n,
         sum(one.east for one in some) / n,
@@ -137,7 +137,7 @@ def _mean(some: Sequence[_Off]) -> _Off:
 
 
 class StepUncertainty:
-    """Sum of the steps along and across the direction of flight. A step back reduces it."""
+    """Sums steps along and across the direction of flight. A step back reduces the sum."""
 
     def __init__(self, most_m: float) -> None:
         """most_m: larger steps are jumps, which are held."""
@@ -147,25 +147,21 @@ class StepUncertainty:
 
     @property
     def delay_s(self) -> float:
-        """Delay of the timestamps, if it is the cause of the steps along the direction
-        of flight.
-        """
+        """Delay of the timestamps, s, that would explain the steps along the flight."""
         return abs(self._along_m) / self._speed if self._speed else 0.0
 
     @property
     def metres(self) -> float:
-        """Position uncertainty from steps that lasted."""
+        """Position uncertainty from steps that lasted, m."""
         return min(math.hypot(self._along_m, self._across_m), self._most_m)
 
     @property
     def possible_m(self) -> float:
-        """The same, with steps that may not last."""
+        """As `metres`, with the newest step included before it has lasted."""
         return min(self.metres + self._finder.suspected_m, self._most_m)
 
     def add(self, step: PositionStep) -> PositionStep | None:
-        """Add the offset of the newest accepted position from its prediction, and the step that has
-        lasted.
-        """
+        """Add an accepted fix's offset from its prediction; returns a step that has lasted now."""
         found = self._finder.add(step)
         if found is not None:
             self._add_up(found)
@@ -176,29 +172,29 @@ class StepUncertainty:
         speed = math.hypot(v_north, v_east)
         if speed >= _MOVES_MPS:
             self._speed = speed
-            self._leave(
+            self._set(
                 self._along_m + (north * v_north + east * v_east) / speed,
                 self._across_m + (east * v_north - north * v_east) / speed,
             )
         else:
-            self._leave(self._along_m, self._across_m + math.hypot(north, east))
+            self._set(self._along_m, self._across_m + math.hypot(north, east))
 
-    def stamps_are_right(self) -> None:
-        """The timestamps are confirmed since the last step, so the steps along the direction of
-        flight were no delay.
+    def confirm_timestamps(self) -> None:
+        """Clear the steps along the direction of flight: the timestamps were confirmed, so there is
+        no delay.
         """
-        self._leave(0.0, self._across_m)
+        self._set(0.0, self._across_m)
 
-    def is_found_again(self) -> None:
-        """The position was searched and confirmed, which resolves the steps across."""
+    def confirm_position(self) -> None:
+        """Clear the steps across: the position was searched and confirmed."""
         self._finder.forget()
-        self._leave(self._along_m, 0.0)
+        self._set(self._along_m, 0.0)
 
-    def begins_anew(self) -> None:
-        """Reset for a new flight."""
+    def reset(self) -> None:
+        """Clear all steps, before a new flight."""
         self._finder.forget()
-        self._leave(0.0, 0.0)
+        self._set(0.0, 0.0)
 
-    def _leave(self, along_m: float, across_m: float) -> None:
+    def _set(self, along_m: float, across_m: float) -> None:
         small = math.hypot(along_m, across_m) < STEP_M
         self._along_m, self._across_m = (0.0, 0.0) if small else (along_m, across_m)

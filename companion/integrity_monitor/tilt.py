@@ -18,9 +18,9 @@ _HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
 
 
 class TiltCheck:
-    """Takes every fix. It does not estimate a constant bias of the gimbal. A wrong tilt that grows
-    slowly from the first fix on (1.5 degrees in 2 s, `begins-denied`) would become part of such a
-    bias.
+    """Compares the tilt of every fix; see the module. It does not estimate a constant bias of the
+    gimbal. A wrong tilt that grows slowly from the first fix on (1.5 degrees in 2 s,
+    `begins-denied`) would become part of such a bias.
     """
 
     def __init__(self, config: IntegrityMonitorConfig) -> None:
@@ -39,19 +39,19 @@ class TiltCheck:
 
     @property
     def off_deg(self) -> float:
-        """Tilt difference of the newest fix."""
+        """Tilt difference between vision and autopilot of the newest fix, degrees."""
         return math.degrees(self._off_rad)
 
     def metres(self, height_m: float | None) -> float:
-        """Position error from the tilt: tilt times height above the ground, minus what gimbal and
-        autopilot explain.
+        """Position error from the tilt, m: tilt times height above the ground; 0 below 2 sigma of
+        the tilt, all of it above 3 sigma. height_m: None for the largest error.
         """
         believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
         shift_m = self._most_m if height_m is None else height_m * self._off_rad
         return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
 
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
-        """Add a fix with the autopilot's attitude at its time, None where unknown."""
+        """Add a fix. attitude: the autopilot's at its time, None if unknown."""
         if attitude is None or fix.quaternion is None:
             since = self._checked_ns
             self.is_known = since is not None and abs(fix.time_ns - since) <= _HOLDS_NS
@@ -63,6 +63,6 @@ class TiltCheck:
 
 
 def _level(ned_from_body: quat.Quaternion) -> tuple[float, float]:
-    """Direction of the vertical in body axes, forward and right; independent of heading."""
+    """The vertical in body axes: forward and right component of the unit vector down."""
     forward, right, _ = quat.rotate(quat.conjugate(ned_from_body), (0.0, 0.0, 1.0))
     return forward, right

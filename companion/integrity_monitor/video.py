@@ -55,7 +55,7 @@ class FrameVerdict:
 
 @dataclass(frozen=True)
 class ImageShift:
-    """Shift between two images, as a share of the width, and its sigma."""
+    """Displacement of the image's edge between two images, as a share of the width; sigma."""
 
     share: float
     sigma: float
@@ -71,7 +71,7 @@ class _SeenFrame:
     """The thumbnail at a contrast of 1: another exposure changes nothing."""
 
 
-def _look(time_ns: int, image: Image) -> _SeenFrame:
+def _seen_frame(time_ns: int, image: Image) -> _SeenFrame:
     small = thumbnail(image)
     contrast = float(small.std())
     crc = zlib.crc32(image[::_CRC_ROWS].tobytes())
@@ -79,7 +79,7 @@ def _look(time_ns: int, image: Image) -> _SeenFrame:
 
 
 class FrozenVideoDetector:
-    """Detects frozen video. Takes every frame, or as many as possible; one thread."""
+    """Detects frozen and repeated video. Takes as many frames as possible; one thread."""
 
     def __init__(self, config: VideoCheckConfig) -> None:
         self._config = config
@@ -91,7 +91,7 @@ class FrozenVideoDetector:
 
     def add(self, time_ns: int, image: Image) -> FrameVerdict:
         """Add a frame (H, W, 3) uint8 RGB at its exposure time; returns the result."""
-        seen = _look(time_ns, image)
+        seen = _seen_frame(time_ns, image)
         last, self._newest = self._newest, seen
         if last is None or last.crc != seen.crc:
             self._identical_since_ns = time_ns
@@ -107,13 +107,13 @@ class FrozenVideoDetector:
         )
 
     def _keep_reference(self, seen: _SeenFrame) -> None:
-        """Select the reference frame that all later frames resemble. The median excludes an
-        encoder's key frames.
+        """Replace the reference frame if the image has moved since. The median of five frames
+        excludes an encoder's key frames.
         """
         if self._reference is None:
             self._reference = seen
             return
-        self._last_shares.append(resemblance(self._reference, seen))
+        self._last_shares.append(shift_between(self._reference, seen))
         shares = sorted(self._last_shares)
         if shares[len(shares) // 2] > self._config.still_share:
             self._reference = seen
@@ -121,9 +121,7 @@ class FrozenVideoDetector:
 
 
 class RepeatedVideoDetector:
-    """Detects frames that repeat earlier ones at a constant lag, along a path of
-    different frames.
-    """
+    """Detects frames that repeat earlier ones at a constant lag, while the image moves."""
 
     def __init__(self, config: VideoCheckConfig) -> None:
         self._config = config
@@ -132,10 +130,10 @@ class RepeatedVideoDetector:
         self._matches: deque[tuple[int, int]] = deque()  # time and lag
 
     def add(self, seen: _SeenFrame) -> float:
-        """Lag in seconds of repeated frames; 0 for new frames."""
+        """Add a frame; returns the lag of repeated frames, s, or 0 for new frames."""
         before = [old for old in self._memory if seen.time_ns - old.time_ns >= self._hold_ns]
-        for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: unlikeness(old, seen)):
-            if resemblance(old, seen) < self._config.still_share:
+        for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: difference_gray(old, seen)):
+            if shift_between(old, seen) < self._config.still_share:
                 self._matches.append((seen.time_ns, seen.time_ns - old.time_ns))
         while self._matches and seen.time_ns - self._matches[0][0] > self._hold_ns:
             self._matches.popleft()
@@ -143,7 +141,7 @@ class RepeatedVideoDetector:
         return self._lag_s(seen.time_ns)
 
     def _lag_s(self, now_ns: int) -> float:
-        """The newest lag, if matches of this lag cover the time and the image moved."""
+        """The newest lag, s, if matches of this lag last and the image moved; otherwise 0."""
         if not self._matches:
             return 0.0
         lag_ns = self._matches[-1][1]
@@ -152,7 +150,7 @@ class RepeatedVideoDetector:
         if now_ns - times[0] < 0.8 * self._hold_ns or len(times) < _FILLED * steps:
             return 0.0
         path = [old for old in self._memory if old.time_ns >= times[0]]
-        far = max(resemblance(path[0], other) for other in path)
+        far = max(shift_between(path[0], other) for other in path)
         return lag_ns * 1e-9 if far > _MOVES * self._config.still_share else 0.0
 
     def _remember(self, seen: _SeenFrame) -> None:
@@ -164,19 +162,19 @@ class RepeatedVideoDetector:
             self._memory.popleft()
 
 
-def resemblance(a: _SeenFrame, b: _SeenFrame) -> float:
-    """Shift of the image from a to b, as a share of its width; 1 if it cannot be measured."""
+def shift_between(a: _SeenFrame, b: _SeenFrame) -> float:
+    """Displacement between two frames, as a share of the width; 1 if it cannot be measured."""
     if a.crc == b.crc:
         return 0.0
     low, high = sorted((a.contrast, b.contrast))
-    if unlikeness(a, b) > _UNLIKE_GRAY or high > _MOST_GAIN * low:
+    if difference_gray(a, b) > _UNLIKE_GRAY or high > _MOST_GAIN * low:
         return 1.0
-    moved = picture_motion(a.thumbnail, b.thumbnail)
+    moved = measure_motion(a.thumbnail, b.thumbnail)
     return moved.share if moved.sigma < _SURE else 1.0
 
 
-def unlikeness(a: _SeenFrame, b: _SeenFrame) -> float:
-    """Root mean square difference of two pictures of one contrast, gray levels of 255."""
+def difference_gray(a: _SeenFrame, b: _SeenFrame) -> float:
+    """Root mean square difference of two frames scaled to one contrast, gray levels of 255."""
     return float(np.sqrt(np.mean(np.square(a.plain - b.plain)))) * min(a.contrast, b.contrast)
 
 
@@ -197,7 +195,7 @@ _V, _U = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
 _X, _Y = (_U - (WIDTH - 1) / 2) / WIDTH, (_V - (HEIGHT - 1) / 2) / WIDTH  # shares of the width
 
 
-def picture_motion(a: Thumbnail, b: Thumbnail) -> ImageShift:
+def measure_motion(a: Thumbnail, b: Thumbnail) -> ImageShift:
     """Least-squares motion from a to b (48, 64): displacement at the image's edge by shift,
     rotation and scale.
 

@@ -1,7 +1,7 @@
 """MISB ST 0601 UAS Datalink Local Set: encodes numbers by tag to bytes and back (SMPTE ST 336 KLV).
 
-Tags and ranges as of edition 8, which all later ones keep. A value outside its tag's range is left
-out, because a limit value would be wrong.
+Tags and ranges are those of edition 8, which all later ones keep. A value outside its tag's range
+is left out, because a limit value would be wrong.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PLATFORM_PITCH_FULL, PLATFORM_ROLL_FULL = 90, 91
 
 @dataclass(frozen=True)
 class _Mapped:
-    """A number of `size` bytes that spans low to high; signed ones leave out the smallest."""
+    """Encoding of a number in `size` bytes from low to high; signed ones leave out the smallest."""
 
     size: int
     low: float
@@ -48,7 +48,7 @@ class _Mapped:
         return round((value - self.low) / (self.high - self.low) * top).to_bytes(self.size, "big")
 
     def decode(self, data: bytes) -> float | None:
-        """None for another length and for the reserved "out of range" value."""
+        """The number; None for another length and for the reserved "out of range" value."""
         if len(data) != self.size:
             return None
         if self.low < 0 and self.low == -self.high:
@@ -96,7 +96,8 @@ _LONGEST_TEXT = 127
 def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
     """Encode one packet: universal label, length, time, the fields by tag, checksum.
 
-    time_us: microseconds since 1970-01-01. ValueError for a tag that is not known here.
+    time_us: microseconds since 1970-01-01. fields: values by tag in ST 0601's units. ValueError for
+    a tag that is not known here.
     """
     body = _item(TIME, time_us.to_bytes(8, "big"))
     for tag, value in sorted({**fields, LOCAL_SET_VERSION: VERSION}.items()):
@@ -134,7 +135,9 @@ def decode(packet: bytes) -> dict[int, float | str | int]:
 
 
 def read_length(data: bytes, at: int) -> tuple[int, int]:
-    """Decode a BER length at index `at`; returns it and the value's index, or ValueError."""
+    """Decode a BER length at index `at`; returns it and the index after it. ValueError if it is cut
+    short.
+    """
     if at >= len(data):
         raise ValueError("a length is missing")
     first = data[at]
@@ -147,7 +150,7 @@ def read_length(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _read_tag(data: bytes, at: int) -> tuple[int, int]:
-    """A BER-OID tag, and where its length begins."""
+    """Decode a BER-OID tag; returns it and the index after it."""
     number = 0
     while at < len(data):
         number = number << 7 | data[at] & 0x7F
@@ -168,7 +171,9 @@ def _decoded(number: int, value: bytes) -> float | str | int | None:
 
 
 def checksum(data: bytes) -> int:
-    """The 16-bit running sum, from the label to the checksum's length (ST 0601, tag 1)."""
+    """The 16-bit running sum over a packet from its label to the checksum's length (ST 0601, tag
+    1).
+    """
     return (sum(data[0::2]) * 256 + sum(data[1::2])) & 0xFFFF
 
 
@@ -185,12 +190,12 @@ def _encoded(tag: int, value: float | str) -> bytes | None:
 
 
 def _item(tag: int, value: bytes) -> bytes:
-    """Tag, length and value; tags up to 127 are one byte (BER-OID)."""
+    """Encode tag, length and value; tags up to 127 are one byte (BER-OID)."""
     return bytes((tag,)) + _length(len(value)) + value
 
 
 def _length(n: int) -> bytes:
-    """BER: short form up to 127, else the number of bytes and then these."""
+    """Encode a BER length: short form up to 127, else the number of bytes and then these."""
     if n < 128:
         return bytes((n,))
     size = (n.bit_length() + 7) // 8

@@ -21,7 +21,9 @@ _OFFSET_DEG = 0.075  # the largest corner offset that tags 26 to 33 hold
 
 @dataclass(frozen=True)
 class KlvContext:
-    """Constants of a flight for its metadata. geoid_m: geoid height above the ellipsoid."""
+    """Constants of a flight for its metadata. cast: intersects rays with the map; geoid_m: geoid
+    height above the ellipsoid.
+    """
 
     frame: LocalFrame
     cast: RayCaster
@@ -65,7 +67,9 @@ def picture_fields(
 
 
 def _attitude(ned_from_body: Array, ned_from_camera: Array) -> dict[int, float | str]:
-    """The aircraft's angles, and the camera's on it: azimuth, elevation, roll in this order."""
+    """The aircraft's angles, and the camera's relative to it: azimuth, elevation, roll in this
+    order.
+    """
     roll, pitch, yaw = (math.degrees(a) for a in euler_from_matrix(ned_from_body))
     on_body = ned_from_body.T @ ned_from_camera @ GIMBAL_FROM_CAMERA.T
     turn, elevation, azimuth = (math.degrees(a) for a in euler_from_matrix(on_body))
@@ -82,8 +86,8 @@ def _attitude(ned_from_body: Array, ned_from_camera: Array) -> dict[int, float |
 
 
 def _footprint(estimate: PoseEstimate, scene: KlvContext) -> dict[int, float | str]:
-    """The centre with its range, and the corners (left above, right above, right below, left
-    below).
+    """The image's centre on the ground with its distance, and the corners (left above, right above,
+    right below, left below).
     """
     w, h = float(estimate.camera.width), float(estimate.camera.height)
     centre, distance = _seen(estimate, (w / 2.0, h / 2.0), scene)

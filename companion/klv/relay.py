@@ -17,7 +17,7 @@ from fractions import Fraction
 import av
 
 from companion.config import KlvConfig
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.errors import StreamError
 from companion.klv.local_set import encode
 from companion.klv.metadata import KlvContext, picture_fields
@@ -80,10 +80,10 @@ class KlvRelay:
         with self._condition:
             self._stopping = True
             self._condition.notify()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A new connection: its packets go into a stream of their own."""
+        """A connection was opened: packets after it go into a new stream."""
         try:
             writer = TransportWriter(self._config.output, stream)
         except StreamError as error:
@@ -92,18 +92,18 @@ class KlvRelay:
         self._put(_RelayItem(time.monotonic_ns(), writer=writer))
 
     def packet(self, packet: av.Packet) -> None:
-        """Take a packet. Never blocks."""
+        """Queue a packet. Never blocks."""
         self._put(_RelayItem(time.monotonic_ns(), packet=packet))
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """Note when a packet's picture was taken. Never blocks."""
+        """Store the exposure time of the frame with that presentation time (s). Never blocks."""
         with self._condition:
             self._exposures[pts] = exposure_time_ns
             while len(self._exposures) > _KEPT:
                 self._exposures.pop(next(iter(self._exposures)))
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Note an estimate, used or not. Never blocks."""
+        """Store an estimate, accepted or not. Never blocks."""
         with self._condition:
             self._newest_ns = max(self._newest_ns, estimate.exposure_time_ns)
             if estimate.accepted:
@@ -113,7 +113,7 @@ class KlvRelay:
             self._condition.notify()
 
     def add_target(self, target: TargetEstimate) -> None:
-        """Note a located target. Never blocks."""
+        """Store a target's fix. Never blocks."""
         with self._condition:
             self._targets[target.fix.exposure_time_ns] = target
             while len(self._targets) > _KEPT:
@@ -143,7 +143,9 @@ class KlvRelay:
         self._close()
 
     def _wait_for(self, item: _RelayItem) -> PoseEstimate | None:
-        """The estimate of a packet's picture; None if there is none in time. Holds the lock."""
+        """The estimate of a packet's frame; None if there is none in time. The caller holds the
+        lock.
+        """
         if item.packet is None or item.packet.pts is None:
             return None
         pts = Fraction(item.packet.pts * item.packet.time_base)
@@ -179,8 +181,8 @@ class KlvRelay:
         return encode((time_ns + self._utc_ns) // 1000, fields)
 
     def _target_at(self, time_ns: int) -> TargetFix | None:
-        """The target seen nearest to a picture's time. Newer ones may have been reported since
-        the picture came: it may have waited for its pose.
+        """The target's fix nearest to a frame's time. Newer ones may exist, because the frame may
+        have waited for its pose.
         """
         with self._condition:
             seen_ns = min(self._targets, key=lambda t: abs(t - time_ns), default=None)

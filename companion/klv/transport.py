@@ -1,7 +1,7 @@
 """Writes a video's packets with metadata as MPEG-TS, without encoding them again.
 
 The muxer is FFmpeg's (PyAV); the metadata is a KLV stream (stream type 0x06, registration "KLVA")
-whose packets carry the presentation time of their picture.
+whose packets carry the presentation time of their frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _OPTIONS = {
 class TransportWriter:
     """Writes a video stream and its metadata. Not thread-safe.
 
-    output: a file or ``udp://HOST:PORT``; template: the stream that the packets come from. Raises
+    output: a file or ``udp://HOST:PORT``; template: the stream from which the packets come. Raises
     `StreamOpenError`.
     """
 

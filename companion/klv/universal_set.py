@@ -44,7 +44,7 @@ _TEXTS = frozenset((tag.MISSION, tag.IMAGE_SOURCE, tag.COORDINATES))
 
 
 def decode_universal(packet: bytes) -> dict[int, float | str | int]:
-    """Values by ST 0601 tag (plus `ANGLE_TO_NORTH`, `OBLIQUITY`), degrees and metres.
+    """Values of a packet by ST 0601 tag (plus `ANGLE_TO_NORTH`, `OBLIQUITY`), degrees and metres.
 
     Unknown items are left out. ValueError for another label or a packet that is cut short.
     """

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class ConsoleConfig(BaseModel):
-    """Address of the operator's page, and its rights."""
+    """Settings of the console: address of the operator's page, and its rights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -44,12 +44,12 @@ class ConsoleConfig(BaseModel):
 
     @property
     def port(self) -> int:
-        """The TCP port."""
+        """TCP port on which the page is served."""
         return int(self.listen.rpartition(":")[2])
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine reaches it."""
+        """Whether the page can be reached from this machine only."""
         if self.host == "localhost":
             return True
         try:

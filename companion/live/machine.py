@@ -18,8 +18,8 @@ class MachineLoad:
         self._temperature: tuple[float, float | None] = (-_HOT_READS_S, None)
 
     def read(self) -> dict[str, float | None]:
-        """cpu_percent: of one core, since the last call; load: one-minute average; temperature of
-        the warmest zone, degrees Celsius, None if unknown.
+        """cpu_percent: of this process since the last call, 100 for one core; cores: their number;
+        load: one-minute average; temperature_c: warmest zone, degrees Celsius, None if unknown.
         """
         now, used = time.monotonic(), self._used_s()
         elapsed = max(now - self._before[0], 1e-3)
@@ -41,7 +41,7 @@ class MachineLoad:
 
 
 def warmest_c(zones: Path = _ZONES) -> float | None:
-    """Temperature of the warmest thermal zone; None if none can be read."""
+    """Temperature of the warmest thermal zone, degrees Celsius; None if none can be read."""
     found = []
     for path in zones.glob("thermal_zone*/temp"):
         try:

@@ -1,4 +1,4 @@
-"""Executes the console's orders in the flight process, after its own checks."""
+"""Executes the orders that the console sends (targets, position hints), in the flight process."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class OrderError(CompanionError):
 
 @dataclass(frozen=True)
 class OrderContext:
-    """Functions that orders call. report: alert to operator and log; track: a click, with the
-    exposure time of its frame; hint: (latitude_deg, longitude_deg, radius_m), raises `OrderError`
-    for a position off the map.
+    """Functions that orders call. report: alert to operator and log; track: start or stop a target,
+    with the exposure time of the clicked frame; hint: search at (latitude_deg, longitude_deg,
+    radius_m); raises `OrderError` for a position off the map.
     """
 
     report: Callable[[Alert], None]
@@ -38,16 +38,19 @@ class OrderContext:
 
 
 class Orders:
-    """Executes the console's orders if `control` is on, and reports each."""
+    """Checks, executes and reports the console's orders. control: whether orders are allowed."""
 
     def __init__(
-        self, control: bool, helm: OrderContext, clock: Callable[[], float] = time.monotonic
+        self, control: bool, context: OrderContext, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._control, self._helm, self._clock = control, helm, clock
+        self._control, self._helm, self._clock = control, context, clock
         self._taken: deque[float] = deque(maxlen=_MOST)
 
-    def take(self, order: dict[str, Any]) -> str:
-        """Execute an order; returns a text. Raises `OrderError` with the reason."""
+    def execute(self, order: dict[str, Any]) -> str:
+        """Execute an order; returns a text for the page. Raises `OrderError` with the reason.
+
+        order: JSON object; its "do" is "stop", "target", "box" or "hint".
+        """
         if not self._control:
             raise OrderError("the console only reads: console.control is false")
         now = self._clock()
@@ -58,10 +61,10 @@ class Orders:
         if do == "stop":
             return self._track("stop", order, (), alert(AlertId.CONSOLE_STOP))
         if do == "target":
-            x, y = (_share(order, key) for key in ("x", "y"))
+            x, y = (_number_to_one(order, key) for key in ("x", "y"))
             return self._track("point", order, (x, y), alert(AlertId.CONSOLE_TARGET, x=x, y=y))
         if do == "box":
-            box = tuple(_share(order, key) for key in ("left", "top", "right", "bottom"))
+            box = tuple(_number_to_one(order, key) for key in ("left", "top", "right", "bottom"))
             if box[0] >= box[2] or box[1] >= box[3]:
                 raise OrderError("a box has its left top before its right bottom")
             news = alert(AlertId.CONSOLE_BOX, x=box[0], y=box[1])
@@ -71,25 +74,24 @@ class Orders:
             longitude = _number(order, "longitude_deg", -180.0, 180.0)
             radius = _number(order, "radius_m", 5.0, _LARGEST_RADIUS_M)
             self._helm.hint(latitude, longitude, radius)
-            return self._told(
+            return self._report(
                 alert(AlertId.CONSOLE_HINT, latitude=latitude, longitude=longitude, metres=radius)
             )
         raise OrderError("no such order")
 
     def _track(self, kind: str, order: dict[str, Any], at: tuple[float, ...], news: Alert) -> str:
-        time_ns = time.monotonic_ns() if kind == "stop" else _pointed_into(order)
+        time_ns = time.monotonic_ns() if kind == "stop" else _click_time_ns(order)
         self._helm.track(TrackRequest(kind, time_ns, at, asked_by=CONSOLE))
-        return self._told(news)
+        return self._report(news)
 
-    def _told(self, news: Alert) -> str:
+    def _report(self, news: Alert) -> str:
         self._helm.report(news)
         return reason(news)
 
 
-def _pointed_into(order: dict[str, Any]) -> int:
-    """Exposure time of the clicked frame; now if the order does not state it. `OrderError` for an
-    old frame, or one of another flight, because it shows another place at this pixel than the
-    present frame.
+def _click_time_ns(order: dict[str, Any]) -> int:
+    """Exposure time of the clicked frame; now if the order does not state it. `OrderError` if it is
+    over 10 s old or of another flight, because the pixel shows another place in the present frame.
     """
     now_ns = time.monotonic_ns()
     if order.get("exposure_ns") is None:
@@ -100,7 +102,7 @@ def _pointed_into(order: dict[str, Any]) -> int:
     return min(int(order["exposure_ns"]), now_ns)
 
 
-def _share(order: dict[str, Any], key: str) -> float:
+def _number_to_one(order: dict[str, Any], key: str) -> float:
     return _number(order, key, 0.0, 1.0)
 
 

@@ -15,9 +15,9 @@ class RateLimiter:
     due_s: float = 0.0
 
     def is_due(self, now_s: float) -> bool:
-        """Whether an event may be sent."""
+        """Whether an event may be sent now; CLOCK_MONOTONIC in s."""
         return now_s >= self.due_s
 
-    def went(self, now_s: float) -> None:
-        """An event was sent; the next is due one period after this one was."""
+    def mark_sent(self, now_s: float) -> None:
+        """Note that an event was sent; the next is due one period after this one was due."""
         self.due_s = max(self.due_s + self.period_s, now_s)

@@ -32,7 +32,7 @@ class LinkError(CompanionError):
 
 @dataclass(frozen=True)
 class Message:
-    """head: JSON object with its "kind"; body: bytes."""
+    """head: JSON object, whose "kind" names the message; body: bytes."""
 
     head: dict[str, Any]
     body: bytes = b""
@@ -45,14 +45,14 @@ def encode(head: dict[str, Any], body: bytes = b"") -> bytes:
 
 
 class MessageDecoder:
-    """Decodes messages from a byte stream."""
+    """Decodes messages from a byte stream. most_head, most_body: size limits, bytes."""
 
     def __init__(self, most_head: int = MOST_HEAD, most_body: int = MOST_BODY) -> None:
         self._most_head, self._most_body = most_head, most_body
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Yield every complete message; `LinkError` for invalid data."""
+        """Add received bytes; yields the messages that are complete. `LinkError` for bad data."""
         self._buffer += data
         while len(self._buffer) >= _SIZES.size:
             head, body = _SIZES.unpack_from(self._buffer)
@@ -73,9 +73,10 @@ class MessageDecoder:
 
 
 def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
-    """Socket path of a deployment, the same for both processes, in a folder of this user.
+    """Path of the socket, the same in flight and console, in a folder of this user.
 
-    Each deployment has its own path. It is short, because socket addresses end at 107 bytes.
+    Each deployment (map, record, address) has its own. It is short: socket addresses end at 107
+    bytes.
     """
     key = f"{Path(map_path).absolute()}\0{record and Path(record).absolute()}\0{listen}"
     name = hashlib.sha256(key.encode()).hexdigest()[:16]
@@ -83,7 +84,7 @@ def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
 
 
 def runtime_folder() -> Path:
-    """A folder that only this user can enter; `LinkError` if another user made it."""
+    """Make and return a folder that only this user can enter; `LinkError` if that is impossible."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(base) if base else Path(tempfile.gettempdir()) / f"companion-{os.getuid()}"
     if base:

@@ -1,8 +1,8 @@
 """Serves the console from the flight process over a local socket, in one thread.
 
 At most one unfinished message per console is kept; others are dropped. Frames pass through shared
-memory (`live.shared`), one at a time: the next one, the newest, is written after the console has
-read the last. Without a console the thread sleeps.
+memory (`live.shared`), one at a time: the newest frame is written after the console has read the
+one before. Without a console the thread sleeps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from companion.live.orders import OrderError, Orders
 from companion.live.pace import RateLimiter
 from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, encode
 from companion.live.shared import SharedMemory
-from companion.live.shown import ConsoleFrame, Shown
+from companion.live.shown import ConsoleData, ConsoleFrame
 
 _log = logging.getLogger(__name__)
 _MOST_CONSOLES = 3
@@ -31,14 +31,14 @@ _ANSWERS = 8
 
 
 class _Console:
-    """One connection. watching: it wants pictures."""
+    """One connection. watching: it wants frames; last_event: number of the newest event sent."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection
         self.decoder = MessageDecoder(MOST_ORDER, 0)
         self.sending = memoryview(b"")
         self.answers: deque[bytes] = deque(maxlen=_ANSWERS)
-        self.told = 0
+        self.last_event = 0
         self.watching = False
         self.memory: SharedMemory | None = None  # once it wants pictures
 
@@ -48,11 +48,11 @@ class _Console:
 
     @property
     def is_ready(self) -> bool:
-        """For a picture."""
+        """Whether a frame can be sent."""
         return self.watching and self.is_idle and (self.memory is None or self.memory.is_read)
 
     def send(self) -> None:
-        """As much of the message as goes."""
+        """Send as much of the message as the socket takes."""
         while self.sending:
             taking = self.connection.send if self.memory is None else self._send_with_memory
             self.sending = self.sending[taking(self.sending) :]
@@ -68,14 +68,14 @@ class _Console:
 
 
 class Publisher:
-    """Serves the console's process at the socket `path`.
+    """Serves console processes at the socket `path`, in a thread of its own.
 
-    shown: makes the messages; orders: executes the console's orders. The flight calls only `start`,
-    `stop` and `wake`, which sets a flag.
+    shown: gives state documents and frames; orders: executes the console's orders. frames_hz: limit
+    of frames per second. The flight calls only `start`, `stop` and `wake`.
     """
 
-    def __init__(self, path: Path, shown: Shown, orders: Orders, frames_hz: float) -> None:
-        self.path, self._shown, self._orders = path, shown, orders
+    def __init__(self, path: Path, shown: ConsoleData, orders: Orders, frames_hz: float) -> None:
+        self.path, self._data, self._orders = path, shown, orders
         self._pictures = RateLimiter(1.0 / frames_hz)
         self._consoles: dict[socket.socket, _Console] = {}
         self._selector = selectors.DefaultSelector()
@@ -96,29 +96,29 @@ class Publisher:
     def start(self) -> None:
         """Start the thread."""
         self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
-        self._selector.register(self._woken, selectors.EVENT_READ, self._drain)
+        self._selector.register(self._woken, selectors.EVENT_READ, self._clear_wake)
         self._thread.start()
 
     def stop(self) -> None:
-        """Close all connections."""
+        """End the thread and close all connections; waits up to 2 s."""
         self._stopping.set()
         self.wake()
         if self._thread.ident is not None:
             self._thread.join(2.0)
 
     def close(self) -> None:
-        """Release the socket."""
+        """Release the socket, after `stop`."""
         for end in (self._listening, self._woken, self._waker):
             end.close()
         with contextlib.suppress(OSError):
             self.path.unlink()
 
-    def waiting(self) -> list[int]:
-        """Bytes queued for each console."""
+    def pending_bytes(self) -> list[int]:
+        """Bytes not yet sent to each console."""
         return [len(c.sending) for c in tuple(self._consoles.values())]
 
     def wake(self) -> None:
-        """A new frame is available. Never blocks."""
+        """Wake the thread, because a new frame is available. Never blocks."""
         with contextlib.suppress(OSError):
             self._waker.send(b"1")
 
@@ -127,7 +127,7 @@ class Publisher:
         # the interpreter would hold up every thread that flies.
         while not self._stopping.is_set():
             try:
-                self._turn()
+                self._serve_once()
             except Exception:  # whatever the console does, the flight goes on without it
                 _log.exception("the console's link failed and starts over")
                 self._drop_all()
@@ -135,7 +135,7 @@ class Publisher:
         self._drop_all()
         self._selector.close()
 
-    def _turn(self) -> None:
+    def _serve_once(self) -> None:
         due = [self._next_state_s] if self._consoles else []
         due += [] if self._accept_again_s is None else [self._accept_again_s]
         timeout = max(min(due) - time.monotonic(), 0.0) if due else None
@@ -148,12 +148,12 @@ class Publisher:
         if self._consoles and now >= self._next_state_s:
             self._next_state_s = now + _STATE_S
             for console in self._idle():
-                head, told = self._shown.state(console.told)
-                if self._offer(console, encode(head)):
-                    console.told = told
+                head, last_event = self._data.state(console.last_event)
+                if self._begin_send(console, encode(head)):
+                    console.last_event = last_event
         ready = [c for c in self._consoles.values() if c.is_ready]
-        if ready and self._pictures.is_due(now) and (shot := self._shown.take_frame()):
-            self._pictures.went(now)
+        if ready and self._pictures.is_due(now) and (shot := self._data.take_frame()):
+            self._pictures.mark_sent(now)
             for console in ready:
                 self._show(console, shot)
 
@@ -179,9 +179,9 @@ class Publisher:
         self._consoles[connection] = console
         self._selector.register(connection, selectors.EVENT_READ, self._serve)
         self._next_state_s = 0.0
-        self._offer(console, encode(self._shown.hello()))
+        self._begin_send(console, encode(self._data.first_message()))
 
-    def _drain(self, woken: Any, _: int) -> None:
+    def _clear_wake(self, woken: Any, _: int) -> None:
         with contextlib.suppress(OSError):
             woken.recv(4096)
 
@@ -195,13 +195,13 @@ class Publisher:
                 if not data:
                     raise LinkError("closed")
                 for message in console.decoder.feed(data):
-                    self._obey(console, message.head)
+                    self._handle(console, message.head)
         except BlockingIOError:
             pass
         except (OSError, LinkError):
             self._drop(console)
 
-    def _obey(self, console: _Console, head: dict[str, Any]) -> None:
+    def _handle(self, console: _Console, head: dict[str, Any]) -> None:
         if head.get("kind") == "watch":
             console.watching = head.get("frames") is True
             return
@@ -210,7 +210,7 @@ class Publisher:
                 console.memory.is_read = True
             return
         try:
-            ok, text = True, self._orders.take(head)
+            ok, text = True, self._orders.execute(head)
         except OrderError as error:
             ok, text = False, str(error)
         number = head.get("number")
@@ -229,10 +229,10 @@ class Publisher:
             _log.warning("a console cannot be given pictures and is left: %s", error)
             self._drop(console)
             return
-        self._offer(console, encode(shot.head | {"shared": size}))
+        self._begin_send(console, encode(shot.head | {"shared": size}))
 
-    def _offer(self, console: _Console, message: bytes) -> bool:
-        """Begin to send, if nothing else is under way."""
+    def _begin_send(self, console: _Console, message: bytes) -> bool:
+        """Begin to send, if no message is under way; whether it was begun."""
         if not console.is_idle:
             return False
         console.sending = memoryview(message)
@@ -256,7 +256,7 @@ class Publisher:
 
     def _next_answer(self, console: _Console) -> None:
         if console.answers and console.is_idle:
-            self._offer(console, console.answers.popleft())
+            self._begin_send(console, console.answers.popleft())
 
     def _drop(self, console: _Console) -> None:
         if self._consoles.pop(console.connection, None) is not None:
@@ -269,7 +269,7 @@ class Publisher:
 
 
 def _listen(path: Path) -> socket.socket:
-    """A socket at that path, for this user alone."""
+    """Listen at a Unix socket of that path, which only this user can use."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.unlink(missing_ok=True)  # of a process that was killed

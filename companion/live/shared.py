@@ -28,7 +28,7 @@ class SharedMemory:
         self._given = False
 
     def write(self, parts: Sequence[np.ndarray]) -> int:
-        """Write the arrays one after the other; returns the number of bytes."""
+        """Write the arrays in order, over the last frame; returns the number of bytes."""
         at = 0
         for part in parts:
             rest = np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
@@ -39,7 +39,7 @@ class SharedMemory:
         return at
 
     def send(self, connection: socket.socket, data: memoryview) -> int:
-        """As `socket.send`; sends the descriptor with the first byte."""
+        """As `socket.send`; the first call also sends the file descriptor."""
         if self._given:
             return connection.send(data)
         sent = socket.send_fds(connection, [data], [self._file])
@@ -47,7 +47,7 @@ class SharedMemory:
         return sent
 
     def close(self) -> None:
-        """Release the flight's hold on it."""
+        """Close the flight's file descriptor."""
         os.close(self._file)
 
 
@@ -59,7 +59,7 @@ class SharedMemoryReader:
         self._file: int | None = None
 
     def receive(self, most: int) -> bytes:
-        """As `socket.recv`."""
+        """As `socket.recv`, at most `most` bytes; keeps a file descriptor that comes with them."""
         data, files, _, _ = socket.recv_fds(self._connection, most, 1, socket.MSG_CMSG_CLOEXEC)
         for file in files:
             self._forget()
@@ -76,7 +76,7 @@ class SharedMemoryReader:
         return data
 
     def close(self) -> None:
-        """Release socket and memory."""
+        """Close socket and shared memory."""
         self._forget()
         self._connection.close()
 

@@ -1,6 +1,6 @@
-"""Data for the console: one state document, and frames with their poses.
+"""Data for the console: state documents, and frames with their poses.
 
-The flight's threads only store references; the console's thread formats the data.
+The flight's threads only store references; the publisher's thread formats the data.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ _TARGETS = 64
 
 @dataclass(frozen=True)
 class Instruments:
-    """Functions that give the data of a state document. injecting: whether positions are sent now;
-    mission: the autopilot's waypoints.
+    """Functions that give the data of a state document. verdict: whether the EKF follows vision,
+    None if not tested; injecting: whether positions are sent now; mission: the autopilot's
+    waypoints.
     """
 
     health: Callable[[], dict[str, Any]]
@@ -50,16 +51,18 @@ class Instruments:
 
 @dataclass(frozen=True)
 class ConsoleFrame:
-    """A frame for the console. parts: image (h, w, 3) uint8 and, with a map view, its rgb (h, w, 3)
-    uint8 and depth (h, w) float32.
+    """A frame for the console. head: JSON object (time, camera, pose); parts: image (h, w, 3) uint8
+    and, with a map view, its rgb (h, w, 3) uint8 and depth (h, w) float32, m.
     """
 
     head: dict[str, Any]
     parts: tuple[np.ndarray, ...]
 
 
-class Shown:
-    """Keeps the newest data for the console. about: constants of a flight (mode, limits, map)."""
+class ConsoleData:
+    """Keeps the newest data for the console. frame: map coordinates; geoid_m: geoid above the
+    ellipsoid; about: constants of a flight (mode, limits, map), for the first message.
+    """
 
     def __init__(
         self, frame: LocalFrame, geoid_m: float, instruments: Instruments, about: dict[str, Any]
@@ -79,14 +82,14 @@ class Shown:
     # --- from the flight's threads; none of them waits ----------------------------------------
 
     def add_frame(self, frame: Frame) -> None:
-        """Keep a frame until its estimate arrives."""
+        """Keep a frame until its estimate arrives; at most the 12 newest."""
         with self._lock:
             self._pictures[frame.exposure_time_ns] = frame
             while len(self._pictures) > _FRAMES:
                 self._pictures.popitem(last=False)
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle | None) -> None:
-        """Pair an estimate with its frame, if that was kept."""
+        """Pair an estimate with its frame, if that was kept. bundle: its map view, or None."""
         self._estimate = estimate
         with self._lock:
             frame = self._pictures.pop(estimate.exposure_time_ns, None)
@@ -95,7 +98,7 @@ class Shown:
                 self._paired_ns = time.monotonic_ns()
 
     def add_target(self, target: TargetEstimate) -> None:
-        """Keep the newest fix of each target."""
+        """Keep the newest fix of each target; at most 64 targets."""
         with self._lock:
             self._targets[target.fix.target_id] = target
             self._targets.move_to_end(target.fix.target_id)
@@ -103,28 +106,28 @@ class Shown:
                 self._targets.popitem(last=False)
 
     def forget_target(self, name: str) -> None:
-        """A target was ended by an order."""
+        """Remove a target that was ended by an order. name: its target_id."""
         with self._lock:
             self._targets.pop(name, None)
 
     def add_event(self, level: str, text: str) -> None:
-        """Add an event."""
+        """Add an event, such as an alert, for the page's list. level: its severity."""
         with self._lock:
             self._count += 1
             self._events.append((self._count, time.monotonic_ns(), level, text))
 
     # --- for the link's thread ----------------------------------------------------------------
 
-    def hello(self) -> dict[str, Any]:
-        """The first message for a console."""
+    def first_message(self) -> dict[str, Any]:
+        """The first message for a console: constants of the flight, and the time."""
         return {"kind": "hello", **self._about, "monotonic_ns": time.monotonic_ns()}
 
-    def state(self, told: int) -> tuple[dict[str, Any], int]:
-        """The state document, and the number of its newest event; events up to `told`
-        are left out.
+    def state(self, last_event: int) -> tuple[dict[str, Any], int]:
+        """A state document, and the number of its newest event. It holds the events after number
+        `last_event`.
         """
         with self._lock:
-            events = [e for e in self._events if e[0] > told]
+            events = [e for e in self._events if e[0] > last_event]
             targets = list(self._targets.values())
             count = self._count
         vehicle, shadow = self._instruments.vehicle(), self._instruments.shadow()
@@ -139,7 +142,7 @@ class Shown:
             "follows": None if verdict is None else _follows(verdict),
             "injecting": self._instruments.injecting(),
             "estimate": self._estimate and self._position(self._estimate),
-            "gnss_residual_m": self._residual(vehicle),
+            "gnss_residual_m": self._gnss_residual_m(vehicle),
             "mission": [
                 [w.number, w.latitude_deg, w.longitude_deg] for w in self._instruments.mission()
             ],
@@ -151,11 +154,13 @@ class Shown:
                 for n, t, level, text in events
             ],
         }
-        plain: dict[str, Any] = _plain(document)
+        plain: dict[str, Any] = _json_value(document)
         return plain, count
 
     def take_frame(self) -> ConsoleFrame | None:
-        """The newest frame with its pose and map view; None if there is no new one."""
+        """The newest frame with its pose and map view; None if there is no new one. If nothing was
+        localized for 1 s, the newest frame without a pose.
+        """
         with self._lock:
             paired, self._paired = self._paired, None
             if paired is not None and time.monotonic_ns() - self._paired_ns > _FRESH_NS:
@@ -166,7 +171,7 @@ class Shown:
         if paired is None:
             return None
         frame, estimate, view = paired
-        image = _narrowed(frame.image)
+        image = _downscaled(frame.image)
         head: dict[str, Any] = {
             "kind": "frame",
             "exposure_ns": frame.exposure_time_ns,
@@ -186,7 +191,7 @@ class Shown:
                     "camera": view.camera.to_dict(), "pose": _pose(view.world_from_camera)
                 }  # fmt: skip
                 parts += [view.rgb, view.depth]
-        return ConsoleFrame(_plain(head), tuple(parts))
+        return ConsoleFrame(_json_value(head), tuple(parts))
 
     def _is_unlocalized(self) -> bool:
         newest = self._estimate
@@ -217,9 +222,9 @@ class Shown:
             "stages_ms": dict(estimate.stage_ms),
         }
 
-    def _residual(self, vehicle: VehicleState) -> float | None:
-        """Horizontal, of the newest fix to the receiver's own position, m. The receiver's delay
-        times the speed is in it.
+    def _gnss_residual_m(self, vehicle: VehicleState) -> float | None:
+        """Horizontal distance from the newest fix to the GNSS receiver's position, m; None without
+        either. It contains the receiver's delay times the speed.
         """
         estimate = self._estimate
         if estimate is None or not estimate.accepted or vehicle.gps_fix_type < 3:
@@ -257,7 +262,7 @@ def _pose(pose: Pose) -> dict[str, list[float]]:
     }
 
 
-def _narrowed(image: np.ndarray) -> np.ndarray:
+def _downscaled(image: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
     if width <= _WIDEST:
         return np.ascontiguousarray(image)
@@ -265,12 +270,12 @@ def _narrowed(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _plain(value: Any) -> Any:
-    """JSON's own types; what is not a number is None."""
+def _json_value(value: Any) -> Any:
+    """As JSON's own types; NaN and infinity become None."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _json_value(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [_json_value(v) for v in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):

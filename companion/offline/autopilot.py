@@ -13,7 +13,7 @@ from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
 class RecordedAutopilot(VehicleTracker):
-    """The vehicle's state at a time, from the recorded messages."""
+    """The vehicle's telemetry from a record's messages, replayed to any later time."""
 
     def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
         c = bridge.camera

@@ -42,8 +42,8 @@ class FlownMap:
                 f"{away_m:.0f} m away: was it built again since? give the flight's own as --map"
             )
 
-    def doubt(self, cache: TileCache) -> str:
-        """A warning if the map has the same origin but is another; empty for the flown one."""
+    def mismatch(self, cache: TileCache) -> str:
+        """A warning if the map's hash is not the flown one's; "" if it is, or none was recorded."""
         try:
             same = self.sha256 in (None, map_hash(cache.path))
         except ConfigError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from companion.errors import StreamDecodeError, StreamSizeError
 from companion.recorded.flight import RecordedFrame
-from companion.sources.folder_source import written_times
+from companion.sources.folder_source import exposure_times_of
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
@@ -52,7 +52,7 @@ def sensors_of(poses: Mapping[int, Pose]) -> AuxiliarySensors:
 
 @dataclass(frozen=True)
 class LocalizedImage:
-    """Result of one image. estimate: None if there is none; `problem` says why."""
+    """Result of one image. estimate: None if there is none; then `problem` says why."""
 
     name: str
     estimate: PoseEstimate | None
@@ -61,7 +61,7 @@ class LocalizedImage:
 
 def image_times(images: Sequence[Path], rate_hz: float) -> tuple[int, ...]:
     """Exposure times in ns, from ``timestamps.txt`` beside the images, else at `rate_hz`."""
-    times = written_times(images[0].parent, images)
+    times = exposure_times_of(images[0].parent, images)
     return times or tuple(round((k + 1) * 1e9 / rate_hz) for k in range(len(images)))
 
 

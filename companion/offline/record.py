@@ -97,8 +97,8 @@ class RecordTables:
         return Path(named) if isinstance(named, str) else None
 
     @property
-    def flown(self) -> FlownMap:
-        """What the record tells about its map."""
+    def flown_map(self) -> FlownMap:
+        """The record's data about its map."""
         named = self.manifest.get("map_sha256")
         sha256 = named if isinstance(named, str) else None
         columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]
@@ -133,12 +133,12 @@ class RecordTables:
 
     @property
     def delay_ms(self) -> float | None:
-        """Setting `bridge.injection.delay_ms`: age at which a fix was sent."""
+        """Setting `bridge.injection.delay_ms` (age at which a fix was sent); None if unknown."""
         return self._number("bridge", "injection", "delay_ms")
 
     @property
     def alert_limit_m(self) -> float | None:
-        """Setting: protection level above which nothing was injected."""
+        """Setting: protection level above which nothing was injected, m; None if unknown."""
         return self._number("bridge", "injection", "alert_limit_m")
 
     def _number(self, *keys: str) -> float | None:
@@ -159,8 +159,8 @@ class RecordTables:
 
 @dataclass(frozen=True)
 class RecordedEstimate:
-    """One row of ``estimates.csv``. known_ns: time of publication, CLOCK_MONOTONIC; focal_px: of
-    its frame, None in old records.
+    """One row of ``estimates.csv``. known_ns: time of publication, CLOCK_MONOTONIC; focal_px: focal
+    length of its frame, None in old records.
     """
 
     exposure_time_ns: int
@@ -221,8 +221,8 @@ def load_record(
 ) -> FlightRecord:
     """Load a record to localize it again; `RecordError` says what is missing.
 
-    kept_share: share of the localized frames that must have their image; tlog, map_cache: instead
-    of the record's own.
+    kept_share: share of the localized frames that must have their image; tlog, map_cache: used
+    instead of the record's own.
     """
     tables = read_record(folder)
     if not tables.manifest:
@@ -270,7 +270,7 @@ def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
 
 
 def _estimates(columns: Columns, path: Path) -> Iterator[RecordedEstimate]:
-    """Of rows that hold a pose each; the last two columns are not in all records."""
+    """The rows that hold a pose; the last two columns are missing in old records."""
     if not columns:
         return
     lacking = [name for name in _ROW if name not in columns]
@@ -293,7 +293,7 @@ def _estimates(columns: Columns, path: Path) -> Iterator[RecordedEstimate]:
 
 
 def document(path: Path) -> dict[str, Any]:
-    """Read a JSON file of a record; {} if it is missing or damaged."""
+    """Read a JSON object of a record; {} if the file is missing or damaged."""
     try:
         return mapping(json.loads(plain_text(path)))
     except (OSError, ValueError, RecursionError):
@@ -301,7 +301,7 @@ def document(path: Path) -> dict[str, Any]:
 
 
 def _table(path: Path, text: tuple[str, ...]) -> Columns:
-    """A table that holds what a report needs, or nothing. Only estimates must be there."""
+    """Read a table of a record; {} if it is missing, unless it is the estimates."""
     if path.name != "estimates.csv" and not path.exists():
         return {}
     columns = read_columns(path, text)

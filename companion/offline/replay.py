@@ -18,7 +18,7 @@ from companion.flight.priors import AutopilotPose
 from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import MIN_IMAGES, FlightRecord, RecordedEstimate
 from companion.recorded.flight import RecordedFrame
-from companion.sources.zoom import ZoomTable, longer
+from companion.sources.zoom import ZoomTable, with_focal_factor
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -73,7 +73,7 @@ def replay(
     try:
         camera = config.camera.model.camera()
         cache = stack.cache
-        record.tables.flown.require_frame(cache)
+        record.tables.flown_map.require_frame(cache)
         arm = np.array(config.camera.lever_arm_m)
         extrinsics = CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
         pose = AutopilotPose(autopilot, extrinsics, config.prior)
@@ -88,13 +88,13 @@ def replay(
                 prior = pose.prior(recorded.exposure_time_ns)
                 if prior is not None:
                     localizer.offer(prior)
-            factor = _told_factor(config.camera.zoom, autopilot, recorded)
+            factor = _logged_zoom_factor(config.camera.zoom, autopilot, recorded)
             if factor is None:  # a fix of it would be metres off and look as good as any
                 unzoomed += 1
                 frames.append(ReplayedFrame(recorded, None))
                 continue
             try:
-                again = _localize(localizer, longer(camera, factor), recorded, one)
+                again = _localize(localizer, with_focal_factor(camera, factor), recorded, one)
             except StreamDecodeError as error:  # power may have gone while it was written
                 _log.warning("left out: %s", error)
                 continue
@@ -117,7 +117,7 @@ def replay(
         stack.close()
 
 
-def _told_factor(
+def _logged_zoom_factor(
     zoom: ZoomTable | None, autopilot: RecordedAutopilot, recorded: RecordedEstimate
 ) -> float | None:
     """Multiple of the model's focal length by the log, for a frame whose row has none, as in older
@@ -136,7 +136,7 @@ def _localize(
     if recorded.focal_px is not None:
         factor = recorded.focal_px / frame.camera.fx
         if abs(factor - 1.0) > _ALIKE:
-            frame = replace(frame, camera=longer(frame.camera, factor))
+            frame = replace(frame, camera=with_focal_factor(frame.camera, factor))
     try:
         return localizer.track(frame)
     except OutsideMapError:
@@ -144,7 +144,7 @@ def _localize(
 
 
 def summarize(frames: list[ReplayedFrame]) -> ReplaySummary:
-    """Compare both results of every frame."""
+    """Compare the recorded and the replayed result of every frame."""
     again = [f.replayed is not None and f.replayed.accepted for f in frames]
     differences = [
         f.recorded.world_from_camera.distance_to(f.replayed.world_from_camera)

@@ -1,7 +1,7 @@
-"""Runs a recorded flight through the parts of the flight process: which alerts and holds result.
+"""Runs a recorded flight through components of the flight process: which alerts and holds result.
 
-The parts are those of `companion.flight.component_table`, not started: bridge and integrity monitor
-run by the record's clock, and frames are localized one after the other. Frames that a busy
+The components are those of `companion.flight.component_table`, not started: bridge and integrity
+monitor run by the record's clock, and frames are localized one after the other. Frames that a busy
 processor would drop are not simulated.
 """
 
@@ -103,9 +103,8 @@ def shadow_check(
     rate_hz: float,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> ShadowCheck:
-    """Play the flight. footage: what `flight` was read from; rate_hz: of the images, at most.
-
-    `RecordError` where the footage has no log or no times.
+    """Play the flight through the components. footage: what `flight` was read from; rate_hz: of the
+    images, at most. `RecordError` if the footage has no log or no times.
     """
     if flight.log is None:
         raise RecordError(f"{footage}: no log of an autopilot lies beside it; give it as LOG")
@@ -132,15 +131,15 @@ def shadow_check(
             if not isinstance(item, Frame):
                 player.bridge.play(item)
                 continue
-            player.see(replace(item, exposure_time_ns=now_ns - delay_ns))
+            player.add_frame(replace(item, exposure_time_ns=now_ns - delay_ns))
             progress((now_ns - _BEGIN_NS) * 1e-9, (end_ns - begin_ns) * 1e-9)
         player.advance(player.now_ns + _AFTER_NS)
         return player.result((*flight.notes, *messages.notes))
 
 
 class _Messages:
-    """The log's messages about the images. before: what is to be known at the begin; origin: the
-    EKF's, GPS_GLOBAL_ORIGIN.
+    """The log's messages during the images. before: messages that must be known at the begin;
+    origin: the EKF's, GPS_GLOBAL_ORIGIN.
     """
 
     def __init__(self, path: Path, begin_ns: int, end_ns: int) -> None:
@@ -161,11 +160,11 @@ class _Messages:
         self.origin = told[-1] if told else self._origin(path)
 
     def dated(self) -> list[Dated]:
-        """In the order of time."""
+        """The messages in the order of their times."""
         return self._within
 
     def _origin(self, path: Path) -> Any:
-        """The EKF's, by its two positions at one time; else its first place stands for it."""
+        """The EKF's origin, by local and global position at one time; else its first position."""
         local, place = None, None
         for _, message in self._within:
             if message.get_type() == "LOCAL_POSITION_NED":
@@ -191,7 +190,7 @@ class _Messages:
 def _frames(
     flight: RecordedFlight, footage: Path, camera: Camera, rate_hz: float
 ) -> Iterator[Frame]:
-    """The images by the footage's own clock, at most so many a second."""
+    """The images on the footage's own clock, at most rate_hz of them a second."""
     last_ns: int | None = None
     for frame in _video(footage, camera) if flight.kind == "video" else _photos(flight, camera):
         if last_ns is None or frame.exposure_time_ns - last_ns >= 0.95e9 / rate_hz:
@@ -228,8 +227,8 @@ class _Counts:
 
 
 class _Player:
-    """The parts of one flight under the record's clock. origin: what the vehicle answers when it is
-    asked for the EKF's, GPS_GLOBAL_ORIGIN.
+    """The components of one flight under the record's clock. origin: GPS_GLOBAL_ORIGIN, with which
+    the vehicle answers requests.
     """
 
     def __init__(self, config: CompanionConfig, origin: Any, up: ExitStack) -> None:
@@ -254,7 +253,7 @@ class _Player:
         self._last_ns = 0
 
     def advance(self, time_ns: int) -> None:
-        """Everything that is due until then."""
+        """Do everything that is due until time_ns."""
         while (next_ns := (self.now_ns // _TICK_NS + 1) * _TICK_NS) <= time_ns:
             self.now_ns = next_ns
             self.bridge.tick()
@@ -269,8 +268,8 @@ class _Player:
                 self._score()
         self.now_ns = max(self.now_ns, time_ns)
 
-    def see(self, frame: Frame) -> None:
-        """An image arrives."""
+    def add_frame(self, frame: Frame) -> None:
+        """Localize an image and inject its fix in shadow mode."""
         self._begun_ns = self._begun_ns or frame.exposure_time_ns
         self._last_ns = frame.exposure_time_ns
         self._counts.frames += 1
@@ -289,7 +288,7 @@ class _Player:
         self.bridge.tick()
 
     def result(self, notes: tuple[str, ...]) -> ShadowCheck:
-        """What came of all images."""
+        """The result of all images."""
         c = self._counts
         seconds = (self._last_ns - (self._begun_ns or self._last_ns)) * 1e-9
         if not c.localized:
@@ -302,7 +301,7 @@ class _Player:
         )  # fmt: skip
 
     def _estimate(self, frame: Frame) -> PoseEstimate | None:
-        """As `DualThreadEngine` does it, one thread's turn after the other's."""
+        """Localize as `DualThreadEngine`, its threads' work in turn; None without a prior."""
         localizer, time_ns = self._localizer, frame.exposure_time_ns
         wants = localizer.tracker.track_status.wants_prior
         self._unknown = self._unknown + 1 if wants else 0
@@ -345,6 +344,6 @@ class _Player:
 
 
 def _shadow(config: CompanionConfig) -> CompanionConfig:
-    """In shadow mode, without what is written or kept."""
+    """The deployment in shadow mode, without record and state files."""
     bridge = config.bridge.model_copy(update={"mode": "shadow", "tlog": None, "state_file": None})
     return config.model_copy(update={"bridge": bridge, "record": None})

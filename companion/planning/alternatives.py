@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.planning.survey import Progress, Surveyor, moved
+from companion.planning.survey import Progress, Surveyor, shifted_sample
 from companion.planning.verdicts import LegVerdict, SampleVerdict
 from companion.planning.way import PathSample
 
@@ -61,10 +61,9 @@ def leg_proposals(
         worst = sorted((j for j in verdict.samples if not j.holds), key=lambda j: -j.forecast.risk)[
             :_SAMPLES
         ]
-        for change in changes(worst[0], fixed):
-            samples = [
-                moved(j.sample, change.rise_m, change.pitch_deg, change.turn_deg) for j in worst
-            ]
+        for change in alternatives_at(worst[0], fixed):
+            shift = (change.rise_m, change.pitch_deg, change.turn_deg)
+            samples = [shifted_sample(j.sample, *shift) for j in worst]
             tried.append((verdict, change, samples))
     judged = iter(surveyor.verdicts([s for _, _, part in tried for s in part], progress))
     found: dict[str, LegProposal] = {}
@@ -79,8 +78,8 @@ def leg_proposals(
     return tuple(found[v.leg.name] for v in bad if v.leg.name in found)
 
 
-def changes(worst: SampleVerdict, fixed: bool) -> list[LegAlternative]:
-    """Alternatives to try at a sample; for a fixed camera only heights and headings."""
+def alternatives_at(worst: SampleVerdict, fixed: bool) -> list[LegAlternative]:
+    """Alternatives to try at a failing sample; for a fixed camera only heights and headings."""
     sample, ground = worst.sample, worst.forecast.ground_m
     options = []
     above = ground * abs(float(np.sin(np.radians(sample.pitch_deg)))) if ground else 0.0

@@ -18,7 +18,7 @@ _LONGEST = 4.0
 
 @dataclass(frozen=True)
 class Course:
-    """points: (N, 3) of the path, world metres; leaves: (3,) direction and strength at its end,
+    """Path of a leg. points: (N, 3), world metres; leaves: (3,) direction and strength at its end,
     zero for a stop; nose_deg: heading of the vehicle, clockwise from the path.
     """
 
@@ -29,7 +29,7 @@ class Course:
 
     @property
     def length_m(self) -> float:
-        """Horizontal length."""
+        """Horizontal length, m."""
         return float(self._steps().sum())
 
     def at(self, share: float) -> tuple[Array, float]:
@@ -51,7 +51,7 @@ class Course:
 
 
 def straight(start: Array, end: Array) -> Course:
-    """A straight course between two positions (3,)."""
+    """A straight course between two positions (3,), world metres."""
     return Course(np.stack([start, end]), end - start)
 
 

@@ -1,4 +1,4 @@
-"""A forecast against a flight: where vision was forecast to work, and where it did."""
+"""Compares a forecast with a flight: where vision was forecast to work, and where it did."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ FLOWN_HEADINGS = ("leg", "should work", "worked", "forecast right", "positions f
 
 @dataclass(frozen=True)
 class FlownLeg:
-    """One leg. forecast, held: (N,) of the places that were flown, whether vision should work there
-    and whether it did; places: of the whole leg.
+    """One leg. forecast, held: (N,) for the samples that were flown, whether vision should work
+    there and whether it did; places: number of the leg's samples.
     """
 
     name: str
@@ -30,7 +30,7 @@ class FlownLeg:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """As cells."""
+        """Table cells of the leg."""
         flown = f"{len(self.held)} of {self.places}"
         if not len(self.held):
             return self.name, "-", "-", "-", flown
@@ -41,8 +41,8 @@ class FlownLeg:
 def flown_legs(
     verdicts: Sequence[LegVerdict], places: Array, accepted: np.ndarray
 ) -> tuple[FlownLeg, ...]:
-    """Compares each leg's samples with the frames of the flight within half a step horizontally.
-    places: (F, 3) of all frames; accepted: (F,), whether each was localized.
+    """Compare each leg's samples with the frames of the flight within half a step horizontally.
+    places: (F, 3) positions of all frames; accepted: (F,), whether each was localized.
     """
     legs = []
     for verdict in verdicts:
@@ -59,17 +59,17 @@ def flown_legs(
 
 
 def recorded_frames(record: Path, cache: TileCache) -> tuple[Array, np.ndarray]:
-    """Places (F, 3) of a record's frames, and whether each was localized. `RecordError` where the
-    folder is no record, or of another map.
+    """Positions (F, 3) of a record's frames, world metres, and whether each was localized.
+    `RecordError` if the folder is no record, or of another map.
     """
-    read_record(record).flown.require_frame(cache)
+    read_record(record).flown_map.require_frame(cache)
     estimates = read_estimates(record / "estimates.csv")
     places = np.array([e.world_from_camera.translation for e in estimates]).reshape(-1, 3)
     return places, np.array([e.accepted for e in estimates], bool)
 
 
 def flown_words(legs: Sequence[FlownLeg]) -> str:
-    """The comparison in a sentence."""
+    """The comparison in a sentence, for the user."""
     forecast = np.concatenate([leg.forecast for leg in legs])
     held = np.concatenate([leg.held for leg in legs])
     if not len(held):

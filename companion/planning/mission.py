@@ -16,7 +16,7 @@ from companion.errors import MissionFileError
 from localizer.plain_files import plain_text
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.mission.items import HeightAbove, MissionItem, MissionVehicle, UnreadItem
-from mavlink_bridge.mission.path import MissionPlace, PlannedMission, fly
+from mavlink_bridge.mission.path import MissionPlace, PlannedMission, planned_path
 
 __all__ = ["HeightAbove", "MissionPlace", "PlannedMission", "read_mission"]
 
@@ -42,7 +42,7 @@ def read_mission(path: Path) -> PlannedMission:
                 f"{path}: holds {len(items):,} items; an autopilot counts {_MOST_ITEMS:,} at the "
                 "most: split the mission"
             )
-        mission = fly(items, home, vehicle, speed)
+        mission = planned_path(items, home, vehicle, speed)
     except OSError as error:
         raise MissionFileError(f"{path}: cannot be read: {error.strerror}") from error
     except MissionError as error:
@@ -84,8 +84,9 @@ def _plan(text: str) -> _Read:
 
 
 def _expanded(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The mission items of an entry: a simple item; the saved items of a survey or corridor; the
-    items that QGroundControl makes of a landing pattern; else the entry itself, which is not read.
+    """The mission items of an entry: a simple item itself; the saved items of a survey or corridor;
+    the items that QGroundControl makes of a landing pattern. Another entry itself, which is not
+    read.
     """
     if entry["type"] == "SimpleItem":
         yield entry
@@ -139,7 +140,7 @@ def _plan_item(entry: dict[str, Any], number: int) -> MissionItem | UnreadItem:
 
 
 def _waypoints(text: str) -> _Read:
-    """Rows of index, current, frame, command, four parameters, latitude, longitude, altitude,
+    """Read rows of index, current, frame, command, four parameters, latitude, longitude, altitude,
     autocontinue; row 0 is home.
     """
     first, *lines = text.splitlines() or [""]
@@ -162,7 +163,7 @@ def _waypoints(text: str) -> _Read:
 
 
 def _numbers(stated: Sequence[int | None]) -> Sequence[int]:
-    """As a jump names them: as stated, or counted from 1 where that does not tell them apart."""
+    """Numbers as a jump names them: as stated, or counted from 1 if those are not unique."""
     known = [number for number in stated if number is not None]
     if len(set(known)) == len(stated):
         return known
@@ -170,7 +171,7 @@ def _numbers(stated: Sequence[int | None]) -> Sequence[int]:
 
 
 def _home(place: Sequence[Any]) -> tuple[float, float] | None:
-    """Degrees; None where it was never set: 0, 0 or nothing."""
+    """Latitude and longitude, degrees; None if home was not set (0, 0 or nothing)."""
     latitude, longitude = (math.nan if p is None else float(p) for p in place[:2])
     if (latitude, longitude) == (0, 0) or (math.isnan(latitude) and math.isnan(longitude)):
         return None

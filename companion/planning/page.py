@@ -31,7 +31,7 @@ PROPOSAL_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "works then")
 
 
 def verdict_words(plan: MissionForecast) -> str:
-    """The result of a plan in a sentence."""
+    """The result of a plan in a sentence, for the user."""
     bad = [v for v in plan.verdicts if not v.holds]
     limit = plan.question.limits.sigma_m
     circles = sum(v.leg.is_circle for v in plan.verdicts)

@@ -45,7 +45,7 @@ class MapSquare:
 
 
 def sheet_of(plan: MissionForecast, cache: TileCache) -> MapSquare:
-    """Render the square of the map about the plan's path."""
+    """Render the map in a square around the plan's path, north up."""
     places = _places(_all(plan))
     low, high = places.min(axis=0), places.max(axis=0)
     half = max(float((high - low).max()) * (0.5 + _MARGIN), _LEAST_HALF_M)
@@ -81,7 +81,7 @@ def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
 def heat_picture(
     sheet: MapSquare, plan: MissionForecast, cache: TileCache, camera: Camera, aim: Aim
 ) -> Image:
-    """The seen ground, coloured by the mean risk of the samples that see it."""
+    """The ground in view, coloured by the mean risk of the samples that see it."""
     total = np.zeros(sheet.rgb.shape[:2], np.float32)
     count = np.zeros_like(total)
     for judged in _all(plan):
@@ -106,7 +106,7 @@ def heat_picture(
 
 
 def colour_of(judged: SampleVerdict) -> tuple[int, int, int]:
-    """RGB colour of a sample."""
+    """RGB colour of a sample: holds, doubtful or fails."""
     if not judged.holds:
         return _COLOURS[2]
     return _COLOURS[1] if judged.forecast.risk > _DOUBTFUL else _COLOURS[0]
@@ -121,7 +121,7 @@ def _places(judged: Sequence[SampleVerdict]) -> Array:
 
 
 def _half_step(verdict: LegVerdict, judged: SampleVerdict, gsd_m: float) -> Array:
-    """Half of the way (2,) that a sample of the leg stands for, pixels."""
+    """Half of the path (2,) that a sample of the leg stands for, pixels."""
     heading = np.radians(judged.sample.heading_deg)
     along = np.array([np.sin(heading), -np.cos(heading)])
     half: Array = 0.5 * verdict.leg.step_m / gsd_m * along
@@ -129,7 +129,7 @@ def _half_step(verdict: LegVerdict, judged: SampleVerdict, gsd_m: float) -> Arra
 
 
 def _footprint(judged: SampleVerdict, cache: TileCache, camera: Camera, aim: Aim) -> Array | None:
-    """(N, 2) corners of the ground in view, at most as far as three times its middle."""
+    """Corners (N, 2) of the ground in view, at most three times as far as its middle; or None."""
     ground = judged.forecast.ground_m
     if ground <= 0:
         return None

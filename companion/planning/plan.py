@@ -28,8 +28,9 @@ _MOST_SAMPLES = 400  # of a mission; longer ones are sampled more thinly
 
 @dataclass(frozen=True)
 class Question:
-    """The request. mission_file: for the report; spacing_m: between samples; speed_m_s, pitch_deg:
-    used if the mission has none; seek: whether alternatives are searched for failing legs.
+    """What the user asks. mission_file: for the report; spacing_m: between samples; speed_m_s,
+    pitch_deg: used if the mission has none; seek: whether alternatives are searched for failing
+    legs.
     """
 
     mission_file: Path
@@ -43,9 +44,9 @@ class Question:
 
 @dataclass(frozen=True)
 class MissionForecast:
-    """The result. length_m: of all legs; verdicts: of each leg once, however often it is flown;
-    not_judged: MAVLink names of the mission's commands that the forecast cannot include; notes:
-    limits of the forecast for this mission, as sentences.
+    """Forecast of a mission. length_m: of all legs; verdicts: of each leg once, however often it is
+    flown; not_judged: MAVLink names of the mission's commands that the forecast cannot include;
+    notes: limits of the forecast for this mission, as sentences.
     """
 
     question: Question
@@ -86,17 +87,17 @@ def make_plan(
     aim = aim_of(deployment, question.pitch_deg)
     ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)
-    coarser_m = length_m(_once(legs)) / _MOST_SAMPLES
+    coarser_m = length_m(_distinct_legs(legs)) / _MOST_SAMPLES
     if coarser_m > question.spacing_m:
         legs = legs_of(mission, cache, ground, aim, coarser_m)
-    samples = [s for leg in _once(legs) for s in leg.samples]
+    samples = [s for leg in _distinct_legs(legs) for s in leg.samples]
 
     with surveyor(cache, deployment, aim, question.conditions, question.limits) as found:
         judged = iter(found.verdicts(samples, progress))
         times = Counter(leg.first for leg in legs)
         verdicts = tuple(
             LegVerdict(leg, tuple(next(judged) for _ in leg.samples), times[leg.first])
-            for leg in _once(legs)
+            for leg in _distinct_legs(legs)
         )
         options = leg_proposals(found, verdicts, aim.fixed, progress) if question.seek else ()
     odometry = deployment.localizer.odometry or OdometryConfig()
@@ -112,13 +113,13 @@ def make_plan(
     return MissionForecast(question, length, speed_m_s, verdicts, bridged, options, notes, unknown)
 
 
-def _once(legs: Sequence[FlightLeg]) -> list[FlightLeg]:
-    """The legs without those that were flown alike before."""
+def _distinct_legs(legs: Sequence[FlightLeg]) -> list[FlightLeg]:
+    """The legs without repeats of legs that were flown identically before."""
     return [leg for number, leg in enumerate(legs) if leg.first == number]
 
 
 def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list[LegVerdict]:
-    """A verdict for each leg, in the order in which they are flown."""
+    """A verdict for each leg, repeats included, in the order in which they are flown."""
     of = {verdict.leg.first: verdict for verdict in verdicts}
     return [
         LegVerdict(
@@ -154,7 +155,7 @@ def _notes(
 def _kind_notes(
     cache: TileCache, deployment: CompanionConfig, places: Sequence[Array], ground: MapHeights
 ) -> tuple[str, ...]:
-    """What the map's kind is worth at the height that is flown (the median over the map)."""
+    """Notes on what the map's kind allows at the flown height (median over the map)."""
     kind = map_kind(cache)
     below = [(p[2], ground.height_m(float(p[0]), float(p[1]))) for p in places]
     heights = [float(z) - ground_m for z, ground_m in below if ground_m is not None]

@@ -50,7 +50,7 @@ class Surveyor:
     def verdicts(
         self, samples: Sequence[PathSample], progress: Progress | None = None
     ) -> list[SampleVerdict]:
-        """Judge the samples, in their order; deterministic."""
+        """Forecast the samples under all conditions, in their order; deterministic."""
         made = []
         with ThreadPoolExecutor(self._threads, "forecast") as pool:
             for done, judged in enumerate(pool.map(self._one, itertools.count(), samples), 1):
@@ -97,8 +97,10 @@ def surveyor(
         yield Surveyor(cache, aim, conditions, limits, forecasters)
 
 
-def moved(sample: PathSample, rise_m: float, pitch_deg: float, turn_deg: float) -> PathSample:
-    """The sample at another height and with another camera direction."""
+def shifted_sample(
+    sample: PathSample, rise_m: float, pitch_deg: float, turn_deg: float
+) -> PathSample:
+    """The sample raised by rise_m, with another camera pitch and turn from the path."""
     position = sample.position.copy()
     position[2] += rise_m
     return replace(sample, position=position, pitch_deg=pitch_deg, turn_deg=turn_deg)

@@ -52,15 +52,13 @@ class SampleVerdict:
 
     @property
     def holds(self) -> bool:
-        """Whether vision is sufficient there."""
+        """Whether vision is sufficient at this sample."""
         return self.reason is Reason.NONE
 
 
 @dataclass(frozen=True)
 class LegVerdict:
-    """Results of a leg's samples. holds: at all of them; share: of samples that hold; times: how
-    often the leg is flown.
-    """
+    """Results of a leg's samples. times: how often the leg is flown."""
 
     leg: FlightLeg
     samples: tuple[SampleVerdict, ...]
@@ -103,14 +101,14 @@ class VisionGap:
 
     @property
     def length_m(self) -> float:
-        """Length along the path."""
+        """Length along the path, m."""
         return self.end_m - self.begin_m
 
 
 def sample_verdict(
     sample: PathSample, forecasts: Sequence[ViewForecast], limits: MissionLimits
 ) -> SampleVerdict:
-    """The sample's result under its worst condition."""
+    """The sample's result under its worst condition. forecasts: one for each condition."""
     worst = max(forecasts, key=lambda f: (_reason(f, limits) is not Reason.NONE, f.risk, f.sigma_m))
     return SampleVerdict(sample, worst, _reason(worst, limits))
 
@@ -162,7 +160,7 @@ def _stretch(
     odometry: OdometryConfig,
     outside: GrowthModel,
 ) -> VisionGap:
-    """off_map: the map has no geometry there, at one place at least."""
+    """The gap between two distances. off_map: the map has no geometry at one sample."""
     growth, length = outside if off_map else odometry.with_map, end_m - begin_m
     drift = math.hypot(growth.horizontal * math.sqrt(length), growth.scale * length)
     can_bridge = drift <= odometry.longest_sigma_m

@@ -1,4 +1,4 @@
-"""Compute the camera's poses along a mission, in the map's frame."""
+"""Computes the camera's poses along a mission, in the map's frame."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
 
 @dataclass(frozen=True)
 class _Site:
-    """What turns places into positions. launch: (east, north) where heights above home begin."""
+    """Converts places to positions. launch: (east, north) where heights above home begin."""
 
     cache: TileCache
     ground: MapHeights
@@ -162,7 +162,7 @@ class _Site:
 
 
 class _Legs:
-    """The legs so far; what is flown alike again is not sampled again."""
+    """Collects the legs; a leg that is flown identically again is not sampled again."""
 
     def __init__(self, site: _Site, aim: Aim, spacing_m: float) -> None:
         self.legs: list[FlightLeg] = []
@@ -171,7 +171,7 @@ class _Legs:
         self._way_m = 0.0
 
     def add(self, key: tuple[Any, ...], name: str, end: MissionPlace, course: Course) -> None:
-        """One more leg, flown as `end` says. key: of those that are flown alike."""
+        """Add a leg to `end` on this course. key: equal for identical legs."""
         if key not in self._firsts:
             leg = _leg(name, end, course, self._site, self._aim, self._spacing_m)
             self._firsts[key] = replace(leg, first=len(self.legs))
@@ -184,7 +184,7 @@ class _Legs:
         self._way_m += course.length_m
 
     def circle(self, place: MissionPlace, centre: Array, arrives: Array) -> None:
-        """The rounds about a place, if any."""
+        """Add the circles about a place, if any. arrives: (3,) direction of arrival."""
         if place.circle is None:
             return
         course = circled(centre, arrives, place.circle)
@@ -197,7 +197,7 @@ class _Legs:
 def _leg(
     name: str, end: MissionPlace, course: Course, site: _Site, aim: Aim, spacing_m: float
 ) -> FlightLeg:
-    """Its samples, as if it were flown first."""
+    """A leg with its samples, from distance 0."""
     count = max(round(course.length_m / spacing_m), 1)
     step_m = course.length_m / count
     looked_at = None if end.gimbal.roi is None else site.position(end.gimbal.roi)
@@ -215,8 +215,8 @@ def _leg(
 def _look(
     gimbal: GimbalTarget, aim: Aim, position: Array, heading_deg: float, looked_at: Array | None
 ) -> tuple[float, float]:
-    """Pitch, and turn to the right of the way, degrees. A vehicle without a gimbal turns to a
-    region of interest itself, as ArduCopter does.
+    """Camera pitch, and its turn to the right of the path, degrees. A vehicle without a gimbal
+    turns to a region of interest itself, as ArduCopter does. looked_at: its position, None without.
     """
     pitch = aim.pitch_deg if gimbal.pitch_deg is None else gimbal.pitch_deg
     if looked_at is not None:
@@ -231,7 +231,7 @@ def _look(
 
 
 def _launch(mission: PlannedMission, cache: TileCache) -> tuple[float, float]:
-    """(east, north) of home, or of the first place where the mission has no home."""
+    """(east, north) of home, m; of the first place if the mission has no home."""
     first = mission.path[0]
     latitude, longitude = mission.home or (first.latitude_deg, first.longitude_deg)
     east, north = _enu(latitude, longitude, cache)
@@ -281,7 +281,7 @@ def _position(
 
 
 def _extent(cache: TileCache, below: tuple[float, float]) -> str:
-    """Where the map lies, and how far a place (east, north in metres) is from its rectangle."""
+    """Text on where the map lies, and how far a place (east, north in m) is from it."""
     corners = np.array(
         [_enu(*corner, cache) for corner in cache.manifest.extent]
     )  # of the rectangle, (n, 2)
@@ -291,5 +291,5 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
 
 
 def length_m(legs: Sequence[FlightLeg]) -> float:
-    """Total length of legs."""
+    """Total length of the legs, m."""
     return sum(leg.length_m for leg in legs)

@@ -1,4 +1,4 @@
-"""How fast the localizer is on this computer: the table of ``companion self-test --bench``."""
+"""Measures the localizer's speed on this computer, for ``companion self-test --bench``."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _SWITCH_S = 2e-4  # as in flight
 
 @dataclass(frozen=True)
 class BenchRow:
-    """One rate of frames. answered_hz: estimates a second; p50_ms, p95_ms: from a frame's arrival
-    to its estimate; cpu_ms: processor time per estimate, all threads; cores: how many were busy;
-    peak_mib: largest memory of the process.
+    """Result at one frame rate. answered_hz: estimates a second; p50_ms, p95_ms: from a frame's
+    arrival to its estimate; cpu_ms: processor time per estimate, all threads; cores: how many were
+    busy; peak_mib: largest memory of the process.
     """
 
     offered_hz: int
@@ -48,7 +48,7 @@ def bench(
     path: Path, start: Pose, camera: Camera, config: LocalizerConfig,
     rates_hz: Sequence[int] = RATES_HZ, seconds: float = _SECONDS,
 ) -> Iterator[BenchRow]:  # fmt: skip
-    """A row for each rate, in real time: a flight at 10 m/s over the map at `path` from `start`."""
+    """Yield a row for each rate, in real time: a flight at 10 m/s over the map from `start`."""
     sys.setswitchinterval(_SWITCH_S)
     for rate_hz in rates_hz:
         poses = [

@@ -25,7 +25,7 @@ _FIX_3D = 3
 _NEEDED = "inside the map"
 
 
-def covered(cache: TileCache, points: Array) -> np.ndarray:
+def is_covered(cache: TileCache, points: Array) -> np.ndarray:
     """Whether a finest tile covers each point (N, 2), ENU metres: (N,) bool."""
     index = cache.index
     leaves = (index.child_count == 0) & (index.tile_count > 0)
@@ -37,13 +37,13 @@ def covered(cache: TileCache, points: Array) -> np.ndarray:
 
 
 def _enu(frame: LocalFrame, waypoints: Sequence[MissionWaypoint]) -> Array:
-    """(N, 2) metres about the map's origin."""
+    """(N, 2) east and north of the map's origin, m."""
     height = frame.origin.height_m
     places = [frame.enu_from_geodetic(w.latitude_deg, w.longitude_deg, height) for w in waypoints]
     return np.array(places).reshape(-1, 3)[:, :2]
 
 
-def _way(points: Array) -> Array:
+def _path_points(points: Array) -> Array:
     """Points (N, 2) every 25 m along the straight legs between the given ones."""
     parts = [points[:1]]
     for start, end in itertools.pairwise(points):
@@ -57,9 +57,9 @@ def check_mission(cache: TileCache, waypoints: Sequence[MissionWaypoint]) -> Doc
     if not [w for w in waypoints if w.number > 0]:
         return DoctorFinding(_NAME, "none in the vehicle", _NEEDED, "nothing to check", True, False)
     points = _enu(cache.frame, waypoints)
-    outside = [w.number for w, inside in zip(waypoints, covered(cache, points), strict=True)
+    outside = [w.number for w, inside in zip(waypoints, is_covered(cache, points), strict=True)
                if not inside]  # fmt: skip
-    way = covered(cache, _way(points))
+    way = is_covered(cache, _path_points(points))
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     found = f"{len(waypoints)} places, {length / 1000:.1f} km"
     if way.all() and not outside:
@@ -67,13 +67,13 @@ def check_mission(cache: TileCache, waypoints: Sequence[MissionWaypoint]) -> Doc
             _NAME, found, _NEEDED, "place and way, not what the camera sees", True, False
         )
     share = 100.0 * float(1.0 - way.mean())
-    where = f"; items {_listed(outside)} outside" if outside else "; no item outside"
+    where = f"; items {_number_list(outside)} outside" if outside else "; no item outside"
     why = f"no position by vision on {share:.0f} % of the way: build a larger map or move it"
     return DoctorFinding(_NAME, found + where, _NEEDED, why, False, False)
 
 
-def _listed(numbers: Sequence[int]) -> str:
-    """A list that fits the table."""
+def _number_list(numbers: Sequence[int]) -> str:
+    """Numbers as a list that fits the table."""
     shown = ", ".join(str(n) for n in numbers[:8])
     return shown if len(numbers) <= 8 else f"{shown} and {len(numbers) - 8} more"
 
@@ -117,7 +117,7 @@ def check_vehicle_position(cache: TileCache, state: VehicleState) -> list[Doctor
 
 
 def _away_km(cache: TileCache, latitude_deg: float, longitude_deg: float) -> float:
-    """From a place to the rectangle about the map, 0 inside; through the Earth."""
+    """Distance from a position to the rectangle about the map, km; 0 inside."""
     height_m = cache.manifest.origin.height_m
     place = np.asarray(cache.frame.enu_from_geodetic(latitude_deg, longitude_deg, height_m))
     low, high = cache.index.box_min[0, :2], cache.index.box_max[0, :2]

@@ -42,7 +42,7 @@ def examine_deployment(
     feed: bool = True,
     say: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Run all checks.
+    """Run all checks of a deployment.
 
     vehicle, feed: False leaves out flight controller or camera. Both are checked in parallel, after
     the localizer, because its compilation would delay the link. say: receives each step as text.
@@ -94,7 +94,7 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[DoctorFi
 
 
 def _check_kind(kind: MapKind, config: CompanionConfig) -> list[DoctorFinding]:
-    """What accuracy the map allows; a map without buildings is flown, with attitude and care."""
+    """Advice on the accuracy that the map allows; one without buildings needs care."""
     why = kind.advice(config.camera.model.camera().horizontal_fov_deg / 2)
     limit = config.map_max_age_days
     age, recent = kind.imagery_age(datetime.now(timezone.utc).date(), limit)
@@ -120,7 +120,7 @@ def _extent_km(extent: Iterable[tuple[float, float]], frame: LocalFrame) -> floa
 
 
 def _check_localizer(config: CompanionConfig, has_map: bool) -> DoctorFinding:
-    """Make the localizer as a flight does, with its model, renderer and device."""
+    """Build the localizer as a flight does, with its model, renderer and device."""
     needed = "a feature network"
     try:
         model = config.localizer.model
@@ -132,7 +132,7 @@ def _check_localizer(config: CompanionConfig, has_map: bool) -> DoctorFinding:
 
 
 def _check_detector(config: CompanionConfig) -> list[DoctorFinding]:
-    """The detection network, which a flight would not start with; nothing where none is named."""
+    """Load the detection network, which a flight needs to start; [] without one."""
     if config.targets.detector is None:
         return []
     needed = "a detection network"

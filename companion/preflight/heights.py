@@ -51,7 +51,7 @@ def _geoid(cache: TileCache, receiver_m: float) -> DoctorFinding:
 
 
 def _ground(cache: TileCache, latitude_deg: float, longitude_deg: float) -> float | None:
-    """AMSL of the map's surface at a place, metres; None beside the map."""
+    """AMSL height of the map's surface at a position, metres; None outside the map."""
     top = cache.manifest.height_range_m[1] + _ABOVE_M
     place = latitude_deg, longitude_deg
     above = np.asarray(cache.frame.enu_from_geodetic(*place, top))

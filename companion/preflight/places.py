@@ -41,7 +41,7 @@ def check_places(config: CompanionConfig) -> list[DoctorFinding]:
 
 
 def _no_file(key: str, path: Path) -> str:
-    """Why the file cannot be made or written, "" if it can."""
+    """Why the file cannot be created or written; "" if it can."""
     try:
         if path.is_dir():
             return f"{key} {path}: a folder, not a file"
@@ -51,7 +51,7 @@ def _no_file(key: str, path: Path) -> str:
 
 
 def _unwritable(key: str, folder: Path) -> str:
-    """Why the folder, or the nearest above it that there is, cannot be written; "" if it can."""
+    """Why the folder, or its nearest existing parent, cannot be written; "" if it can."""
     try:
         place = folder
         while not place.exists() and place != place.parent:

@@ -70,8 +70,8 @@ def self_test(
     """
     config = config or LocalizerConfig()
     say("building a map")
-    cache = made_map(folder)
-    pose, frame = made_view(cache, config)
+    cache = generate_map(folder)
+    pose, frame = render_view(cache, config)
     say("compiling and tracking")
     tracked = _track(folder / "map", pose, frame, config)
     say("searching without a prior")
@@ -90,8 +90,8 @@ def self_test(
     return report
 
 
-def made_map(folder: Path) -> TileCache:
-    """Ground that is alike nowhere, from a DSM and an orthophoto as a user brings them."""
+def generate_map(folder: Path) -> TileCache:
+    """Build a map without repetition, from a DSM and an orthophoto as a user brings them."""
     n = round(_SIDE_M / _CELL_M)
     rng = np.random.default_rng(0)
     colours = [_blotches(rng, n, px) for px in (3, 8, 20, 60)]
@@ -106,7 +106,7 @@ def made_map(folder: Path) -> TileCache:
 
 
 def _blotches(rng: np.random.Generator, n: int, size_px: int) -> np.ndarray:
-    """Blotches (n, n, 3) of about so many pixels, gray levels about 0."""
+    """Random blotches (n, n, 3) of about size_px pixels, gray levels about 0."""
     coarse = rng.normal(0.0, 40.0, (n // size_px + 2, n // size_px + 2, 3))
     return np.asarray(cv2.resize(coarse, (n, n), interpolation=cv2.INTER_CUBIC))
 
@@ -120,8 +120,8 @@ def _write(path: Path, raster: np.ndarray, **profile: float) -> None:
         file.write(np.moveaxis(raster, -1, 0))
 
 
-def made_view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
-    """The map seen from its middle, 100 m above ground."""
+def render_view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
+    """Pose and frame of a view from 100 m above the map's middle."""
     camera = Camera.from_fov(config.width, config.width * 3 // 4, 60.0)
     middle = cache.frame.position((0.0, 0.0, 0.0))  # a source's centre is its origin
     pose = inspect.camera_pose(
@@ -134,8 +134,8 @@ def made_view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
 def _track(
     path: Path, pose: Pose, frame: Frame, config: LocalizerConfig
 ) -> tuple[float, float, float, str]:
-    """Worst error in metres, processor milliseconds a frame, seconds until the first was done, and
-    what computes the features.
+    """Worst error (m), processor time per frame (ms), time to the first result (s), and what
+    computes the features.
     """
     began = time.perf_counter()
     off = Pose(pose.rotation, pose.translation + np.array([_OFF_M, -_OFF_M, 0.0]))

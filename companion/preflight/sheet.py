@@ -115,7 +115,7 @@ def _map(config: CompanionConfig, today: date) -> tuple[SheetRow, ...]:
 
 
 def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:
-    """The newest record's score; from beside the record's folder, as `run` numbers them."""
+    """Row with the shadow score of the newest record beside the record's folder."""
     folder = config.record.folder if config.record is not None else None
     if folder is None:
         return SheetRow("shadow score", "no record is kept, so none is known", False)
@@ -138,7 +138,7 @@ def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:
 
 
 def _forecast(plan: Path | None, flown: Path) -> SheetRow:
-    """flown: the deployment's map, which must be the one that the forecast was made over."""
+    """Row of the forecast, which must be for the map `flown`, the deployment's."""
     if plan is None:
         return SheetRow(
             "forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False

@@ -1,7 +1,7 @@
 """Reads logs beside video or photos: ArduPilot's .bin (dataflash), MAVLink's .tlog and PX4's .ulg.
 
-They give position by the EKF, attitude of the body, and the camera's direction, by the gimbal if
-one reports, otherwise of a camera fixed to the body.
+A log gives the EKF's position, the body's attitude, and the camera's direction: by the gimbal if
+one reports, otherwise as of a camera fixed to the body.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class _LogRows:
 
     @cached_property
     def gimbal_times(self) -> np.ndarray:
-        """(G,) int64, once all are read."""
+        """(G,) int64, UTC ns of the gimbal rows; call it after all are read."""
         return np.array([g[0] for g in self.gimbals], dtype=np.int64)
 
 
@@ -109,7 +109,7 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
         notes.append(f"{path.name}: {raw.refused} rows say no place or no rotation: not used")
     track = Track(samples)
     exposures = tuple(_exposures(raw, track, fixed_pitch_deg))
-    stamps = [time_ns for time_ns, _ in _of_first_camera(raw)]
+    stamps = [time_ns for time_ns, _ in _exposures_of_first_camera(raw)]
     if len(exposures) > 1 and (len(set(stamps)) == 1 or stamps != sorted(stamps)):
         notes.append(
             f"{path.name}: the times of its exposures (CAM, TRIG) stand still or run back: not used"
@@ -118,15 +118,15 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
     return LogTrack(track, exposures, bool(raw.gimbals), tuple(notes))
 
 
-def _of_first_camera(raw: _LogRows) -> list[tuple[int, Any]]:
-    """In the log's order; what was asked for counts only where no exposure is logged."""
+def _exposures_of_first_camera(raw: _LogRows) -> list[tuple[int, Any]]:
+    """The first camera's exposures, in the log's order; requests (TRIG) only if none is logged."""
     kinds = [(m.flags == mavlink.CAMERA_FEEDBACK_OPENLOOP, m.cam_idx) for _, m in raw.feedback]
     return [row for row, kind in zip(raw.feedback, kinds, strict=True) if kind == min(kinds)]
 
 
 def _exposures(raw: _LogRows, track: Track, fixed_pitch_deg: float) -> Iterator[Telemetry]:
-    """Of the first camera. Two links to the ground bring each message twice."""
-    rows = _of_first_camera(raw)
+    """Camera poses at the exposures, without repeats: two links log each message twice."""
+    rows = _exposures_of_first_camera(raw)
     told = {(m.time_usec, m.img_idx): (time_ns, m) for time_ns, m in reversed(rows)}
     for time_ns, m in sorted(told.values(), key=lambda one: one[0]):
         said = track.at(time_ns) or Telemetry()
@@ -162,7 +162,7 @@ def _samples(raw: _LogRows, fixed_pitch_deg: float) -> Iterator[Telemetry]:
 def _view(
     raw: _LogRows, time_ns: int, body_rad: Sequence[float], fixed_pitch_deg: float
 ) -> RecordedView | None:
-    """By the body's roll, pitch and yaw; None while the log's gimbal says nothing."""
+    """Camera direction; None while the log's gimbal is silent. body_rad: roll, pitch, yaw."""
     gimbal, tilt = _gimbal(raw, time_ns), _TILT_DEG
     if gimbal is None and raw.gimbals:
         return None
@@ -190,9 +190,9 @@ def _position(
 
 
 def vehicle_messages(path: Path) -> Iterator[Dated]:
-    """Yield every MAVLink message of a log in order; for .bin and .ulg they are made from its rows.
+    """Yield every MAVLink message of a log in order, dated; made from the rows of .bin and .ulg.
 
-    `FootageError` where it is no log that can be read.
+    `FootageError` if it is no log that can be read.
     """
     readers: dict[str, Callable[[Path], Iterator[Dated]]] = {
         ".tlog": read_tlog, ".ulg": ulog_messages

@@ -49,12 +49,12 @@ def camera_of_tags(tags: PhotoTags) -> CameraGuess:
 
 
 def camera_given(camera: Camera, source: str) -> CameraGuess:
-    """A camera model that the user gives."""
+    """A camera model that the user gives. source: its origin, for the report."""
     return CameraGuess(camera, _GIVEN, source)
 
 
 def camera_of_file(path: Path) -> CameraGuess:
-    """Read a camera model from a file. A distortion that folds the image corners, and otherwise is
+    """Read a camera model from a file. A distortion that folds the image corners, and is otherwise
     smaller than the focal length's sigma, is dropped as overfitted.
     """
     try:
@@ -73,8 +73,8 @@ def camera_of_file(path: Path) -> CameraGuess:
 
 
 def equivalent_camera(width: int, height: int, focal_35mm: float, *, small: bool) -> Camera:
-    """Pinhole camera of a 35 mm equivalent focal length (mm). small: a 4:3 sensor, whose full width
-    a wider image shows.
+    """Pinhole camera of a 35 mm equivalent focal length (mm). small: the sensor has 4:3; a wider
+    image shows its full width.
     """
     aspect = min(width / height, _NATIVE_ASPECT) if small else width / height
     diagonal = math.hypot(width, width / aspect)
@@ -115,7 +115,7 @@ def _calibrated(tags: PhotoTags) -> CameraGuess | None:
 
 
 def _perspective(tags: PhotoTags) -> CameraGuess | None:
-    """Pix4D's ``Camera:`` tags of Parrot, Autel and senseFly, millimetres on the sensor."""
+    """Camera of Pix4D's ``Camera:`` tags (Parrot, Autel, senseFly), millimetres on the sensor."""
     focal_mm = tags.number("PerspectiveFocalLength")
     resolution = tags.exif_number("FocalPlaneXResolution")
     unit_mm = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(tags.exif_number("FocalPlaneResolutionUnit") or 0))
@@ -159,7 +159,7 @@ def _equivalent(tags: PhotoTags) -> CameraGuess | None:
 
 
 def _taken_size(tags: PhotoTags) -> tuple[int, int]:
-    """Size at which the photo was taken: what tags in pixels refer to, if it was shrunk since."""
+    """Size at which the photo was taken, before it was shrunk: tags in pixels refer to it."""
     width = tags.exif_number("ExifImageWidth")
     height = tags.exif_number("ExifImageHeight")
     if width is None or height is None:

@@ -39,9 +39,9 @@ _TAG_NS = 600_000_000  # EXIF's times may be whole seconds
 @dataclass(frozen=True)
 class ClockOffset:
     """Offset of an autopilot log's clock from the images'. offset_s: to add to the images' times.
-    residual_deg: of the features at this offset; second_deg: at the next best offset, infinite
-    without one; pairs: number of image pairs used; chance: probability that another flight's log
-    reaches so low a residual.
+    residual_deg: median of the features at this offset; second_deg: at the next best offset,
+    infinite without one; pairs: number of image pairs used; chance: probability that another
+    flight's log reaches so low a residual.
     """
 
     offset_s: float
@@ -59,7 +59,7 @@ class ClockOffset:
 
     @property
     def text(self) -> str:
-        """The values as text."""
+        """The values as text for the user."""
         offset = f"{self.offset_s:+.2f} s"
         if abs(self.offset_s) > 86_400.0:  # a video's clock begins at 0
             begin = datetime.fromtimestamp(self.offset_s, timezone.utc)
@@ -84,7 +84,7 @@ class _Pair:
 def find_offset(
     frames: Sequence[RecordedFrame], camera: Camera, track: Track, reach_s: tuple[float, float]
 ) -> ClockOffset | None:
-    """Estimate the offset within reach_s (least, greatest); None with too few images."""
+    """Estimate the offset within reach_s (least, greatest), s; None with too few images."""
     pairs = _pairs(frames, camera)
     if len(pairs) < 2:
         return None
@@ -101,14 +101,14 @@ def find_offset(
     fine = coarse[best] + np.arange(-_COARSE_S, _COARSE_S + _FINE_S / 2, _FINE_S)
     close = np.array([_score(_residuals(pairs, track, frame, float(o))) for o in fine])
     k = int(np.nanargmin(close))
-    outside = _outside(scores, best)
+    outside = _outside_valley(scores, best)
     second = float(np.nanmin(scores[outside], initial=np.inf))
     found = float(fine[k]), float(np.degrees(close[k])), float(np.degrees(second))
     return ClockOffset(*found, len(pairs), _chance(residuals, outside, float(close[k])))
 
 
-def _outside(scores: Array, best: int) -> np.ndarray:
-    """Mask of the offsets that are not of the best one's valley: it ends where the score has come
+def _outside_valley(scores: Array, best: int) -> np.ndarray:
+    """Mask of the offsets outside the best one's valley, which ends where the score has come
     halfway up to the typical one.
     """
     rim = 0.5 * (float(scores[best]) + float(np.nanmedian(scores)))
@@ -190,8 +190,8 @@ def _features(
 
 
 def _residuals(pairs: Sequence[_Pair], track: Track, frame: LocalFrame, offset_s: float) -> Array:
-    """(P,) of each pair the median angle (rad) between features and where the log has them; NaN
-    outside the log.
+    """(P,) for each pair the median angle (rad) between its features and where the log predicts
+    them; NaN outside the log.
     """
     shift = round(1e9 * offset_s)
     found = np.full(len(pairs), np.nan)
@@ -213,14 +213,14 @@ def _residuals(pairs: Sequence[_Pair], track: Track, frame: LocalFrame, offset_s
 
 
 def _score(residuals: Array) -> float:
-    """Of one offset; NaN where less than half of the pairs lie in the log."""
+    """Score of one offset; NaN if less than half of the pairs lie in the log."""
     known = residuals[np.isfinite(residuals)]
     is_enough = len(known) >= max(2, len(residuals) // 2)
     return float(np.median(known)) if is_enough else float("nan")
 
 
 def _camera(sample: Telemetry | None, frame: LocalFrame) -> tuple[Array, Array, float] | None:
-    """Attitude (3, 3), place (3,) in NED and height above the take-off, m."""
+    """Attitude (3, 3) to NED, position (3,) in NED and height above the take-off, m; or None."""
     if sample is None or sample.position is None or sample.view is None:
         return None
     height = next((h.value_m for h in sample.position.heights if h.datum is Datum.TAKEOFF), None)
@@ -234,9 +234,9 @@ def _camera(sample: Telemetry | None, frame: LocalFrame) -> tuple[Array, Array, 
 def exposures_of(
     times_ns: Sequence[int | None], exposures: Sequence[Telemetry]
 ) -> tuple[Telemetry, ...] | None:
-    """Assign an exposure of a log to each image: by their intervals, if exactly one clock offset
-    fits all images; for images without times by their order, if the numbers are equal. Otherwise
-    None.
+    """Assign one of the log's exposures to each image: by their intervals, if exactly one clock
+    offset fits all images; for images without times by their order, if the numbers are equal.
+    Otherwise None.
     """
     if all(t is None for t in times_ns):
         return tuple(exposures) if len(times_ns) == len(exposures) else None
@@ -255,7 +255,7 @@ def exposures_of(
 
 
 def _fit(times: np.ndarray, at: np.ndarray) -> tuple[int, ...] | None:
-    """The exposure next to each image; None where an image has none of its own in its interval."""
+    """Index of the exposure next to each image; None unless each image has one of its own."""
     after = np.clip(np.searchsorted(at, times), 1, max(len(at) - 1, 1))
     near = np.where(times - at[after - 1] < at[after] - times, after - 1, after)
     off = (at[near] - times).astype(np.float64)

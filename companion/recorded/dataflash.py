@@ -35,8 +35,8 @@ _KINDS = {"ArduCopter": 2, "ArduPlane": 1, "ArduRover": 10, "ArduSub": 12}  # MA
 
 
 def dataflash_messages(path: Path) -> Iterator[Dated]:
-    """Yield the messages of a .bin or .log. `FootageError` for another file; other errors are those
-    of pymavlink's reader.
+    """Yield the messages of a .bin or .log with their times. `FootageError` for another file; other
+    errors are those of pymavlink's reader.
     """
     is_text = path.suffix.lower() == ".log"
     with path.open("rb") as file:
@@ -64,7 +64,7 @@ def dataflash_messages(path: Path) -> Iterator[Dated]:
 
 @dataclass
 class _Dataflash:
-    """What rows say that other rows' messages need.
+    """Converts rows to messages; keeps values of rows that other rows' messages need.
 
     Above 15 public methods: one of a few lines for each kind of row.
     """
@@ -152,14 +152,14 @@ class _Dataflash:
         return origin_message((m.Lat, m.Lng), m.Alt)
 
     def mount_row(self, m: Any, ms: int) -> Any:
-        """MNT's angles, degrees; YawE is against north, Yaw or YawB against the heading."""
+        """Gimbal angles of MNT, degrees; YawE is against north, Yaw or YawB against the heading."""
         earth = getattr(m, "YawE", math.nan)
         yaw = getattr(m, "YawB", getattr(m, "Yaw", 0.0)) if math.isnan(earth) else earth
         angles = (getattr(m, "Roll", 0.0), getattr(m, "Pitch", 0.0), yaw)
         return gimbal_message(ms, angles, earth=not math.isnan(earth))
 
     def camera_row(self, m: Any, _: int) -> Any:
-        """CAM says an exposure, TRIG that one was asked for."""
+        """CAMERA_FEEDBACK of a CAM row (an exposure) or TRIG row (one was requested)."""
         flag = (
             mavlink.CAMERA_FEEDBACK_OPENLOOP
             if m.get_type() == "TRIG"

@@ -17,7 +17,7 @@ import numpy as np
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
-from companion.sources.zoom import longer
+from companion.sources.zoom import with_focal_factor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler, so3_exp, so3_log
 from localizer.types import Frame
@@ -77,7 +77,7 @@ class RecordedView:
         *,
         measured: bool = True,
     ) -> RecordedView:
-        """From a gimbal's angles relative to north and the horizon."""
+        """From a gimbal's angles relative to north and the horizon; see the module."""
         angles = (float(a) for a in np.radians([roll_deg, pitch_deg, yaw_deg]))
         attitude = np.asarray(matrix_from_euler(*angles) @ GIMBAL_FROM_CAMERA)
         return cls(attitude, tilt_sigma_deg, heading_sigma_deg, measured)
@@ -124,7 +124,7 @@ class RecordedFrame:
         """
         image = read_image(self.path)
         camera = fitted_camera(image.shape[1], image.shape[0], camera, self.name)
-        return Frame(image, time_ns, longer(camera, self.telemetry.zoom), sequence)
+        return Frame(image, time_ns, with_focal_factor(camera, self.telemetry.zoom), sequence)
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class RecordedFlight:
 
     @property
     def located(self) -> int:
-        """Number of frames with a position."""
+        """Number of frames with a recorded position."""
         return sum(frame.telemetry.position is not None for frame in self.frames)
 
 
@@ -184,7 +184,7 @@ class Track:
         return self._times
 
     def at(self, time_ns: int) -> Telemetry | None:
-        """Telemetry at a time; None outside the record and in gaps."""
+        """Telemetry at a time (ns), interpolated; None outside the record and in gaps."""
         if not len(self._times):
             return None
         after = int(np.searchsorted(self._times, time_ns))

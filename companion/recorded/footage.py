@@ -98,7 +98,7 @@ def read_footage(
 
 
 def _check_files(options: FootageOptions) -> None:
-    """Whether each file that is given is one, and of its kind."""
+    """`FootageError` if a file that is given is none, or not of its kind."""
     given = {"--places": options.places, "--log": options.log, "--camera": options.camera}
     for option, file in given.items():
         if file is not None and not file.is_file():
@@ -154,7 +154,7 @@ def _read_photos(
     folder: Path, photos: Sequence[Path], options: FootageOptions, progress: Progress
 ) -> RecordedFlight:
     notes: list[str] = []
-    photos = _once(photos, notes)
+    photos = _without_duplicates(photos, notes)
     chosen = _spread(photos, options.frames)
     if len(chosen) < len(photos):
         notes.append(f"{len(chosen)} of {len(photos)} photos are used (--frames)")
@@ -169,7 +169,7 @@ def _read_photos(
         raise damaged[0]
     if damaged:
         notes.append(f"{len(damaged)} photos are left out, the first: {damaged[0]}")
-    tags = _of_one_camera(tags, notes)
+    tags = _photos_of_main_camera(tags, notes)
     if tags[0].was_turned:
         raise FootageError(
             f"{tags[0].path}: another program turned its pixels, and its angles are of the image "
@@ -195,8 +195,8 @@ def _read_photos(
     return _flight(folder, "photos", frames, camera, notes, beside)
 
 
-def _once(photos: Sequence[Path], notes: list[str]) -> list[Path]:
-    """Each photograph once: the same file again is no second piece of evidence."""
+def _without_duplicates(photos: Sequence[Path], notes: list[str]) -> list[Path]:
+    """Each photograph once: the same file again is no further evidence. Adds a note."""
     sizes = Counter(photo.stat().st_size for photo in photos)
     first: dict[object, Path] = {}
     for photo in photos:
@@ -224,8 +224,8 @@ def _spread(items: Sequence[_T], most: int) -> list[_T]:
     return [items[int(k)] for k in picked]
 
 
-def _of_one_camera(tags: Sequence[PhotoTags], notes: list[str]) -> list[PhotoTags]:
-    """The photos of the camera that took most of them: lenses of one drone differ."""
+def _photos_of_main_camera(tags: Sequence[PhotoTags], notes: list[str]) -> list[PhotoTags]:
+    """Photos of the camera that took most; lenses of one drone differ. Adds a note."""
     sizes = Counter((t.model, t.width, t.height) for t in tags)
     (model, width, height), count = sizes.most_common(1)[0]
     if count < len(tags):
@@ -258,7 +258,7 @@ def _photo_camera(folder: Path, tags: Sequence[PhotoTags], options: FootageOptio
 def _given_camera(
     folder: Path, width: int, height: int, options: FootageOptions
 ) -> CameraGuess | None:
-    """By --camera, --fov or a camera.json beside the footage."""
+    """Camera by --camera, --fov or a camera.json beside the footage; None without."""
     if options.fov_deg is not None:
         camera = Camera.from_fov(width, height, options.fov_deg)
         return CameraGuess(camera, _FOV_FOCAL_PERCENT, "--fov")
@@ -302,7 +302,7 @@ def _places_file(
 def _with_places(
     frames: Sequence[RecordedFrame], file: Path | None, notes: list[str]
 ) -> list[RecordedFrame]:
-    """What the file says takes precedence over the tags."""
+    """Frames with the positions of the file, which take precedence over the tags."""
     if file is None:
         return list(frames)
     places = read_places(file)
@@ -340,7 +340,7 @@ def _with_log(
     frames: Sequence[RecordedFrame], camera: Camera, file: Path, options: FootageOptions,
     notes: list[str], *, utc: bool,
 ) -> tuple[list[RecordedFrame], LogBeside]:  # fmt: skip
-    """Telemetry from the log, at the images' times plus the clocks' offset."""
+    """Frames with telemetry of the log, by the clocks' offset. utc: the images' clock is UTC."""
     log = read_autopilot_log(file, options.fixed_pitch_deg)
     notes.extend(log.notes)
     is_dated = all(f.time_ns is not None for f in frames)
@@ -393,7 +393,7 @@ def _with_log(
 
 
 def _apart_m(a: RecordedPosition, b: RecordedPosition) -> float:
-    """Distance of two places at one height."""
+    """Horizontal distance of two positions, m."""
     ecef = [ecef_from_geodetic(p.latitude_deg, p.longitude_deg, 0.0) for p in (a, b)]
     return float(np.linalg.norm(ecef[0] - ecef[1]))
 
@@ -401,7 +401,7 @@ def _apart_m(a: RecordedPosition, b: RecordedPosition) -> float:
 def _reach_s(
     frames: Sequence[RecordedFrame], log: LogTrack, file: Path, *, utc: bool
 ) -> tuple[float, float]:
-    """Offsets, s, that are looked for. `FootageError` for a log of another time."""
+    """Clock offsets to search (least, greatest), s. `FootageError` for a log of another time."""
     times = [f.time_ns for f in frames if f.time_ns is not None]
     begin, end = int(log.track.times_ns[0]), int(log.track.times_ns[-1])
     if utc and times[0] <= end and times[-1] >= begin:
@@ -440,7 +440,7 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
     notes: list[str] = []
     facts = video_facts(path)
     duration_ns = round(1e9 * max(facts.duration_s, 1e-3))
-    log = options.log or _beside(path, LOG_SUFFIXES)
+    log = options.log or _file_beside(path, LOG_SUFFIXES)
     times = _times(duration_ns, options.frames, in_pairs=log is not None)
     extracted = extract_frames(path, options.work / "frames", times, progress)
     if facts.assumed:
@@ -452,7 +452,7 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
         )
     subtitles = _subtitles(path)
     if subtitles is not None:
-        notes += _doubts(subtitles, facts)
+        notes += _mismatches(subtitles, facts)
     track, focal_35mm, klv_fov = _video_track(path, subtitles, notes)
     width, height = extracted[0].width, extracted[0].height
     camera = _video_camera(path, width, height, options, focal_35mm, klv_fov)
@@ -480,8 +480,8 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
 
 
 def _times(duration_ns: int, frames: int, *, in_pairs: bool) -> list[int]:
-    """When frames are taken. in_pairs: motion between two of them is to be seen, which lie far
-    apart in a long video: then every second one follows the one before closely.
+    """Times (ns) at which frames are taken. in_pairs: every second frame follows the one before
+    closely, so that the motion between them can be seen in a long video.
     """
     step_ns = max(duration_ns // frames, _LEAST_STEP_NS)
     times = list(range(0, duration_ns, step_ns))
@@ -490,18 +490,18 @@ def _times(duration_ns: int, frames: int, *, in_pairs: bool) -> list[int]:
     return [t + late for t in times[::2] for late in (0, _PAIR_NS) if t + late < duration_ns]
 
 
-def _beside(path: Path, suffixes: frozenset[str]) -> Path | None:
-    """A file of the same name with another ending, in any letter case."""
+def _file_beside(path: Path, suffixes: frozenset[str]) -> Path | None:
+    """File of the same name with another ending, in any letter case; None without."""
     return next((f for f in files_of(path.parent, suffixes) if f.stem == path.stem), None)
 
 
 def _subtitles(path: Path) -> Subtitles | None:
-    file = _beside(path, frozenset({".srt"}))
+    file = _file_beside(path, frozenset({".srt"}))
     return read_subtitles(file) if file is not None else None
 
 
-def _doubts(subtitles: Subtitles, facts: VideoFacts) -> list[str]:
-    """Whether they are of this video, and of all of it."""
+def _mismatches(subtitles: Subtitles, facts: VideoFacts) -> list[str]:
+    """Notes if the subtitles seem to be of another video, or of a part of it."""
     doubts = []
     if subtitles.day and facts.day and abs((subtitles.day - facts.day).days) > 1:
         doubts.append(
@@ -519,7 +519,7 @@ def _doubts(subtitles: Subtitles, facts: VideoFacts) -> list[str]:
 def _video_track(
     path: Path, subtitles: Subtitles | None, notes: list[str]
 ) -> tuple[Track | None, float | None, float | None]:
-    """Telemetry on the video's time, 35 mm equivalent, field of view."""
+    """Telemetry on the video's time, 35 mm equivalent, field of view (degrees); None: unknown."""
     if subtitles is not None:
         notes.append(f"telemetry is read from the subtitles: {len(subtitles.samples)} samples")
         return Track(subtitles.samples, 5.0), subtitles.focal_35mm, None

@@ -84,14 +84,14 @@ def read_klv(path: Path) -> KlvTrack:
 
 
 def decode(packet: bytes) -> Fields:
-    """Decode a packet of either standard to ST 0601 tags; ValueError for others."""
+    """Decode a packet of either standard to ST 0601 tags; ValueError for other packets."""
     if packet.startswith(universal_set.UNIVERSAL_SET_LABEL):
         return universal_set.decode_universal(packet)
     return tag.decode(packet)
 
 
 def telemetry(fields: Fields, time_ns: int) -> Telemetry:
-    """Position and camera direction of the fields."""
+    """Position and camera direction of a packet's fields, at time_ns."""
 
     def number(name: int) -> float | None:
         value = fields.get(name)
@@ -127,7 +127,9 @@ def _first(*values: float | None) -> float | None:
 
 
 def _view(platform: list[float | None], sensor: list[float | None]) -> RecordedView | None:
-    """From the platform's heading, pitch, roll and the sensor's azimuth, elevation, roll on it."""
+    """Direction by the platform's heading, pitch, roll and the sensor's azimuth,
+    elevation, roll.
+    """
     if sensor[2] is None:
         sensor = [*sensor[:2], 0.0]
     told = [math.radians(a) for a in (*platform, *sensor) if a is not None]
@@ -142,8 +144,8 @@ def _view(platform: list[float | None], sensor: list[float | None]) -> RecordedV
 def _universal_view(
     north: float | None, obliquity: float | None, roll: float | None
 ) -> RecordedView | None:
-    """EG 0104's angles are against north and the horizon. Obliquity is written as a negative
-    elevation, or with 180 ahead and 270 down.
+    """Camera direction by EG 0104's angles, which are against north and the horizon. Obliquity is
+    written as a negative elevation, or with 180 ahead and 270 down.
     """
     if north is None or obliquity is None:
         return None

@@ -16,7 +16,7 @@ Dated = tuple[int, Any]
 
 
 def autopilot(time_ns: int, message: Any) -> Iterator[Dated]:
-    """Yield the message as sent by the autopilot 1/1; nothing if its values do not fit."""
+    """Yield the message as of the autopilot 1/1 at time_ns; nothing if its values do not fit."""
     try:
         message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
     except (struct.error, OverflowError, ValueError):
@@ -25,7 +25,7 @@ def autopilot(time_ns: int, message: Any) -> Iterator[Dated]:
 
 
 def position_message(ms: int, at_deg: tuple[float, float], amsl_m: float, above_m: float) -> Any:
-    """GLOBAL_POSITION_INT. above_m: height above take-off."""
+    """GLOBAL_POSITION_INT. at_deg: latitude, longitude; above_m: height above take-off."""
     latitude, longitude = (round(x * 1e7) for x in at_deg)
     return mavlink.MAVLink_global_position_int_message(
         ms, latitude, longitude, round(amsl_m * 1e3), round(above_m * 1e3), 0, 0, 0, 65535
@@ -62,7 +62,7 @@ def range_message(ms: int, metres: float, orientation: int) -> Any:
 
 
 def origin_message(at_deg: tuple[float, float], amsl_m: float) -> Any:
-    """GPS_GLOBAL_ORIGIN."""
+    """GPS_GLOBAL_ORIGIN. at_deg: latitude, longitude."""
     latitude, longitude = (round(x * 1e7) for x in at_deg)
     return mavlink.MAVLink_gps_global_origin_message(latitude, longitude, round(amsl_m * 1e3))
 

@@ -56,16 +56,16 @@ class PhotoTags:
 
     @property
     def maker(self) -> str:
-        """Camera maker in lower case; empty if unknown."""
+        """Camera maker in lower case; "" if unknown."""
         return str(self.exif.get("Make") or self.xmp.get("Make") or "").strip("\x00 ").lower()
 
     @property
     def model(self) -> str:
-        """Camera model; empty if unknown."""
+        """Camera model; "" if unknown."""
         return str(self.exif.get("Model") or self.xmp.get("Model") or "").strip("\x00 ")
 
     def number(self, *names: str) -> float | None:
-        """First of these XMP tags that is a finite number or a fraction such as 35/10."""
+        """First of these XMP tags that is a finite number or a fraction such as 35/10; or None."""
         for name in names:
             value = _number(self.xmp.get(name))
             if value is not None:
@@ -99,11 +99,11 @@ class PhotoTags:
         return (width > height) != (self.width > self.height)
 
     def telemetry(self) -> Telemetry:
-        """Position and direction, as far as the tags have them."""
+        """Position and direction, as far as the tags contain them."""
         return Telemetry(self.time_ns, self._position(), self.view(), self._course())
 
     def view(self) -> RecordedView | None:
-        """The measured camera direction, by the first maker's convention that fits."""
+        """The measured camera direction, by the first maker's convention that fits; or None."""
         for names, convert in _VIEWS:
             angles = [self.number(name) for name in names]
             values = [a for a in angles if a is not None]
@@ -145,7 +145,7 @@ class PhotoTags:
         return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
 
     def _sigma(self, name: str) -> float | None:
-        """A standard deviation in metres; None if it is missing or cannot be one."""
+        """A standard deviation in metres; None if the tag is missing or its value impossible."""
         value = self.number(name)
         return value if value is not None and 0.0 < value <= _LARGEST_SIGMA_M else None
 
@@ -166,7 +166,7 @@ class PhotoTags:
 
     @property
     def altitude(self) -> Height | None:
-        """The absolute height; AltitudeType, else the RTK fix, says what it is above."""
+        """The absolute height; AltitudeType, else the RTK fix, gives its datum. Or None."""
         value = self.number("AbsoluteAltitude")
         if value is None:
             value = self._exif_altitude
@@ -193,7 +193,7 @@ def _same(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
 
 
 def _from_nadir(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
-    """Pix4D's ``Camera:`` tags: pitch 0 looks down, 90 ahead (Autel, Parrot, Sentera)."""
+    """Gimbal angles of Pix4D's ``Camera:`` tags, whose pitch is 0 down, 90 ahead."""
     return roll, pitch - 90.0, yaw
 
 

@@ -69,7 +69,7 @@ def read_places(path: Path) -> dict[str, Telemetry]:
 
 
 def _rows(lines: list[str]) -> Iterator[tuple[int, list[str]]]:
-    """Fields of the lines that hold some: by comma, semicolon, tab or blanks."""
+    """(line number, fields) of lines that are not empty: by comma, semicolon, tab or blanks."""
     kept = [
         (number, line)
         for number, line in enumerate(lines, 1)
@@ -83,7 +83,7 @@ def _rows(lines: list[str]) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(first: list[str]) -> dict[str, int] | None:
-    """Which column holds what, if the first row is a header."""
+    """Index of each known column, if the first row is a header; otherwise None."""
     if len(first) > 1 and _number(first[1]) is not None:
         return None
     plain = [re.sub(r"[^a-z]", "", name.lower()) for name in first]

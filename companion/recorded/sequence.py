@@ -20,7 +20,7 @@ from companion.recorded.flight import (
     RecordedView,
     Telemetry,
 )
-from companion.sources.folder_source import TIMESTAMPS_NAME, written_times
+from companion.sources.folder_source import TIMESTAMPS_NAME, exposure_times_of
 from localizer.errors import SequenceError
 from localizer.evaluation.sequences import Sequence
 from localizer.geometry.camera import Camera
@@ -55,7 +55,7 @@ def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
             f"{images}: {len(missing)} of {len(rows)} images named in {poses.name} are missing, "
             f"first {missing[0]}"
         )
-    times = written_times(images, [images / row.name for row in rows])
+    times = exposure_times_of(images, [images / row.name for row in rows])
     if times is not None and any(b <= a for a, b in itertools.pairwise(times)):
         raise SequenceError(f"{images / TIMESTAMPS_NAME}: exposure times must increase")
     frames = tuple(
@@ -67,7 +67,7 @@ def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
 
 
 def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Sequence:
-    """The flight as a `Sequence` with the recorded poses as truth, else `SequenceError`."""
+    """As a `Sequence` with recorded poses as truth in this frame; `SequenceError` without them."""
     truth = [_pose(one.telemetry, frame, geoid_m) for one in flight.frames]
     whole = tuple(pose for pose in truth if pose is not None)
     if len(whole) < len(truth) or not whole:

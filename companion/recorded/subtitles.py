@@ -73,7 +73,9 @@ def read_subtitles(path: Path) -> Subtitles:
             f"{path}: {len(cues)} subtitles, none with a position: subtitles without telemetry, or "
             "of a kind that is not known"
         )
-    return Subtitles(tuple(_once(samples)), focal, _day(text), (samples[-1].time_ns or 0) / 1e9)
+    return Subtitles(
+        tuple(_without_repeats(samples)), focal, _day(text), (samples[-1].time_ns or 0) / 1e9
+    )
 
 
 def _day(text: str) -> date | None:
@@ -143,15 +145,15 @@ def _above_takeoff(value: float) -> Height:
 
 
 def _focal(pairs: dict[str, float]) -> float | None:
-    """35 mm equivalent; older firmwares write ten times as much."""
+    """35 mm equivalent focal length, mm; older firmwares write ten times as much."""
     focal = pairs.get("focal_len")
     if focal is None or focal <= 0.0:
         return None
     return focal / 10.0 if focal >= 150.0 else focal
 
 
-def _once(samples: list[Telemetry]) -> list[Telemetry]:
-    """Without repeats: subtitles come thirty a second, their positions one to ten."""
+def _without_repeats(samples: list[Telemetry]) -> list[Telemetry]:
+    """Samples without repeated positions: thirty subtitles a second hold one to ten positions."""
     kept: list[Telemetry] = []
     for sample in samples:
         same = kept and sample.position == kept[-1].position and _same_view(sample, kept[-1])

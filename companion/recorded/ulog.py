@@ -54,7 +54,7 @@ def ulog_messages(path: Path) -> Iterator[Dated]:
 
 
 def _subsampled(times_us: np.ndarray) -> np.ndarray:
-    """Which samples are used, about one each `_LONGEST_STEP_US`."""
+    """Indices of the samples used, about one each `_LONGEST_STEP_US`."""
     slot = np.asarray(times_us, np.int64) // _LONGEST_STEP_US
     return np.flatnonzero(np.diff(slot, prepend=-1) != 0)
 

@@ -91,7 +91,7 @@ def _assumed(path: Path, stream: av.VideoStream) -> str:
 
 
 def _length_s(path: Path) -> float:
-    """Of a file that does not say it, by its packets."""
+    """Duration by the packets, s, of a file that does not state it."""
     with av.open(str(path)) as container:
         stream = video_stream(container, str(path))
         stamps = [packet.pts for packet in container.demux(stream) if packet.size]

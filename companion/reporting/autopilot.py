@@ -1,4 +1,4 @@
-"""EKF and receiver tracks from the .tlog of a flight."""
+"""Reads EKF and receiver tracks from the .tlog of a flight."""
 
 from __future__ import annotations
 

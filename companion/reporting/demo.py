@@ -34,7 +34,7 @@ from companion.reporting.record import (
     worst_frames,
 )
 from companion.reporting.record import uncertainty_plots as uncertainty
-from companion.reporting.verdicts import advice, compared
+from companion.reporting.verdicts import advice, value_and_limit
 from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
 
@@ -69,7 +69,7 @@ def demo_report(folder: Path, say: Say = silent) -> Report:
     off = np.flatnonzero(accepted & (errors["3-D"] > _LARGE_M) & (time_s >= 0))
     large = f"{time_s[off[0]]:.3f} the position was {errors['3-D'][off[0]]:.1f} m off" \
         if len(off) else ""  # fmt: skip
-    with map_pictures(record.map_path, say, record.flown) as pictures:
+    with map_pictures(record.map_path, say, record.flown_map) as pictures:
         vision = figures.track("vision (camera)", VISION, INNER, estimates)
         tracks = [
             figures.track("truth", _TRUTH, OUTER, vehicle),
@@ -109,7 +109,7 @@ def demo_report(folder: Path, say: Say = silent) -> Report:
 
 
 def _broken(report: Mapping[str, Any]) -> str:
-    """That the flight was not flown to its end, in front of what went wrong first."""
+    """Text in front of the first fault, if the flight was not flown to its end; otherwise ""."""
     return f"{report['won']}; before that: " if report.get("broken") else ""
 
 
@@ -141,7 +141,7 @@ def _verdicts(report: Mapping[str, Any]) -> tuple[CriterionResult, ...]:
         value, known = c["value"], advice(c["name"])
         missing = value is None or not np.isfinite(value)
         ok = not missing and (value >= c["limit"] if c["at_least"] else value <= c["limit"])
-        found, needed = compared(value, c["limit"], c["unit"], at_least=c["at_least"])
+        found, needed = value_and_limit(value, c["limit"], c["unit"], at_least=c["at_least"])
         verdicts.append(
             CriterionResult(c["name"], found, needed, bool(ok), known.meaning, known.look)
         )

@@ -21,7 +21,7 @@ from companion.reporting.content import (
 )
 from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import VISION
-from companion.reporting.verdicts import advice, compared
+from companion.reporting.verdicts import advice, value_and_limit
 from companion.sources.folder_source import read_image
 from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
@@ -69,7 +69,7 @@ def evaluation_report(folder: Path, say: Say = silent) -> Report:
 
 
 def _verdicts(document: dict[str, float]) -> tuple[CriterionResult, ...]:
-    """The same targets as a demo flight's localizer."""
+    """Criteria with the same limits as for a demo flight's localizer."""
     wanted = (
         ("localizer median", document["median_translation_m"], 1.0, "m", False),
         ("localizer R@3", document["recall_3"], 95.0, "%", True),
@@ -79,7 +79,7 @@ def _verdicts(document: dict[str, float]) -> tuple[CriterionResult, ...]:
     for name, value, limit, unit, at_least in wanted:
         ok = value is not None and (value >= limit if at_least else value <= limit)
         known = advice(name)
-        found, needed = compared(value, limit, unit, at_least=at_least)
+        found, needed = value_and_limit(value, limit, unit, at_least=at_least)
         verdicts.append(CriterionResult(name, found, needed, bool(ok), known.meaning, known.look))
     return tuple(verdicts)
 

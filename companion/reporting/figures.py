@@ -34,12 +34,12 @@ _EVERY_FIX = (
 
 
 def seconds(time_ns: np.ndarray, start_ns: int) -> np.ndarray:
-    """Seconds since the start."""
+    """Seconds since start_ns."""
     return np.asarray((np.asarray(time_ns) - start_ns) * 1e-9, dtype=np.float64)
 
 
 def track(name: str, colour: str, width: float, columns: Columns, prefix: str = "") -> MapTrack:
-    """The path of a table's positions."""
+    """The path of a table's positions, in the columns that begin with `prefix`."""
     points = np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north")])
     return MapTrack(name, colour, width, points)
 
@@ -123,7 +123,7 @@ def _first_since(
     begin_s: float, states: np.ndarray, time_s: np.ndarray, happened: Sequence[ReportEvent],
     large_error: str,
 ) -> str:  # fmt: skip
-    """With its time; empty where nothing did."""
+    """The first fault from begin_s on, with its time; "" without one."""
     found: list[tuple[float, str]] = []
     left = np.flatnonzero((states != "tracking") & (time_s > begin_s))
     if len(left):
@@ -157,7 +157,7 @@ def target_marks(targets: Columns) -> tuple[MapMark, ...]:
 
 
 def by_name(targets: Columns) -> dict[str, np.ndarray]:
-    """Row indices of each target, in order of first appearance."""
+    """Row indices of each target by its name, in order of first appearance."""
     if not targets:
         return {}
     names = np.asarray(targets["target_id"])

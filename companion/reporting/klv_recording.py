@@ -34,7 +34,7 @@ _TARGET_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Written:
-    """Result. pictures: frames of the video; described: frames with metadata."""
+    """Result. pictures: number of the video's frames; described: of frames with metadata."""
 
     path: Path
     pictures: int
@@ -67,7 +67,7 @@ def describe_recording(
     if out.resolve() == video.resolve():
         raise RecordError(f"{out}: is the video itself; give another file as --out")
     cache = TileCache.open(map_path)
-    tables.flown.require_frame(cache)
+    tables.flown_map.require_frame(cache)
     with ExitStack() as stack:
         scene = KlvContext(
             cache.frame, MapSurface(cache).cast, cache.manifest.geoid_separation_m, mission
@@ -112,14 +112,14 @@ def describe_recording(
 
 @dataclass
 class _Clock:
-    """From a picture to its exposure on the record's CLOCK_MONOTONIC."""
+    """Gives the exposure of a frame on the record's CLOCK_MONOTONIC."""
 
     begin_ns: int | None
     utc_minus_monotonic_ns: int
     first: Fraction | None = None
 
     def exposure_ns(self, picture: av.VideoFrame) -> int | None:
-        """None of a picture that does not say."""
+        """Exposure of a frame, CLOCK_MONOTONIC; None if the frame does not state it."""
         pts = Fraction(picture.pts * picture.time_base)
         self.first = pts if self.first is None else self.first
         if self.begin_ns is not None:
@@ -135,7 +135,7 @@ class _Clock:
 def _packets(
     source: av.container.InputContainer, stream: av.VideoStream, clock: _Clock
 ) -> Iterator[tuple[av.Packet, list[tuple[Fraction, int]]]]:
-    """Every packet of the video, and the pictures (presentation time, exposure) that it gave."""
+    """Yield every packet and (presentation time, exposure) of the frames decoded from it."""
     for packet in source.demux(stream):
         taken = []
         try:
@@ -151,7 +151,7 @@ def _packets(
 
 
 class _RecordTrack:
-    """What the record knows at a time: pose, the aircraft's attitude, the newest target."""
+    """Data of the record at a time: pose, the aircraft's attitude, the newest target."""
 
     def __init__(self, tables: RecordTables, scene: KlvContext) -> None:
         self._scene = scene
@@ -167,7 +167,7 @@ class _RecordTrack:
         self._attitudes = _attitudes(tables.tlog, self._utc_ns)
 
     def at(self, time_ns: int, camera: Camera) -> bytes | None:
-        """The packet of a picture; None of one that was not localized."""
+        """Metadata packet of a frame; None if the frame was not localized."""
         k = _nearest(self._times, time_ns, _SAME_NS)
         if k is None:
             return None
@@ -201,7 +201,7 @@ def _nearest(times: np.ndarray, time_ns: int, within_ns: int) -> int | None:
 
 
 def _targets(table: Columns) -> tuple[np.ndarray, list[TargetFix]]:
-    """Every report of a target, in the order of time."""
+    """Times and fixes of all target reports, in the order of time."""
     rows = []
     for k in range(len(table.get("exposure_time_ns", ()))):
         place = np.array([table[name][k] for name in ("east_m", "north_m", "up_m")], dtype=float)
@@ -215,7 +215,7 @@ def _targets(table: Columns) -> tuple[np.ndarray, list[TargetFix]]:
 
 
 def _attitudes(tlog: Path | None, utc_minus_monotonic_ns: int) -> tuple[np.ndarray, Array]:
-    """When ATTITUDE came, and (N, 3) roll, pitch, yaw; none without a log."""
+    """Times of ATTITUDE, and (N, 3) roll, pitch, yaw, rad; empty without a log."""
     rows: list[tuple[int, float, float, float]] = []
     if tlog is not None and tlog.is_file():
         for utc_ns, message in read_tlog(tlog):

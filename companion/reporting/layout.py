@@ -64,7 +64,7 @@ def render(report: Report) -> str:
 
 
 def _embedded(data: Any) -> str:
-    """JSON inside a script element: nothing in it may end the element."""
+    """JSON for a script element, escaped so that it cannot end the element."""
     return json.dumps(data, allow_nan=False).replace("<", "\\u003c")
 
 
@@ -113,7 +113,7 @@ def _verdicts(report: Report) -> str:
 
 
 def _map(sheet: MapSheet) -> str:
-    """SVG in metres, north up, over the picture from above."""
+    """SVG in metres, north up, over the top view."""
     width, height = sheet.east - sheet.west, sheet.north - sheet.south
     size = max(width, height)
 
@@ -153,7 +153,7 @@ def _map(sheet: MapSheet) -> str:
 
 
 def _label(name: str, at: tuple[float, float], arm: float, width: float) -> str:
-    """A mark's name beside it, on the side where the map has room for it."""
+    """SVG of a mark's name, on the side where the map has room for it."""
     font = 2.0 * arm
     x, y = at
     ends = x + arm + _LETTER * font * len(name) > width
@@ -166,7 +166,7 @@ def _label(name: str, at: tuple[float, float], arm: float, width: float) -> str:
 
 
 def _polyline(track: MapTrack, points: list[str]) -> str:
-    """A track with a dark rim, which is seen on any ground."""
+    """SVG of a track with a dark rim, which is visible on any ground."""
     line = " ".join(points)
     return (
         f'<polyline points="{line}" class=rim stroke-width="{track.width + RIM}"/>'
@@ -229,7 +229,7 @@ def _kept(count: int) -> np.ndarray:
 
 
 def _runs(points: np.ndarray) -> list[np.ndarray]:
-    """The stretches between unknown points: what was not known is not drawn as if it were."""
+    """Split points at unknown (NaN) ones, so that gaps are not drawn."""
     known = np.isfinite(points).all(axis=1)
     runs = np.split(np.arange(len(points)), np.flatnonzero(np.diff(known)) + 1)
     step = -(-len(points) // _MOST_POINTS)
@@ -237,7 +237,7 @@ def _runs(points: np.ndarray) -> list[np.ndarray]:
 
 
 def _stanford(data: Stanford) -> str:
-    """Error (abscissa) against protection level (ordinate), both to twice the alert limit."""
+    """SVG: error (abscissa), protection level (ordinate), both to twice the alert limit."""
     side, top = 420.0, 2.0 * data.alert_limit_m
     scale = side / top
     dots = "".join(
@@ -272,7 +272,7 @@ def _stanford(data: Stanford) -> str:
 
 
 def _ticks(side: float, top: float) -> str:
-    """Numbers along both axes of the diagram, at every quarter."""
+    """SVG numbers along both axes of the diagram, at every quarter."""
     texts = []
     for k in range(5):
         value, at = f"{top * k / 4:g}", side * k / 4
@@ -300,7 +300,7 @@ def _overlays(report: Report) -> str:
 
 
 def _cell(text: str) -> str:
-    """A number and its unit stay on one line."""
+    """Table cell in which a number and its unit stay on one line."""
     number = len(text) < 24 and any(character.isdigit() for character in text)
     return f"<td{' class=n' if number else ''}>{escape(text)}</td>"
 

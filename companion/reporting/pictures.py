@@ -117,7 +117,7 @@ def map_pictures(
     except (LocalizerError, RecordError, OSError) as error:
         yield MapPictures(None, None, [f"no pictures of the map: {error}"])
         return
-    doubt = "" if flown is None else flown.doubt(cache)
+    doubt = "" if flown is None else flown.mismatch(cache)
     streamer = TileStreamer(cache)
     try:
         yield MapPictures(cache, NumbaRenderer(streamer), [doubt] if doubt else [], say)

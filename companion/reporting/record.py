@@ -34,7 +34,7 @@ GNSS = "#ffffff"
 
 
 def record_report(folder: Path, say: Say = silent) -> Report:
-    """Make the report of one record."""
+    """Make the report of one record; `RecordError` for another folder."""
     tables = read_record(folder)
     camera, estimates = tables.camera, tables.estimates
     start_ns = tables.start_ns
@@ -47,7 +47,7 @@ def record_report(folder: Path, say: Say = silent) -> Report:
             versions=tables.versions,
         )  # fmt: skip
     time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
-    with map_pictures(tables.map_path, say, tables.flown) as pictures:
+    with map_pictures(tables.map_path, say, tables.flown_map) as pictures:
         autopilot = read_autopilot(tables.tlog, tables.start_ns, tables.utc_ns, pictures)
         tracks = _tracks(estimates, autopilot)
         sheet = pictures.sheet(tracks, figures.target_marks(tables.targets))
@@ -118,7 +118,7 @@ def _known(figure: float) -> str:
 
 
 def _refused(status: str) -> str:
-    """status: of the registration, which may be well and its pose not believed."""
+    """Why a frame was refused. status: of the registration, which may be OK all the same."""
     return "registered, not accepted" if status == "OK" else f"refused ({status})"
 
 
@@ -165,7 +165,7 @@ def _tracks(estimates: Columns, autopilot: AutopilotTracks) -> list[MapTrack]:
 
 
 def _verdicts(tables: RecordTables) -> tuple[CriterionResult, ...]:
-    """What can be judged without the truth."""
+    """Criteria that can be judged without the truth."""
     health, estimates = tables.health, tables.estimates
     ended = health.get("level") == "ended"
     verdicts = [
@@ -197,7 +197,7 @@ def _verdicts(tables: RecordTables) -> tuple[CriterionResult, ...]:
                 "latency by stage; more processor, lower localizer.width, higher delay_ms",
             )
         )  # fmt: skip
-    verdicts += _untold_targets(health.get("targets"))
+    verdicts += _unreported_targets(health.get("targets"))
     shadow = _shadow(health.get("shadow"))
     if shadow:
         verdicts.append(
@@ -211,14 +211,14 @@ def _verdicts(tables: RecordTables) -> tuple[CriterionResult, ...]:
 
 
 def _shadow(told: Any) -> dict[str, Any]:
-    """Of health.json; 0.1 wrote a line that begins with "go" or "no-go"."""
+    """Shadow result of a health.json; version 0.1 wrote a line that begins with "go" or "no-go"."""
     if isinstance(told, str) and told:
         return {"ready": told.startswith("go"), "text": told}
     return mapping(told)
 
 
-def _untold_targets(counts: Any) -> list[CriterionResult]:
-    """Clicks and detections that were not told; nothing where all were, or nobody counted."""
+def _unreported_targets(counts: Any) -> list[CriterionResult]:
+    """A criterion for clicks and detections that were not reported; [] if all were."""
     named = {k: v for k, v in mapping(counts).items() if isinstance(v, int) and v > 0}
     if not named:
         return []

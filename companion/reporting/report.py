@@ -27,7 +27,7 @@ def write_page(folder: Path, out: Path | None = None, say: Say = silent) -> Path
 
 
 def report_of(folder: Path, say: Say = silent) -> Report:
-    """Make the folder's report; `RecordError` for another or a damaged folder."""
+    """Make the folder's report; `RecordError` for another kind or a damaged folder."""
     try:
         return _report_of(folder, say)
     # What a damaged or a foreign file raises where a report takes it apart.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Advice:
-    """meaning: of the failure, for the pilot; look: what to open first."""
+    """Explanation of a failed criterion. meaning: for the pilot; look: what to open first."""
 
     meaning: str
     look: str
@@ -62,7 +62,9 @@ _ADVICE = {
 }
 
 
-def compared(value: float | None, limit: float, unit: str, *, at_least: bool) -> tuple[str, str]:
+def value_and_limit(
+    value: float | None, limit: float, unit: str, *, at_least: bool
+) -> tuple[str, str]:
     """A value and its limit as text, with enough digits to show the difference: never "0.25 m,
     needed <= 0.25 m: missed".
     """

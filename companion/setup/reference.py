@@ -46,7 +46,7 @@ def reference() -> str:
 
 
 def _lines(model: type[BaseModel], default: BaseModel | None, depth: int) -> Iterator[str]:
-    """The settings of a model; default: what it is where it is left out, None: its own."""
+    """Lines of a model's settings. default: its value if it is left out, None: the model's own."""
     for name, field in settings(model).items():
         indent = "  " * depth
         value = _default(field) if default is None else getattr(default, name)
@@ -70,7 +70,7 @@ def _default(field: FieldInfo) -> Any:
 
 
 def _part(field: FieldInfo) -> type[BaseModel] | None:
-    """The model that a setting consists of, None of a plain one."""
+    """The model of which a setting consists; None for a plain one."""
     for annotation in (field.annotation, *get_args(field.annotation)):
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
             return annotation
@@ -88,7 +88,7 @@ def _words(field: FieldInfo, value: Any, indent: str) -> Iterator[str]:
 
 
 def _bounds(field: FieldInfo) -> str:
-    """As an interval: [0, 10], (0, 1] without 0, [1, inf)."""
+    """Bounds as an interval: [0, 10], (0, 1] without 0, [1, inf); "" without."""
     found = {
         key: getattr(part, key)
         for part in field.metadata
@@ -104,7 +104,7 @@ def _bounds(field: FieldInfo) -> str:
 
 
 def _text(value: Any) -> str:
-    """A value on one line, as YAML and as people write it."""
+    """A value on one line of YAML."""
     if isinstance(value, tuple | list):
         return json.dumps([_number(v) for v in value])
     if isinstance(value, float):
@@ -118,6 +118,6 @@ def _number(value: Any) -> Any:
 
 
 def _float(value: float) -> str:
-    """YAML reads a number without a point before its exponent as text."""
+    """A number as text, with the point that YAML needs before an exponent."""
     text = repr(value)
     return text if "e" not in text or "." in text else text.replace("e", ".0e")

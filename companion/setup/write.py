@@ -23,7 +23,8 @@ def deployment_text(
         "# `companion init --reference`. Check it with `companion doctor` before each flight.",
         *(f"# {note}" for note in notes),
     ]
-    body = yaml.safe_dump(differing(config), sort_keys=False, default_flow_style=None, width=100)
+    settings = differing_settings(config)
+    body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=100)
     return "\n".join(lines) + "\n\n" + body
 
 
@@ -38,9 +39,9 @@ def write_deployment(text: str, path: Path, overwrite: bool) -> None:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def differing(model: BaseModel, default: BaseModel | None = None) -> dict[str, Any]:
-    """The settings of a model that differ, as plain data: from `default`, or else from the
-    defaults of its kind; those that have none are all given.
+def differing_settings(model: BaseModel, default: BaseModel | None = None) -> dict[str, Any]:
+    """The settings of a model that differ from `default`, or else from the defaults of its class,
+    as plain data. Settings without a default are all given.
     """
     found: dict[str, Any] = {}
     for name, field in settings(type(model)).items():
@@ -52,14 +53,14 @@ def differing(model: BaseModel, default: BaseModel | None = None) -> dict[str, A
         then = field.get_default(call_default_factory=True) if by_kind else getattr(default, name)
         if now != then:
             both = isinstance(now, BaseModel) and isinstance(then, type(now))
-            found[name] = differing(now, then) if both else _plain(now)
+            found[name] = differing_settings(now, then) if both else _plain(now)
     return found
 
 
 def _plain(value: Any) -> Any:
-    """As YAML holds it."""
+    """The value as YAML's types."""
     if isinstance(value, BaseModel):
-        return differing(value)
+        return differing_settings(value)
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]
     return value if isinstance(value, bool | int | float | str) or value is None else str(value)

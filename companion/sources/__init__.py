@@ -44,13 +44,14 @@ def open_source(
     on_stranger: Callable[[str], None] | None = None,
     tap: PacketTap | None = None,
 ) -> FrameSource:
-    """The feed at `location`: ``udp://host:port`` (MPEG-TS, RTP or raw H.264 or H.265), the
+    """Open the feed at `location`: ``udp://host:port`` (MPEG-TS, RTP or raw H.264 or H.265), the
     ``.sdp`` file of an RTP feed, ``rtsp://...``, ``/dev/videoN`` (or ``v4l2:///dev/videoN``), a
     video file, or a folder of images.
 
-    on_stranger: called once for each other address that sends video to a UDP feed. tap: receives
-    the packets of a video; a folder of images has none. Raises `StreamOpenError` if a file or
-    device does not exist. A live stream may start later.
+    camera: calibrated model of the feed's frames. on_state: called with the state and a text for
+    the operator when the state changes. on_stranger: called once for each other IP address that
+    sends video to a UDP feed. tap: receives the packets of a video; unused for a folder of images.
+    Raises `StreamOpenError` if a file or device does not exist. A live stream may start later.
     """
     text = str(location)
     if text.startswith(_LIVE) or text.endswith(".sdp"):

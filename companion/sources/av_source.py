@@ -44,7 +44,7 @@ from companion.sources.datagrams import (
     VideoDatagrams,
 )
 from companion.sources.misp import MispTime, parse_message
-from companion.sources.references import Damage, References
+from companion.sources.references import DamageTracker, ReferenceTracker
 from companion.sources.sdp import SdpSession
 from companion.sources.timing import ExposureClock, FrameTimestamps
 from localizer.geometry.camera import Camera
@@ -81,7 +81,7 @@ class _Input:
 
 class VideoDecoder:
     """Decodes one open container, single-threaded, because FFmpeg's frame threads add a frame of
-    delay each.
+    delay each. read_timeout_s: longest wait for data of a live stream; None for a file.
     """
 
     def __init__(
@@ -109,8 +109,8 @@ class VideoDecoder:
         context = self.stream.codec_context
         live = read_timeout_s is not None
         h264 = context.name == "h264" and live
-        self._damage = Damage() if live else None
-        self._references = References(bytes(context.extradata or b"")) if h264 else None
+        self._damage = DamageTracker() if live else None
+        self._references = ReferenceTracker(bytes(context.extradata or b"")) if h264 else None
         context.thread_count = 1
         if read_timeout_s is not None:
             context.flags |= _LOW_DELAY
@@ -118,7 +118,9 @@ class VideoDecoder:
             tap.begin(self.stream)
 
     def pictures(self) -> Iterator[tuple[av.VideoFrame | None, int]]:
-        """Yield (frame, arrival time in ns), and (None, time) for a packet without a frame."""
+        """Yield (frame or None, arrival time); None: a packet gave no intact frame. CLOCK_MONOTONIC
+        ns.
+        """
         for packet in self._container.demux(self.stream):
             arrival_ns = time.monotonic_ns()
             try:
@@ -126,10 +128,10 @@ class VideoDecoder:
             except av.error.InvalidDataError:
                 pictures = []
                 if self._damage is not None:
-                    self._damage.undecodable(arrival_ns)
+                    self._damage.add_undecodable(arrival_ns)
             if self._tap is not None and packet.size:
                 self._tap.packet(packet)
-            late = self._leans_on_lost(packet, arrival_ns)  # each packet: it counts them
+            late = self._is_predicted_from_lost(packet, arrival_ns)  # each packet: it counts them
             whole = [p for p in pictures if not self._is_damaged(p, arrival_ns) and not late]
             self.late += max(0, len(whole) - (1 if packet.size else 0))
             for picture in whole:
@@ -143,7 +145,7 @@ class VideoDecoder:
         clean = bool(picture.key_frame) or picture.pict_type == PictureType.I
         return self._damage.is_damaged(arrival_ns, marked=bool(picture.is_corrupt), clean=clean)
 
-    def _leans_on_lost(self, packet: av.Packet, arrival_ns: int) -> bool:
+    def _is_predicted_from_lost(self, packet: av.Packet, arrival_ns: int) -> bool:
         follows = self._references
         return follows is not None and follows.is_broken(bytes(packet), arrival_ns)
 
@@ -153,7 +155,9 @@ class VideoDecoder:
 
 
 class VideoFileSource:
-    """Every frame of a video file; exposure time: start time plus presentation time."""
+    """Every frame of a video file. Exposure time: start of `frames` plus time since the first
+    frame.
+    """
 
     def __init__(
         self,
@@ -178,23 +182,23 @@ class VideoFileSource:
 
     @property
     def counters(self) -> SourceCounters:
-        """Counters; nothing is dropped."""
+        """Counters so far; `dropped` stays 0."""
         return self._counters
 
     @property
     def state(self) -> StreamState:
-        """Idle, live, ended, failed or closed."""
+        """Idle, live, scaled, ended, failed or closed."""
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame; raises `StreamDecodeError` if the file has none."""
+        """Every frame. `StreamOpenError` for no video, `StreamDecodeError` if no frame decodes."""
         try:
             decoder = VideoDecoder(_Input(str(self._path), {}), None, self._tap)
         except av.error.FFmpegError as error:
             raise StreamOpenError(
                 f"{self._path}: not a video, or damaged from the start: {error}"
             ) from error
-        self._report(StreamState.LIVE, f"{self._path}: {self._told_rate(decoder)}")
+        self._report(StreamState.LIVE, f"{self._path}: {self._settle_rate(decoder)}")
         try:
             yield from self._play(decoder)
         except StreamError as error:
@@ -213,7 +217,7 @@ class VideoFileSource:
         first: int | None = None
         for picture in self._readable(decoder):
             camera = self._rgb.camera(picture, self._camera, str(self._path))
-            self._tell_scaling(camera)
+            self._report_scaling(camera)
             pts = self._pts_ns(picture, decoder)
             first = pts if first is None else first
             offset = pts - first
@@ -224,7 +228,7 @@ class VideoFileSource:
             n = self._counters.delivered
             frame = Frame(self._rgb(picture, str(self._path)), start + offset, camera, n)
             self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
-            _tell(self._tap, picture, frame.exposure_time_ns)
+            _pass_exposure_time(self._tap, picture, frame.exposure_time_ns)
             yield frame
         if not self._counters.delivered:
             raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
@@ -233,8 +237,8 @@ class VideoFileSource:
         text = f"{self._path}: end of file, {self._delivered} pictures"
         self._report(StreamState.ENDED, text + (f", {lost} undecodable" if lost else ""))
 
-    def _told_rate(self, decoder: VideoDecoder) -> str:
-        """Settles the rate of a file that has no times, as raw H.264, and says which it is."""
+    def _settle_rate(self, decoder: VideoDecoder) -> str:
+        """Set the frame rate of a file without times (raw H.264); returns a text that names it."""
         if decoder.has_times:
             return "playing"
         stated = float(decoder.stream.codec_context.framerate or 0.0)
@@ -245,7 +249,7 @@ class VideoFileSource:
         _log.warning("%s: %s", self._path, text)
         return text
 
-    def _tell_scaling(self, camera: Camera) -> None:
+    def _report_scaling(self, camera: Camera) -> None:
         if camera is not self._camera and self._state is not StreamState.SCALED:
             text = scaling_text(camera.width, camera.height, self._camera, str(self._path))
             self._report(StreamState.SCALED, text)
@@ -284,8 +288,9 @@ class VideoFileSource:
 
 
 class LiveVideoSource:
-    """A live stream, decoded by a reader thread; only the newest frame is kept. A stream that stops
-    is reported and reopened, with longer waits after failures.
+    """Decodes a live stream in a reader thread, which keeps only the newest frame. If the stream
+    stops, the state becomes STALLED and the reader connects again, with longer waits after
+    failures.
 
     Above 200 lines: the reader's thread and the thread that takes frames share one state.
     """
@@ -328,10 +333,11 @@ class LiveVideoSource:
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the newest frame; ends only when closed.
+        """Wait for the newest frame and yield it; ends only when closed.
 
-        Raises `StreamSizeError` if the first frame has another aspect ratio than the camera model.
-        If the ratio changes later, MISFIT is reported until it fits again.
+        Raises `StreamSizeError` if the first frame has another aspect ratio than the camera model,
+        `StreamDepthError` if its pixels cannot be converted. Later frames of this kind are skipped,
+        with state MISFIT until a frame fits.
         """
         self._start()
         while (item := self._newest.take()) is not None:
@@ -391,7 +397,7 @@ class LiveVideoSource:
                 connections += 1
             except StreamError as error:
                 self._report(StreamState.FAILED, str(error))
-                self._newest.close(error.retold(redacted(str(error))))
+                self._newest.close(error.with_text(redacted(str(error))))
                 return
             except av.error.ExitError:  # the open time-out
                 reason = _nothing_came()
@@ -414,7 +420,7 @@ class LiveVideoSource:
             wait_s = min(2 * wait_s, self._settings.retry_max_s)
 
     def _receive_once(self, *, reconnect: bool) -> str:
-        """Receives until the connection ends; returns why it did."""
+        """Receive until the connection ends; returns the reason for the operator."""
         decoder = VideoDecoder(self._input, self._settings.stall_timeout_s, self._tap)
         if reconnect:
             self._count(reconnects=1)
@@ -428,7 +434,7 @@ class LiveVideoSource:
             for picture, arrival_ns in decoder.pictures():
                 if self._closing.is_set():
                     return "closed"
-                self._take(picture, arrival_ns, clock)
+                self._process_frame(picture, arrival_ns, clock)
             return "the sender ended the stream"
         except av.error.ExitError:  # the read time-out
             return f"no data for {self._settings.stall_timeout_s:g} s"
@@ -439,7 +445,9 @@ class LiveVideoSource:
         finally:
             decoder.close()
 
-    def _take(self, picture: av.VideoFrame | None, arrival_ns: int, clock: ExposureClock) -> None:
+    def _process_frame(
+        self, picture: av.VideoFrame | None, arrival_ns: int, clock: ExposureClock
+    ) -> None:
         if picture is None:
             self._count(undecodable=1)
             # A receiver that has just joined waits for a key frame: no stall yet.
@@ -450,13 +458,13 @@ class LiveVideoSource:
             return
         self._last_picture_ns = arrival_ns
         if self._input.datagrams is not None:
-            self._input.datagrams.prove()
+            self._input.datagrams.confirm_sender()
         camera = self._fitted(picture)
         if camera is None:
             return
         stamps = FrameTimestamps(_pts_ns(picture), _misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns) - self._settings.late_ns
-        _tell(self._tap, picture, exposure_ns)
+        _pass_exposure_time(self._tap, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile
         self._count(received=1)
@@ -468,7 +476,9 @@ class LiveVideoSource:
             self._report_change(StreamState.SCALED, text)
 
     def _fitted(self, picture: av.VideoFrame) -> Camera | None:
-        """The picture's camera. None for another kind, which in flight must not end the feed."""
+        """Camera model of the frame's size; None if it does not fit, but before any frame the
+        error.
+        """
         try:
             return self._rgb.camera(picture, self._camera, self._location)
         except (StreamSizeError, StreamDepthError) as error:
@@ -511,8 +521,9 @@ def live_input(
     settings: SourceSettings,
     on_stranger: Callable[[str], None] = lambda _: None,
 ) -> _Input:
-    """FFmpeg's options for a live location, chosen for low delay. `StreamOpenError` if the video
-    device does not exist.
+    """FFmpeg's options for a live location, chosen for low delay. camera: gives the image size that
+    a V4L2 device is set to. on_stranger: as of `open_source`. `StreamOpenError` if the video device
+    does not exist.
     """
     timeout_us = str(round(settings.stall_timeout_s * 1e6))
     common = {"probesize": "65536", "analyzeduration": "200000", "flags": "low_delay"}
@@ -541,7 +552,7 @@ def live_input(
 
 
 class _ToRgb:
-    """Decoded pictures as RGB (H, W, 3) uint8."""
+    """Converts frames to RGB (H, W, 3) uint8. grey_range: as in `SourceSettings`."""
 
     def __init__(self, grey_range: GreyRange | None) -> None:
         self._grey_range = grey_range
@@ -549,7 +560,7 @@ class _ToRgb:
         self._unknown = set(_ABORTING)  # kinds of pixels
 
     def __call__(self, picture: av.VideoFrame, where: str) -> Image:
-        """`StreamDepthError` for pixels that FFmpeg cannot convert."""
+        """Convert; where: for the error. `StreamDepthError` for pixels that cannot be converted."""
         try:
             if _is_counts(picture):
                 counts = self._reformatter.reformat(picture, format="gray16le").to_ndarray()
@@ -565,8 +576,8 @@ class _ToRgb:
             raise StreamDepthError(f"{where}: {picture.format.name}{_UNCONVERTED}") from error
 
     def camera(self, picture: av.VideoFrame, camera: Camera, where: str) -> Camera:
-        """As of `fitted_camera`; `StreamDepthError` for 16-bit grey without a range, and for what
-        could not be converted before.
+        """Camera model of the frame, as `fitted_camera`. `StreamDepthError` for 16-bit grey without
+        a range, and for a pixel format that could not be converted before.
         """
         if picture.format.name in self._unknown:
             raise StreamDepthError(f"{where}: {picture.format.name}{_UNCONVERTED}")
@@ -578,8 +589,8 @@ class _ToRgb:
 
 
 def _is_counts(picture: av.VideoFrame) -> bool:
-    """Whether the pictures are a sensor's 16-bit counts. Grey of 9 to 14 bits is a codec's (H.264,
-    H.265), whose white is known.
+    """Whether the frame holds a sensor's 16-bit counts. Grey of 9 to 14 bits comes from a codec
+    (H.264, H.265), whose white level is known.
     """
     parts = picture.format.components
     return len(parts) == 1 and bool(parts[0].is_luma) and parts[0].bits == 16
@@ -592,7 +603,7 @@ def _pts_ns(picture: av.VideoFrame) -> int | None:
     return time_ns
 
 
-def _tell(tap: PacketTap | None, picture: av.VideoFrame, exposure_ns: int) -> None:
+def _pass_exposure_time(tap: PacketTap | None, picture: av.VideoFrame, exposure_ns: int) -> None:
     if tap is not None and picture.pts is not None and picture.time_base is not None:
         tap.picture(Fraction(picture.pts * picture.time_base), exposure_ns)
 

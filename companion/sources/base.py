@@ -59,11 +59,12 @@ StateCallback = Callable[[StreamState, str], None]
 
 @dataclass(frozen=True)
 class SourceCounters:
-    """Frame counters of a source. received: frames decoded; delivered: passed on by `frames`;
-    dropped: replaced by a newer one first; undecodable: packets without a complete frame, or with
-    one predicted from a lost frame (`companion.sources.references`); misfits: frames whose shape is
-    not the calibration's; reconnects: connections after the first; foreign: datagrams of other
-    senders, which are ignored.
+    """Frame counters of a source. received: decoded frames that can be used; delivered: passed on
+    by `frames`; dropped: replaced by a newer frame before they were delivered; undecodable: packets
+    without a complete frame, or with one predicted from a lost frame
+    (`companion.sources.references`); misfits: frames with another aspect ratio than the
+    calibration, or with pixels that cannot be converted; reconnects: connections after the first;
+    foreign: datagrams of other senders, which are ignored.
     """
 
     received: int = 0
@@ -124,7 +125,7 @@ class SourceSettings(BaseModel):
 
     @property
     def late_ns(self) -> int:
-        """`time_offset_ms` in ns."""
+        """`time_offset_ms` in ns: subtracted from exposure times."""
         return round(1e6 * self.time_offset_ms)
 
     @field_validator("grey_range")
@@ -143,7 +144,7 @@ class SourceSettings(BaseModel):
 
 
 class PacketTap(Protocol):
-    """Receives a video's packets before decoding, on the reader's thread; must not block."""
+    """Receives a video's undecoded packets, on the reader's thread; must not block."""
 
     def begin(self, stream: av.VideoStream) -> None:
         """A connection was opened; the following packets are of this stream."""
@@ -154,7 +155,7 @@ class PacketTap(Protocol):
         ...
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """Exposure time of the frame with that presentation time (s)."""
+        """A frame of presentation time `pts` (s) was exposed then (CLOCK_MONOTONIC)."""
         ...
 
 
@@ -181,8 +182,8 @@ class PacketTaps:
 
 
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
-    """The video stream of a container, not a cover image or thumbnails; of several FFmpeg's choice,
-    which is logged. `StreamOpenError` without one.
+    """The container's video stream, not a cover image or thumbnails. If there are several, FFmpeg's
+    choice, which is logged. where: location for the error text. `StreamOpenError` without one.
     """
     films = [
         s for s in container.streams.video
@@ -211,9 +212,9 @@ class FrameSource(Protocol):
     """A camera feed. One consumer iterates `frames`; `close` may be called from any thread."""
 
     def frames(self) -> Iterator[Frame]:
-        """Frames in order of exposure, until a file ends or the source is closed.
+        """Yield frames in order of exposure, until a file ends or the source is closed.
 
-        If a live stream stops, the iteration continues: the source reports its state and connects
+        If a live stream stops, the iteration waits: the source reports its state and connects
         again.
         """
         ...
@@ -234,9 +235,8 @@ class FrameSource(Protocol):
 
 
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
-    """Camera model of a frame of this size: the calibrated one, scaled if necessary.
-
-    Raises `StreamSizeError` if the aspect ratio shows that the frame was cropped or padded.
+    """Camera model for frames of width x height pixels: the calibrated one, scaled if necessary.
+    where: location for the error text.
     """
     if (width, height) == (camera.width, camera.height):
         return camera
@@ -255,7 +255,7 @@ def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera
 
 
 def scaling_text(width: int, height: int, camera: Camera, where: str) -> str:
-    """Warning for the operator about frames of another size than calibrated."""
+    """Warning for the operator: frames have another size (width x height) than `camera`."""
     return (
         f"{where}: delivers {width}x{height}, taken as the calibrated "
         f"{camera.width}x{camera.height} scaled down or up (wrong if the camera crops or zooms)"

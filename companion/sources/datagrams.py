@@ -16,7 +16,14 @@ from dataclasses import dataclass
 from urllib.parse import parse_qs, urlsplit
 
 from companion.errors import StreamOpenError
-from companion.sources.rtp import FORMATS, Kind, RtpPictures, kind_of, named, payload_of
+from companion.sources.rtp import (
+    FORMATS,
+    Kind,
+    RtpDepacketizer,
+    describe_unsupported,
+    rtp_payload,
+    video_format,
+)
 from mavlink_bridge.link.waking import WakePipe
 
 _LARGEST = 65_535
@@ -28,7 +35,7 @@ Address = tuple[str, int]
 
 
 class SilentSenderError(Exception):
-    """The sender sent nothing for patience_s. instead: what other senders sent, or empty."""
+    """The sender sent nothing for patience_s (s). instead: text on what other senders sent."""
 
     def __init__(self, patience_s: float, instead: str) -> None:
         super().__init__(instead or f"no data for {patience_s:g} s")
@@ -39,8 +46,8 @@ class SilentSenderError(Exception):
 class UdpAddress:
     """Parsed ``udp://HOST:PORT?localaddr=ADDRESS``.
 
-    host: address of this computer to listen at, or a multicast group. interface: by which a group
-    is joined; empty: the system's choice.
+    host: address of this computer to listen at, or a multicast group. interface: address of the
+    interface that joins the group; "": the system's choice.
     """
 
     host: str
@@ -49,7 +56,7 @@ class UdpAddress:
 
     @classmethod
     def parse(cls, location: str) -> UdpAddress:
-        """Raises `StreamOpenError` for an address that cannot be listened on."""
+        """Parse a location; `StreamOpenError` without a port, or with an unknown option."""
         try:
             parts = urlsplit(location)
             port = parts.port
@@ -66,8 +73,8 @@ class UdpAddress:
             )
         return cls(parts.hostname or "0.0.0.0", port, options.get("localaddr", [""])[0])
 
-    def bound(self) -> socket.socket:
-        """A non-blocking socket bound to it; OSError if that is impossible."""
+    def open_socket(self) -> socket.socket:
+        """Open a non-blocking socket bound to it, in its multicast group; may raise OSError."""
         family, kind, _, _, where = socket.getaddrinfo(
             self.host, self.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )[0]
@@ -97,12 +104,12 @@ class UdpAddress:
 class SenderLock:
     """Accepts the datagrams of one sender: the configured one or the first one.
 
-    Once a frame of the sender was decoded, its address stays locked. The sender may change its port
-    after `quiet_ns` of silence, as a camera does that restarts. If no frame of the first sender is
-    decoded within 6 s, another sender may replace it, so that a stray packet does not lock the
-    camera out.
+    Once a frame of the sender was decoded (`confirm_sender`), its address stays locked. The sender
+    may change its port after `quiet_ns` of silence, as a camera does that restarts. If no frame of
+    the first sender is decoded within 6 s, another sender may replace it, so that a stray packet
+    does not lock the camera out.
 
-    only: HOST or HOST:PORT, a numeric address; None: the first.
+    only: HOST or HOST:PORT, a numeric address; None: the first sender of video.
     """
 
     def __init__(self, only: str | None, quiet_ns: int) -> None:
@@ -119,33 +126,33 @@ class SenderLock:
 
     @property
     def has_chosen(self) -> bool:
-        """Whether a sender is accepted or configured, so that others are refused."""
+        """Whether a sender is accepted or configured: datagrams of others count as foreign."""
         return self._sender is not None or self._only is not None
 
-    def prove(self) -> None:
+    def confirm_sender(self) -> None:
         """A frame of the accepted sender was decoded."""
         self._proven = True
 
-    def admits(self, sender: Address, data: bytes, now_ns: int) -> bool:
-        """Whether a datagram that arrived now is accepted."""
-        if sender == self._sender or self._may_follow(sender, data, now_ns):
+    def accepts(self, sender: Address, data: bytes, now_ns: int) -> bool:
+        """Whether to use a datagram that arrived now; its sender may become the accepted one."""
+        if sender == self._sender or self._becomes_sender(sender, data, now_ns):
             self._heard_ns = now_ns
             return True
         return False
 
-    def _may_follow(self, sender: Address, data: bytes, now_ns: int) -> bool:
+    def _becomes_sender(self, sender: Address, data: bytes, now_ns: int) -> bool:
         if self._only is not None and not _is(sender, self._only):
             return False
-        if self._sender is not None and not self._makes_room(sender, now_ns):
+        if self._sender is not None and not self._may_be_replaced_by(sender, now_ns):
             return False
-        if kind_of(data) is None:
+        if video_format(data) is None:
             return False
         if self._sender is None or sender[0] != self._sender[0]:
             self._proven = False
         self._sender, self._since_ns = sender, now_ns
         return True
 
-    def _makes_room(self, other: Address, now_ns: int) -> bool:
+    def _may_be_replaced_by(self, other: Address, now_ns: int) -> bool:
         assert self._sender is not None
         if other[0] == self._sender[0] and now_ns - self._heard_ns >= self._quiet_ns:
             return True
@@ -153,14 +160,14 @@ class SenderLock:
 
 
 class VideoDatagrams:
-    """The feed's socket. It stays bound from the first open to `close`, so the accepted sender
-    stays, too.
+    """Receives the feed's UDP datagrams and gives FFmpeg the video in them, as a file (`read`).
 
-    FFmpeg reads it as a file (`read`) in the decoding thread; any thread may call `close`. The data
-    are MPEG-TS, RTP (whose frames are assembled here), or raw H.264 or H.265.
+    The socket stays bound from the first `begin` to `release`, so the accepted sender stays, too.
+    The decoding thread reads; any thread may call `close`. The datagrams hold MPEG-TS, RTP (whose
+    frames are assembled here), or raw H.264 or H.265.
 
-    on_stranger: called in the reading thread, once for the address of each refused sender. sets:
-    parameter sets of a session description, for an RTP stream that has none itself.
+    on_stranger: called in the reading thread, once for the address of each refused sender, for at
+    most 16. sets: parameter sets of a session description, for an RTP stream that has none itself.
     """
 
     def __init__(
@@ -180,41 +187,42 @@ class VideoDatagrams:
         self._socket: socket.socket | None = None
         self._pending = b""
         self._kind: Kind | None = None
-        self._pictures: RtpPictures | None = None
+        self._depacketizer: RtpDepacketizer | None = None
         self._unread: tuple[str, bytes] | None = None  # newest sender and datagram, not taken
         self._silent = False
         self._closed = threading.Event()
         self._waker = WakePipe()
 
     def begin(self, patience_s: float) -> None:
-        """Bind the socket if necessary, and drop old datagrams.
+        """Bind the socket if necessary, and drop waiting datagrams; called before each connection.
 
-        Raises OSError while the address cannot be bound.
+        patience_s: longest wait of `format` and `read`, s. Raises OSError while the address cannot
+        be bound.
         """
         self.patience_s = patience_s
         self._pending, self._silent, self._unread = b"", False, None
-        self._kind = self._pictures = None
+        self._kind = self._depacketizer = None
         if self._socket is None:
-            self._socket = self._address.bound()
+            self._socket = self._address.open_socket()
         for _ in range(100 * _PER_READ):  # bounded: a flood would be drained for ever
             if self._received() is None:
                 return
 
     def format(self) -> str:
-        """FFmpeg's name of the received format; `SilentSenderError` if nothing arrives."""
+        """Wait for video; FFmpeg's name of its format. `SilentSenderError` after `patience_s`."""
         self._pending = self._next()
         return FORMATS[self._kind or "mpegts"]  # None: closed
 
-    def prove(self) -> None:
+    def confirm_sender(self) -> None:
         """A frame was decoded: the sender stays accepted."""
-        self._lock.prove()
+        self._lock.confirm_sender()
 
     def read(self, size: int) -> bytes:
-        """Data of the sender, at most `size` bytes, as soon as there are any.
+        """Wait for data of the accepted sender; returns at most `size` bytes.
 
         b"" after `close`. Raises `SilentSenderError` if nothing was received within `patience_s`;
-        from then on it returns b"" until `begin`, because the demuxer reads again after the error,
-        and a second error would hide the first.
+        from then on `read` returns b"" until `begin`, because the demuxer reads again after the
+        error, and a second error would hide the first.
         """
         if self._silent:
             return b""
@@ -224,12 +232,12 @@ class VideoDatagrams:
         return given
 
     def close(self) -> None:
-        """End a waiting `read`. `release` frees the socket in the reading thread."""
+        """End a waiting `read`; any thread. The reading thread frees the socket by `release`."""
         self._closed.set()
         self._waker.wake()
 
     def release(self) -> None:
-        """Free the socket; call it after the last read."""
+        """Free the socket; the reading thread calls it after the last read."""
         self._waker.close()
         if self._socket is not None:
             self._socket.close()
@@ -241,55 +249,57 @@ class VideoDatagrams:
         poller.register(self._waker.read_end, select.POLLIN)
         deadline = time.monotonic() + self.patience_s
         while not self._closed.is_set():
-            data = self._drained()
+            data = self._read_waiting()
             if data:
                 return data
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
                 self._silent = True
-                raise SilentSenderError(self.patience_s, self._instead())
+                raise SilentSenderError(self.patience_s, self._describe_unread())
             poller.poll(left_s * 1e3)
         return b""
 
-    def _drained(self) -> bytes:
-        """What waits and is admitted, in order."""
+    def _read_waiting(self) -> bytes:
+        """Video of the datagrams that wait and are accepted, in order, for FFmpeg."""
         taken = []
         for _ in range(_PER_READ):
             received = self._received()
             if received is None:
                 break
             data, sender = received
-            if not self._lock.admits(sender, data, time.monotonic_ns()):
+            if not self._lock.accepts(sender, data, time.monotonic_ns()):
                 self._unread = sender[0], data
                 self._refuse(sender)
-            elif self._kind is None and not self._begins(data):
+            elif self._kind is None and not self._set_format(data):
                 self._unread = sender[0], data
             else:
                 taken.append(self._read(data))
         return b"".join(taken)
 
-    def _begins(self, data: bytes) -> bool:
-        """Whether a datagram says of which kind the feed is."""
-        self._kind = kind_of(data)
+    def _set_format(self, data: bytes) -> bool:
+        """Set the feed's format by a datagram; False if it shows none."""
+        self._kind = video_format(data)
         if self._kind in ("rtp h264", "rtp hevc"):
-            self._pictures = RtpPictures("h264" if self._kind == "rtp h264" else "hevc", self._sets)
+            self._depacketizer = RtpDepacketizer(
+                "h264" if self._kind == "rtp h264" else "hevc", self._sets
+            )
         return self._kind is not None
 
     def _read(self, data: bytes) -> bytes:
-        """What FFmpeg is given of a datagram."""
-        if self._pictures is not None:
-            return self._pictures.take(data)
-        return payload_of(data) if self._kind == "rtp mpegts" else data
+        """Bytes for FFmpeg from a datagram."""
+        if self._depacketizer is not None:
+            return self._depacketizer.add_packet(data)
+        return rtp_payload(data) if self._kind == "rtp mpegts" else data
 
-    def _instead(self) -> str:
-        """What comes and is not read."""
-        if self._pictures is not None and self._pictures.is_under_way:
+    def _describe_unread(self) -> str:
+        """What arrives but is not used, for the operator; "" for nothing."""
+        if self._depacketizer is not None and self._depacketizer.is_under_way:
             return "RTP comes, but no whole picture: packets are lost"
         if self._unread is None:
             return ""
         host, data = self._unread
-        if kind_of(data) is None:
-            return f"from {host} come {named(data)}"
+        if video_format(data) is None:
+            return f"from {host} come {describe_unsupported(data)}"
         return f"video comes from {host}, which is not the feed's sender (camera.settings.sender)"
 
     def _received(self) -> tuple[bytes, Address] | None:
@@ -311,7 +321,9 @@ class VideoDatagrams:
 
 
 def parse_sender(text: str) -> tuple[str, int | None]:
-    """HOST or HOST:PORT ([HOST]:PORT for IPv6) of a sender; ValueError if it is none."""
+    """Parse HOST or HOST:PORT ([HOST]:PORT for IPv6) to (host, port); port None: any. ValueError if
+    the text is neither.
+    """
     try:
         return str(ipaddress.ip_address(text)), None
     except ValueError:

@@ -85,9 +85,9 @@ def read_timestamps(path: Path) -> dict[str, int]:
     return times
 
 
-def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | None:
-    """Exposure times (ns) of a folder's images by its ``timestamps.txt``; None without that file.
-    `StreamOpenError` if an image is missing in it.
+def exposure_times_of(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | None:
+    """Exposure times (ns) of the images, from the folder's ``timestamps.txt``; None without that
+    file. `StreamOpenError` if an image is missing in it.
     """
     file = folder / TIMESTAMPS_NAME
     if not file.exists():
@@ -103,8 +103,9 @@ def written_times(folder: Path, images: Sequence[Path]) -> tuple[int, ...] | Non
 
 
 class FolderSource:
-    """Frames from a folder. Times are those of ``timestamps.txt``, or those of a constant rate from
-    now on. In real time, recorded times are shifted to start now.
+    """Frames from the images of a folder. Exposure times (ns) are those of ``timestamps.txt``;
+    without that file, they begin now and follow at `rate_hz`. With `realtime`, recorded times are
+    shifted to begin now.
     """
 
     def __init__(
@@ -119,23 +120,23 @@ class FolderSource:
         self._settings = settings or SourceSettings()
         self._on_state = on_state
         self._images = list_images(folder)
-        self._times = written_times(folder, self._images)
+        self._times = exposure_times_of(folder, self._images)
         self._closed = threading.Event()
         self._state = StreamState.IDLE
         self._delivered = 0
 
     @property
     def counters(self) -> SourceCounters:
-        """Counters; nothing is dropped."""
+        """Counters so far; `dropped` stays 0."""
         return SourceCounters(received=self._delivered, delivered=self._delivered)
 
     @property
     def state(self) -> StreamState:
-        """Idle, live, ended, failed or closed."""
+        """Idle, live, scaled, ended, failed or closed."""
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """Every image; raises `StreamDecodeError` or `StreamSizeError` naming the file."""
+        """Every image; raises `StreamDecodeError` or `StreamSizeError`, which name the file."""
         start = time.monotonic_ns()
         first = self._times[0] if self._times else 0
         recorded = bool(self._times) and not self._settings.realtime

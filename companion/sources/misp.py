@@ -19,7 +19,7 @@ _FILLER = slice(3, None, 3)  # of the 12 bytes from the status on: 0xFF at 3, 6 
 
 @dataclass(frozen=True)
 class MispTime:
-    """time_us: microseconds since 1970-01-01; locked: to an absolute reference."""
+    """time_us: microseconds since 1970-01-01; locked: the clock has an absolute reference."""
 
     time_us: int
     locked: bool

@@ -1,10 +1,10 @@
 """Detects frames that were predicted from a lost or damaged frame.
 
 A decoder marks a frame of which a part is missing and fills the part from the frame before. Frames
-predicted from it repeat the fault without a mark (`Damage`, any codec). If a whole frame is
+predicted from it repeat the fault without a mark (`DamageTracker`, any codec). If a whole frame is
 missing, the decoder repeats the frame before and continues: what follows is sharp and unmarked, and
 shows the ground as it was one frame earlier until the next key frame. H.264's `frame_num` counts
-reference frames, so a gap in it shows the loss (`References`; ITU-T H.264, 7.3 and 7.4.3).
+reference frames, so a gap in it shows the loss (`ReferenceTracker`; ITU-T H.264, 7.3 and 7.4.3).
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class _Bits:
         self._value, self._left = int.from_bytes(raw, "big"), 8 * len(raw)
 
     def take(self, count: int) -> int:
-        """`count` bits as an unsigned number, u(n)."""
+        """Read `count` bits as an unsigned number, u(n)."""
         if count > self._left:
             raise _EndOfDataError
         self._left -= count
         return (self._value >> self._left) & ((1 << count) - 1)
 
     def unsigned(self) -> int:
-        """An Exp-Golomb number, ue(v) (9.1)."""
+        """Read an Exp-Golomb number, ue(v) (9.1)."""
         zeros = 0
         while not self.take(1):
             zeros += 1
@@ -52,14 +52,14 @@ class _Bits:
         return (1 << zeros) - 1 + self.take(zeros)
 
     def signed(self) -> int:
-        """A signed Exp-Golomb number, se(v) (9.1.1)."""
+        """Read a signed Exp-Golomb number, se(v) (9.1.1)."""
         k = self.unsigned()
         return (k + 1) // 2 if k % 2 else -(k // 2)
 
 
 @dataclass(frozen=True)
 class _Sequence:
-    """What an SPS says of `frame_num`: its size in bits, and whether gaps are meant."""
+    """Fields of an SPS: size of `frame_num` in bits, and whether gaps in it are intended."""
 
     bits: int
     gaps_allowed: bool
@@ -68,7 +68,7 @@ class _Sequence:
 
 @dataclass(frozen=True)
 class _Slice:
-    """The begin of a slice header. reference: others may be predicted from its picture."""
+    """Begin of a slice header. reference: other frames may be predicted from this frame."""
 
     frame_num: int
     intra: bool
@@ -77,19 +77,19 @@ class _Slice:
     sequence: _Sequence
 
 
-class Damage:
-    """Tracks damage through a decoder's frames in order, for any codec."""
+class DamageTracker:
+    """Tracks damage from frame to frame of any codec: it spreads by prediction."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self._has_begun = False
 
     def is_damaged(self, arrival_ns: int, *, marked: bool, clean: bool) -> bool:
-        """Whether this frame is damaged or predicted from a damaged one.
+        """Add the next decoded frame; whether it is damaged or predicted from a damaged one.
 
-        marked: whether the decoder marked the frame as damaged. clean: whether the frame is
-        predicted from no other. After 5 s the stream counts as undamaged, because an encoder
-        without key frames has refreshed all parts of the image by then.
+        arrival_ns: CLOCK_MONOTONIC. marked: the decoder marked the frame as damaged. clean: the
+        frame is predicted from no other. After 5 s the stream counts as undamaged, because an
+        encoder without key frames has refreshed all parts of the image by then.
         """
         self._has_begun = True
         waited = self._since_ns is not None and arrival_ns - self._since_ns > _LONGEST_NS
@@ -99,17 +99,18 @@ class Damage:
             self._since_ns = arrival_ns
         return marked or self._since_ns is not None
 
-    def undecodable(self, arrival_ns: int) -> None:
-        """A packet was so damaged that it gave no picture; before the first one all are."""
+    def add_undecodable(self, arrival_ns: int) -> None:
+        """A packet gave no frame: the next ones are damaged. No effect before the first frame."""
         if self._has_begun:
             self.is_damaged(arrival_ns, marked=True, clean=False)
 
 
-class References:
-    """Follows a stream's `frame_num`; call `is_broken` for each packet (one frame), in order.
+class ReferenceTracker:
+    """Follows the `frame_num` of an H.264 stream to detect lost frames; call `is_broken` for each
+    packet (one frame), in order.
 
-    A stream without H.264 start codes never counts as broken, nor one whose encoder does not count
-    as the standard demands.
+    extradata: SPS and PPS of the container, or b"". A stream without H.264 start codes never counts
+    as broken, nor one whose encoder does not count `frame_num` as the standard demands.
     """
 
     def __init__(self, extradata: bytes = b"") -> None:
@@ -123,7 +124,7 @@ class References:
             self._learn(nal)
 
     def is_broken(self, packet: bytes, arrival_ns: int) -> bool:
-        """Whether this packet's frame is predicted from a frame that was lost.
+        """Add the next packet; whether its frame is predicted from a frame that was lost.
 
         The damage ends with a frame that is predicted from none, after the number of frames that a
         recovery point states, and after 5 s at the latest (a stream without key frames).
@@ -141,15 +142,15 @@ class References:
     def _follow(self, slices: list[_Slice], arrival_ns: int) -> None:
         first = slices[0]
         gap = self._is_gap(first)
-        if self._counts_otherwise(gap and not first.idr):
+        if self._is_numbering_unusable(gap and not first.idr):
             self._broken_ns = None
         else:
-            self._judge(first, slices, arrival_ns, gap=gap)
+            self._update_broken(first, slices, arrival_ns, gap=gap)
         if first.reference or self._last is None:
             self._last = first.frame_num
 
-    def _counts_otherwise(self, gap: bool) -> bool:
-        """Whether the encoder's numbers say nothing: each picture in a row was a gap."""
+    def _is_numbering_unusable(self, gap: bool) -> bool:
+        """Whether the numbers show nothing, because 10 frames in a row were gaps."""
         if self._gaps_in_a_row < _GAPS_IN_A_ROW:
             self._gaps_in_a_row = self._gaps_in_a_row + 1 if gap else 0
             self._regular_in_a_row = 0
@@ -159,7 +160,9 @@ class References:
                 self._gaps_in_a_row = 0
         return self._gaps_in_a_row >= _GAPS_IN_A_ROW
 
-    def _judge(self, first: _Slice, slices: list[_Slice], arrival_ns: int, *, gap: bool) -> None:
+    def _update_broken(
+        self, first: _Slice, slices: list[_Slice], arrival_ns: int, *, gap: bool
+    ) -> None:
         if first.idr or all(s.intra for s in slices) or self._has_waited(arrival_ns):
             self._broken_ns = self._recovers_in = None
         elif gap:
@@ -174,14 +177,14 @@ class References:
         return recovered or arrival_ns - self._broken_ns > _LONGEST_NS
 
     def _is_gap(self, found: _Slice) -> bool:
-        """7.4.3: it is that of the reference picture before, or one more."""
+        """Whether `frame_num` is neither the last reference frame's nor one more (7.4.3)."""
         if self._last is None or found.sequence.gaps_allowed:
             return False
         following = (self._last + 1) % (1 << found.sequence.bits)
         return found.frame_num not in (self._last, following)
 
     def _learn(self, nal: bytes) -> None:
-        """Take what a parameter set or a recovery point says; a damaged one says nothing."""
+        """Store the content of a parameter set or recovery point; ignore a damaged one."""
         if not nal:
             return
         kind = nal[0] & 0x1F
@@ -278,7 +281,7 @@ def _recovery_count(payload: bytes) -> int | None:
 
 
 def _extended(raw: bytes, at: int) -> tuple[int, int]:
-    """A number that goes on after each 0xFF, and where the next begins (7.3.2.3.1)."""
+    """Read a number that continues after each 0xFF (7.3.2.3.1); (number, index after it)."""
     value = 0
     while at < len(raw) and raw[at] == 0xFF:
         value, at = value + 255, at + 1

@@ -30,11 +30,11 @@ _RATE_HZ = 90_000  # of RTP's video times
 _WRAP = 1 << 32
 
 
-def kind_of(data: bytes) -> Kind | None:
-    """Format of a datagram; None if it is no supported video."""
+def video_format(data: bytes) -> Kind | None:
+    """Video format of a UDP datagram by its first bytes; None if it is no supported video."""
     if data[:1] == bytes([_SYNC]) and _is_transport(data):
         return "mpegts"
-    payload = payload_of(data)
+    payload = rtp_payload(data)
     if payload:
         if data[1] & 0x7F == _MPEG_TS_TYPE and payload[0] == _SYNC:
             return "rtp mpegts"
@@ -47,11 +47,11 @@ def kind_of(data: bytes) -> Kind | None:
     return "mpegts" if _is_transport(data) else None
 
 
-def named(data: bytes) -> str:
-    """Name of an unsupported datagram format, for the operator."""
+def describe_unsupported(data: bytes) -> str:
+    """Describe a datagram that is no supported video, for the operator."""
     if data[:1] in (b"\xfd", b"\xfe") and len(data) >= 8:
         return "MAVLink: is this the autopilot's port?"
-    if payload_of(data):
+    if rtp_payload(data):
         kind = {26: ", JPEG", 32: ", MPEG-2"}.get(data[1] & 0x7F, "")
         return f"RTP of payload type {data[1] & 0x7F}{kind}: have it send H.264 or H.265"
     return (
@@ -60,7 +60,7 @@ def named(data: bytes) -> str:
 
 
 def _is_transport(data: bytes) -> bool:
-    """Whether MPEG-TS packets follow one another in it; a datagram may begin inside one."""
+    """Whether the datagram holds consecutive MPEG-TS packets; it may begin inside one."""
     begins = 1 if data[:1] == bytes([_SYNC]) else _PACKET
     least = 1 if begins == 1 else _LEAST_SYNCS
     return len(data) >= _PACKET and any(
@@ -68,8 +68,8 @@ def _is_transport(data: bytes) -> bool:
     )
 
 
-def payload_of(data: bytes) -> bytes:
-    """RTP's payload; b"" for RTCP or no RTP packet."""
+def rtp_payload(data: bytes) -> bytes:
+    """Payload of an RTP packet; b"" for RTCP or any other datagram."""
     if len(data) <= _HEADER or data[0] >> 6 != 2 or 72 <= data[1] & 0x7F <= 76:
         return b""
     begin = _HEADER + 4 * (data[0] & 0x0F)
@@ -80,7 +80,7 @@ def payload_of(data: bytes) -> bytes:
 
 
 def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
-    """By a NAL unit's header, or that of what RTP makes of it."""
+    """Codec by the header of a NAL unit, or of an RTP packet of NAL units; None for another."""
     if len(unit) < 2 or unit[0] & 0x80:
         return None
     if not unit[0] & 0x01 and unit[1] == 1 and unit[0] >> 1 in _HEVC_TYPES:
@@ -89,11 +89,11 @@ def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
 
 
 @dataclass
-class RtpPictures:
+class RtpDepacketizer:
     """Assembles RTP packets of H.264 or H.265 to IVF or MPEG-TS, each frame with its time.
 
-    A frame that lacks a packet is left out, because a decoder would show the damage for seconds.
-    sets: parameter sets of an SDP, put before the first frame.
+    A frame that lacks a packet, also by reordering, is dropped: a decoder would show the damage for
+    seconds. sets: parameter sets of an SDP, put before the first frame.
     """
 
     codec: Literal["h264", "hevc"]
@@ -109,9 +109,9 @@ class RtpPictures:
     _told: int | None = None  # RTP's time of the picture before
     _transport: TransportStream = field(default_factory=TransportStream)
 
-    def take(self, data: bytes) -> bytes:
-        """The bytes for FFmpeg that a datagram completes, often none."""
-        payload = payload_of(data)
+    def add_packet(self, data: bytes) -> bytes:
+        """Add an RTP packet; returns bytes for FFmpeg if it completes a frame, otherwise b""."""
+        payload = rtp_payload(data)
         if not payload:
             return b""
         sequence, time = struct.unpack_from(">HI", data, 2)
@@ -126,7 +126,7 @@ class RtpPictures:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether a frame is incomplete."""
+        """Whether packets of a frame wait for the rest."""
         return self._time is not None
 
     def _add(self, payload: bytes) -> None:
@@ -144,7 +144,9 @@ class RtpPictures:
             self._units.append(_START + payload)
 
     def _add_part(self, payload: bytes, head: int) -> None:
-        """A fragment: its header says of which type of unit, and whether it is the first."""
+        """Add a fragment of a NAL unit; its header says the unit's type and whether it is the
+        first.
+        """
         if len(payload) <= head:
             return
         if payload[head] & 0x80:

@@ -23,7 +23,9 @@ _MOST_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class SdpSession:
-    """host: to listen on, a multicast group, or 0.0.0.0. sets: the parameter sets, Annex B."""
+    """host: to listen at: a multicast group, loopback or 0.0.0.0. sets: parameter sets (Annex B) or
+    b"".
+    """
 
     host: str
     port: int
@@ -31,7 +33,7 @@ class SdpSession:
 
     @classmethod
     def read(cls, path: Path) -> SdpSession:
-        """Read a file; `StreamOpenError` if it has no RTP video of H.264 or H.265."""
+        """Read a file; `StreamOpenError` if it describes no RTP video of H.264 or H.265."""
         try:
             text = plain_text(path, _MOST_BYTES)
         except (OSError, UnicodeDecodeError) as error:
@@ -52,7 +54,7 @@ class SdpSession:
 
 
 def _host(text: str) -> str:
-    """The group or this computer's own loopback; another address may be the sender's."""
+    """The multicast group or loopback address, else 0.0.0.0: another may be the sender's."""
     line = re.search(r"^c=IN IP[46] ([^\s/]+)", text, re.MULTILINE)
     try:
         address = ipaddress.ip_address(line[1] if line else "0.0.0.0")

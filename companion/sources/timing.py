@@ -43,7 +43,7 @@ class MinimumLag:
     _last_sender: int = field(default=-(2**63))
 
     def map(self, sender_ns: int, arrival_ns: int) -> int:
-        """CLOCK_MONOTONIC (ns) of `sender_ns`, for a message that arrived at `arrival_ns`."""
+        """`sender_ns` as CLOCK_MONOTONIC (ns), of a message that arrived at `arrival_ns`."""
         lag = arrival_ns - sender_ns
         if self._is_discontinuity(lag, sender_ns):
             self._current = self._previous = None
@@ -64,14 +64,16 @@ class MinimumLag:
 
 @dataclass(frozen=True)
 class FrameTimestamps:
-    """Time stamps of a decoded frame. pts_ns: presentation time, unknown epoch."""
+    """Time stamps of a frame; None without. pts_ns: presentation time, unknown epoch."""
 
     pts_ns: int | None
     misp: MispTime | None
 
 
 class ExposureClock:
-    """Computes the exposure times of one stream; make a new one for each connection."""
+    """Computes exposure times; a new one for each connection. device: a V4L2 device, whose
+    presentation times are CLOCK_MONOTONIC.
+    """
 
     def __init__(self, latency_ns: int, timing: Timing = "auto", *, device: bool = False) -> None:
         self._timing = timing
@@ -116,15 +118,15 @@ class ExposureClock:
         return known if _plausible(known, arrival_ns) else relative
 
     def _agrees(self, excess_ns: int) -> bool:
-        """Whether a stamp may be taken as it is: after a step of this computer's clock only if it
-        says of the lag what the stamps before the step said.
+        """Whether a MISP stamp is used as it is. After a step of this computer's clock, the stamp
+        must give the lag that the stamps before the step gave.
         """
         if not self._held or self._excess_ns is None:
             return True
         return abs(excess_ns - self._excess_ns) <= _STEP_NS
 
     def _watch_wall_clock(self, offset_ns: int) -> None:
-        """A step of it must not enter the flight: the vehicle has not moved."""
+        """Detect a step of this computer's clock, so that exposure times do not step with it."""
         before, self._wall_clock_ns = self._wall_clock_ns, offset_ns
         if before is not None and abs(offset_ns - before) > _STEP_NS:
             self._held = True
@@ -138,7 +140,8 @@ class ExposureClock:
 def system_minus_monotonic() -> int:
     """The system clock minus CLOCK_MONOTONIC, ns.
 
-    From the closest of a few pairs of readings: another thread may have its turn between two.
+    Taken from the closest of up to 5 pairs of readings, because another thread may run between two
+    readings.
     """
     pairs = []
     for _ in range(_READINGS):

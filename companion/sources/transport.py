@@ -21,7 +21,7 @@ class TransportStream:
         self._counts = {0: 0, _PMT: 0, _VIDEO: 0}
 
     def picture(self, data: bytes, time: int) -> bytes:
-        """One frame. data: Annex B; time: in 1/90000 s since the first."""
+        """Encode one frame. data: Annex B; time: in 1/90000 s since the first frame."""
         video = 0xE000 | _VIDEO
         pat = struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 1, 0xE000 | _PMT)
         pmt = struct.pack(">HBBBHHBHH", 1, 0xC1, 0, 0, video, 0xF000, _HEVC, video, 0xF000)
@@ -49,7 +49,7 @@ class TransportStream:
 
 
 def _stamp(time: int) -> bytes:
-    """A PES packet's flags and presentation time, 33 bits."""
+    """Flags and presentation time (33 bits) of a PES packet; time in 1/90000 s."""
     t = time & 0x1_FFFF_FFFF
     high, middle, low = t >> 30, t >> 15 & 0x7FFF, t & 0x7FFF
     return b"\x80\x80\x05" + struct.pack(">BHH", 0x21 | high << 1, middle << 1 | 1, low << 1 | 1)

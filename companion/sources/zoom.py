@@ -62,21 +62,24 @@ class ZoomTable(BaseModel):
         return points
 
     def factor(self, level: float) -> float | None:
-        """Multiple of the model's focal length; None outside the table."""
+        """Focal length at this level (0 to 100), as a multiple of the model's; None outside."""
         levels, factors = zip(*self.points, strict=True)
         if not levels[0] <= level <= levels[-1]:
             return None
         return math.exp(float(np.interp(level, levels, np.log(factors))))
 
 
-def longer(camera: Camera, factor: float) -> Camera:
-    """The camera with another focal length; principal point and distortion are unchanged."""
+def with_focal_factor(camera: Camera, factor: float) -> Camera:
+    """The camera with its focal length times `factor`; principal point and distortion are
+    unchanged.
+    """
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
 class FocalCorrection:
-    """Estimates the zoom table's error from images: the logarithm of true over table focal length.
-    Its sigma is half the bound at first, and again after the zoom changes.
+    """Estimates the zoom table's error, `value`: ln(true focal length / table's). bound: of its
+    size, as a share. The sigma is half the bound at first; a zoom change widens it again, at most
+    to that.
     """
 
     def __init__(self, bound: float) -> None:
@@ -84,14 +87,14 @@ class FocalCorrection:
         self._variance = self._first = (0.5 * self._bound) ** 2
         self.value = 0.0
 
-    def moved(self, by: float) -> None:
-        """The zoom changed; by: change of the logarithm of its factor."""
+    def zoom_changed(self, by: float) -> None:
+        """Increase the sigma after a zoom change. by: change of ln(zoom factor)."""
         other = min(abs(by) / _ELSEWHERE, 1.0)
         self._variance = min(self._variance + other * self._first, self._first)
 
     def learn(self, seen: float, sigma: float) -> None:
-        """Add a frame's logarithm of true over table focal length. Errors of consecutive frames are
-        correlated, so its weight is reduced.
+        """Update with one frame. seen: measured ln(true focal length / table's); sigma: its 1
+        sigma. The weight is reduced 9 times, because errors of consecutive frames are correlated.
         """
         noise = _ALIKE_PICTURES * sigma**2
         gain = self._variance / (self._variance + noise)
@@ -101,11 +104,12 @@ class FocalCorrection:
 
 
 class ZoomedFrames:
-    """Sets the camera model of every frame by its zoom, on the feed's thread; `factor` may be
-    called from any.
+    """Sets the camera model of each frame by its zoom, on the feed's thread; `factor` and `learn`
+    may be called from any thread.
 
-    level_at: the reported zoom level at a time, None if unknown. report: receives an alert when a
-    problem begins, and every ten seconds while it lasts.
+    level_at(time_ns, hold_s): the zoom level (0 to 100) that the camera reported within hold_s of
+    that time, None if unknown. report: receives an alert when a problem begins, and every ten
+    seconds while it lasts.
     """
 
     def __init__(
@@ -119,32 +123,32 @@ class ZoomedFrames:
         self._factor: float | None = None
         self._correction = FocalCorrection(table.refine)
         self._by_table: float | None = None  # the newest picture's factor
-        self._given: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
+        self._assigned: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
         self._reported_ns: int | None = None
         self.unknown = 0  # frames
 
     def __call__(self, frame: Frame) -> Frame | None:
-        """The frame with its camera; None where its focal length is not known: a fix of it would be
-        metres off and look as good as any.
+        """The frame with its camera model. None if the focal length is unknown, because the fix
+        would be wrong by metres and look as good as any.
         """
         level = self._level_at(frame.exposure_time_ns, self._table.hold_s)
         factor = None if level is None else self._table.factor(level)
         if factor is None:
-            self._doubt(level, frame.exposure_time_ns)
+            self._report_unknown(level, frame.exposure_time_ns)
             return None
         self._reported_ns = None
         with self._lock:
             if self._by_table is not None:
-                self._correction.moved(math.log(factor / self._by_table))
+                self._correction.zoom_changed(math.log(factor / self._by_table))
             self._by_table = by_table = factor
             factor *= math.exp(self._correction.value)
             if self._factor is None or abs(factor / self._factor - 1.0) > _ALIKE:
                 self._factor = factor
             factor = self._factor
-            self._given.append((frame.exposure_time_ns, by_table, factor))
-        return replace(frame, camera=longer(frame.camera, factor))
+            self._assigned.append((frame.exposure_time_ns, by_table, factor))
+        return replace(frame, camera=with_focal_factor(frame.camera, factor))
 
-    def before(self, take: Callable[[Frame], object]) -> Callable[[Frame], None]:
+    def zoom_filter(self, take: Callable[[Frame], object]) -> Callable[[Frame], None]:
         """A receiver of frames that passes those with known zoom to `take`, with their camera."""
 
         def hand_on(frame: Frame) -> None:
@@ -155,23 +159,23 @@ class ZoomedFrames:
         return hand_on
 
     def learn(self, estimate: PoseEstimate) -> None:
-        """Use a registered frame's focal length; any thread, never blocks."""
+        """Correct the table by a registered frame's focal length; any thread, never blocks."""
         fit = estimate.focal
         if fit is None or not self._table.refine:
             return
         with self._lock:
-            for time_ns, by_table, factor in self._given:
+            for time_ns, by_table, factor in self._assigned:
                 same = by_table == self._by_table  # of a lens that moved on it says nothing
                 if time_ns == estimate.exposure_time_ns and same:
                     self._correction.learn(math.log(fit.factor * factor / by_table), fit.sigma)
 
     @property
     def factor(self) -> float | None:
-        """Focal length factor of the newest frame with known zoom."""
+        """Focal length of the newest frame with known zoom, as a multiple of the model's."""
         with self._lock:
             return self._factor
 
-    def _doubt(self, level: float | None, time_ns: int) -> None:
+    def _report_unknown(self, level: float | None, time_ns: int) -> None:
         self.unknown += 1
         if self._reported_ns is not None and 0 <= time_ns - self._reported_ns < _AGAIN_NS:
             return

@@ -11,7 +11,7 @@ from companion.config import CompanionConfig, load_config, parse_config, resolve
 from companion.errors import ConfigError
 
 
-def keep(config: CompanionConfig) -> int:
+def keep_settings(config: CompanionConfig) -> int:
     """Keep the deployment in memory; returns a file descriptor that child processes inherit."""
     with open(os.memfd_create("deployment"), "wb") as file:
         # Escaped: a folder's name may be no UTF-8.
@@ -23,8 +23,8 @@ def keep(config: CompanionConfig) -> int:
 def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:
     """The deployment of a file; if the file cannot be read, the kept deployment and the reason.
 
-    kept: the descriptor returned by `keep`; None at a first start, where an unreadable file is an
-    error.
+    kept: the descriptor returned by `keep_settings`; None at a first start, where an unreadable
+    file is an error.
     """
     try:
         return load_config(path), ""

@@ -23,8 +23,8 @@ class Beat:
 
 
 class FlightProcess:
-    """A flight process. standby: it is started with ``--standby``, prepares and waits. hands_on:
-    inherited file descriptors.
+    """Starts and controls a flight process. standby: it is started with ``--standby``, prepares and
+    waits. hands_on: inherited file descriptors.
 
     It has its own process group, so that the terminal's interrupt reaches it through the supervisor
     only. It has no session of its own, because Linux schedules each session as one group and would
@@ -62,7 +62,7 @@ class FlightProcess:
                 self._process.stdin.flush()
 
     def wait(self, timeout_s: float) -> int | None:
-        """Exit code, negative for a signal; None while it runs."""
+        """Wait; exit code, negative for a signal, or None while it runs after timeout_s."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -91,7 +91,7 @@ class FlightProcess:
         self.wait(_KILL_S)
 
     def interrupt(self, number: int) -> None:
-        """Pass a signal on; harmless if it has ended."""
+        """Send the signal `number`; harmless if the process has ended."""
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
 
@@ -106,6 +106,6 @@ class FlightProcess:
 
 
 def _beat(line: bytes) -> Beat | None:
-    """A line of `companion.supervision.pulse`; None for anything else."""
+    """Parse a line of `companion.supervision.pulse`; None for anything else."""
     part, _, age_ms = line.decode(errors="replace").partition(" ")
     return Beat(part, int(age_ms) * 1e-3) if age_ms.isdecimal() and len(age_ms) < 12 else None

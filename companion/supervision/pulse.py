@@ -1,7 +1,7 @@
 """Sends signs of life four times a second to the supervisor, which restarts a hanging process.
 
 A process whose threads hang is not dead, and its heartbeat may continue. So each thread that a
-position needs notes the time of its last cycle; the oldest is sent.
+position needs stores the time of its last cycle; the oldest is sent.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.supervision.processes import ENDING
 from mavlink_bridge.link.clock import monotonic_ns
 
@@ -43,7 +43,7 @@ class Pulse:
         recording; after an error it restarts soon.
         """
         self._stop.set()
-        ended = joined(self._thread)
+        ended = wait_for_end(self._thread)
         self._say(f"{ENDING if clean_shutdown else 'failing'} 0\n".encode())
         if ended:  # else its next line would go into whatever file has the number then
             os.close(self._descriptor)
@@ -61,7 +61,7 @@ class Pulse:
 
 
 def line(beats: Mapping[str, int], now_ns: int) -> bytes:
-    """The line for a time; ``all 0`` without components."""
+    """The line for now_ns; ``all 0`` without components."""
     if not beats:
         return b"all 0\n"
     name = min(beats, key=lambda one: beats[one])

@@ -34,7 +34,7 @@ def without_lost_disks(
     beside = None if record is None else record.folder.parent
     tlog = bridge.tlog
     folders = {None if tlog is None else tlog.parent, state, beside} - {None}
-    lost = _lost(filter(None, folders), probe or written_to)
+    lost = _lost(filter(None, folders), probe or write_problem)
     if not lost:
         return config, ""
     # Of what is read, too: without a disk that answers there is nothing to read.
@@ -71,8 +71,8 @@ def _lost(folders: Iterable[Path], probe: Callable[[Path], str]) -> dict[Path, s
     return {folder: why for folder, why in told.items() if why}
 
 
-def written_to(folder: Path) -> str:
-    """Why a folder cannot be written to; empty if it can, or if the disk is full."""
+def write_problem(folder: Path) -> str:
+    """Why a folder cannot be written to; "" if it can, or if the disk is full."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=".again-", dir=folder)

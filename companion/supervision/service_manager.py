@@ -35,7 +35,7 @@ class ServiceManager:
             self._socket = None
 
     def ready(self) -> None:
-        """Report that the service works."""
+        """Report that the service has started."""
         self._say("READY=1")
 
     def alive(self) -> None:

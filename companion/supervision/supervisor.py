@@ -38,7 +38,7 @@ _USAGE = 2  # exit code of a named error
 
 
 class Process(Protocol):
-    """A flight process."""
+    """A flight process, as `FlightProcess`."""
 
     @property
     def pid(self) -> int:
@@ -48,7 +48,7 @@ class Process(Protocol):
         """Let a standby fly."""
 
     def wait(self, timeout_s: float) -> int | None:
-        """Exit code, negative for a signal; None while it runs."""
+        """Wait up to timeout_s; exit code, negative for a signal, or None while it runs."""
 
     def beats(self) -> Sequence[Beat]:
         """Signs of life since the last call."""
@@ -60,7 +60,7 @@ class Process(Protocol):
         """Close the pipes."""
 
     def interrupt(self, number: int) -> None:
-        """Pass a signal on; harmless if it has ended."""
+        """Send the signal `number`; harmless if the process has ended."""
 
     def dismiss(self) -> None:
         """End a standby that is not needed, and reap it."""
@@ -97,10 +97,10 @@ class Manager(Protocol):
     """The service manager, which restarts the supervisor if it is silent for long."""
 
     def ready(self) -> None:
-        """A flight process works: each component has completed a cycle."""
+        """Report that a flight process works: each component has completed a cycle."""
 
     def alive(self) -> None:
-        """The flight process is supervised and does not hang."""
+        """Report that the flight process is supervised and does not hang."""
 
     def status(self, text: str) -> None:
         """Report the status as text."""
@@ -156,7 +156,7 @@ class Supervisor:
                 if hangs:
                     self._recover(ProcessFault.HANGS, Name(hangs))
                 else:
-                    self._recover(ProcessFault.DIED, Name(described(code)))
+                    self._recover(ProcessFault.DIED, Name(exit_code_text(code)))
                 if self._flying is None:  # an order to end came while it waited
                     return code if code > 0 else 128 - code
         finally:
@@ -166,7 +166,7 @@ class Supervisor:
                 self._standby.dismiss()
 
     def stop(self, number: int) -> None:
-        """Pass a signal on and end with the flight process; for a signal handler."""
+        """Pass the signal `number` on, and end with the flight process; for a signal handler."""
         self._stopping = True
         if self._flying is not None:
             self._flying.interrupt(number)
@@ -191,7 +191,7 @@ class Supervisor:
         return code
 
     def _hanging(self) -> str:
-        """What of the flight process hangs; empty while nothing does."""
+        """Name of the component that hangs; "" if none does."""
         assert self._flying is not None
         now_s, beats = self._clock(), self._flying.beats()
         looked_away = now_s - self._looked_s > _LOOKED_AWAY_S
@@ -206,7 +206,7 @@ class Supervisor:
             self._patience_s = self._policy.ending_s if is_ending else self._policy.silent_s
             without_turn_s = min(last.age_s, now_s - self._awake_s)
             hangs = last.part[:_PART] if without_turn_s > self._policy.part_s else ""
-            self._tell_ready(now_s, last)
+            self._report_ready(now_s, last)
         elif looked_away:
             self._heard_s = now_s
         elif now_s - self._heard_s > self._patience_s:
@@ -215,8 +215,8 @@ class Supervisor:
             self._manager.alive()  # a start, too, which may compile: it has its patience here
         return hangs
 
-    def _tell_ready(self, now_s: float, last: Beat) -> None:
-        """Once every part took a turn since the first sign of life: a frame, or a wait for one."""
+    def _report_ready(self, now_s: float, last: Beat) -> None:
+        """Report once all components had a cycle since the first sign of life."""
         if self._shown_s is None:
             self._shown_s = now_s
         if self._manager is None or last.age_s >= now_s - self._shown_s or not self._is_new:
@@ -231,7 +231,7 @@ class Supervisor:
         return -signal.SIGKILL
 
     def _prepare_standby(self) -> None:
-        """Without one a restart takes longer, and nothing else: the flight goes on."""
+        """Start a standby. If that fails, only a restart takes longer; the flight continues."""
         if self._clock() < self._no_standby_until_s:
             return
         try:
@@ -241,11 +241,11 @@ class Supervisor:
             _log.warning("no standby can be started: %s", error)
 
     def _is_hopeless(self, code: int) -> bool:
-        """A wrong configuration is as wrong the next time; it was told where it was found."""
+        """Whether a restart is useless: the configuration is wrong, as reported."""
         return code == _USAGE and not self._deaths and self._standby is None
 
     def _recover(self, how: ProcessFault, what: Name) -> None:
-        """Fly again, tell and mark; nothing flies afterwards where an order to end came."""
+        """Start the next process, report the death and mark it; starts nothing after `stop`."""
         assert self._flying is not None
         dead, wait_s = self._flying.pid, self._wait_s()
         process, self._standby = self._standby, None
@@ -262,18 +262,18 @@ class Supervisor:
         if self._manager is not None:
             self._manager.status(body(news))
         if process is None:
-            self._begin_anew(wait_s)
+            self._cold_start(wait_s)
 
     def _wait_s(self) -> float:
-        """Seconds before a cold start, now that one died: longer, the more died of late."""
+        """Seconds to wait before a cold start; longer after more deaths lately."""
         now_s, policy = self._clock(), self._policy
         self._deaths.append(now_s)
         recent = sum(now_s - at < policy.window_s for at in self._deaths)
         beyond = recent - policy.deaths
         return 0.0 if beyond < 0 else min(2.0 ** min(1 + beyond, 16), policy.wait_s)
 
-    def _begin_anew(self, wait_s: float) -> None:
-        """A cold start, however long the computer has no process to give."""
+    def _cold_start(self, wait_s: float) -> None:
+        """Start a process after wait_s, and try again as long as the computer cannot start one."""
         if self._flying is not None:
             self._flying.close()
             self._flying = None
@@ -289,7 +289,7 @@ class Supervisor:
                 again_s = min(2.0 * again_s, self._policy.wait_s)
 
     def _wait(self, seconds: float) -> None:
-        """Unless an order to end comes."""
+        """Wait, but end at `stop`."""
         slices = math.ceil(seconds / _PAUSE_S)
         for _ in range(slices):
             if self._stopping:
@@ -300,8 +300,8 @@ class Supervisor:
 
 
 def _do_in_time(name: str, do: Callable[[], None]) -> None:
-    """Run it with a time limit: a report that fails must not delay the restart. The flight process
-    may have died of the same disk or port that blocks the report.
+    """Run `do` with a time limit: a report that fails must not delay the restart. The flight
+    process may have died of the same disk or port that blocks the report.
     """
 
     def guarded() -> None:
@@ -317,8 +317,8 @@ def _do_in_time(name: str, do: Callable[[], None]) -> None:
         _log.error("the death could not be reported: to %s it takes too long", name)
 
 
-def described(code: int) -> str:
-    """An exit code in words."""
+def exit_code_text(code: int) -> str:
+    """An exit code in words, for the operator."""
     if code >= 0:
         return f"exit {code}"
     try:

@@ -1,7 +1,7 @@
 """Assigns a ground station's clicks to frames, and refuses invalid ones.
 
-Each click is a new target. The operator sees an older frame than the camera's newest: the click
-belongs to the frame `targets.operator_delay_ms` before it arrived.
+Each click is a new target. The operator sees an older frame than the camera's newest: the clicked
+frame is the one exposed `targets.operator_delay_ms` before the click arrived.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MOST = 8  # clicked targets at a time
 class ClickPolicy:
     """Finds each click's frame among the past poses, and begins or ends its target.
 
-    report: tells the operator.
+    targets: receives the clicks; report: sends an alert to the operator.
     """
 
     def __init__(
@@ -45,38 +45,38 @@ class ClickPolicy:
         self._lock = threading.Lock()  # two links may both have a ground station
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle | None = None) -> None:
-        """Add an estimate; waiting clicks of that time are processed. Never blocks."""
+        """Add an accepted estimate, and process the clicks that wait for its time. Never blocks."""
         if estimate.accepted:
             self._history.add(estimate)
         if not self._waiting:
             return
         with self._lock:
             self._waiting = [
-                r for r in self._waiting if not self._place(r, estimate.exposure_time_ns)
+                r for r in self._waiting if not self._try_begin(r, estimate.exposure_time_ns)
             ]
 
     def on_request(self, request: TrackRequest) -> None:
-        """Process a click. Never blocks."""
+        """Begin the target of a click, or end targets if its kind is "stop". Never blocks."""
         with self._lock:
             if request.kind == "stop":
                 self._stop(request.number)
-            elif not self._place(request, request.time_ns):
+            elif not self._try_begin(request, request.time_ns):
                 self._waiting.append(request)
 
     def on_gone(self, name: str) -> None:
-        """A target has ended."""
+        """Remove a target that has ended from the clicked ones (at most 8 at a time)."""
         with self._lock:
             self._alive = [c for c in self._alive if c.name != name]
 
     def _stop(self, number: int) -> None:
-        """End one clicked target, or with 0 all of them."""
+        """End the clicked target with this number; 0 ends all of them."""
         self._waiting = [r for r in self._waiting if number not in (0, r.number)]
         ended = [c for c in self._alive if number in (0, c.number)]
         self._alive = [c for c in self._alive if number not in (0, c.number)]
         self._targets.forget(tuple(c.name for c in ended))
 
-    def _place(self, request: TrackRequest, now_ns: int) -> bool:
-        """Begin or refuse the request's target; False while its frame's pose may still come."""
+    def _try_begin(self, request: TrackRequest, now_ns: int) -> bool:
+        """Begin or refuse the request's target; False while its frame's pose may still arrive."""
         wanted_ns = request.time_ns - self._delay_ns
         newest = self._history.newest
         if newest is None or now_ns - newest.exposure_time_ns > _OLDEST_NS:
@@ -120,7 +120,7 @@ class ClickPolicy:
         self._targets.begin(click)
 
     def _refuse(self, request: TrackRequest, why: ClickRefusal) -> None:
-        """Say it once to an impatient operator."""
+        """Report the reason, at most every 2 s for the same reason."""
         if self._refused is None or (
             request.time_ns - self._refused[0] > _OLDEST_NS or self._refused[1] != why
         ):

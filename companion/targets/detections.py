@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import isfinite
 
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.errors import ConfigError, DetectionError
 from companion.targets.senders import Senders
 
@@ -34,7 +34,7 @@ _PAUSE_S = 0.001  # at most a thousand detections a second: a flood must not tak
 
 
 def clicked_name(number: int, asked_by: str = GROUND_STATION) -> str:
-    """Name of the target of the click with that number."""
+    """Target name of the click with that number. asked_by: GROUND_STATION or CONSOLE."""
     return f"{asked_by} {number}"
 
 
@@ -45,7 +45,7 @@ def clicked_number(name: str) -> int | None:
 
 @dataclass(frozen=True)
 class Detection:
-    """A target's pixel in one frame."""
+    """A target's pixel (u, v) in the frame that was exposed at time_ns, CLOCK_MONOTONIC."""
 
     target_id: str
     time_ns: int
@@ -55,7 +55,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class FrameName:
-    """Identifies a frame by number or presentation time; exactly one is set."""
+    """Identifies a frame by its number or presentation time (s); exactly one is set."""
 
     sequence: int | None = None
     pts_s: float | None = None
@@ -64,7 +64,8 @@ class FrameName:
 def parse_detection(data: bytes) -> tuple[Detection, FrameName | None]:
     """Decode one datagram; `DetectionError` for an invalid one.
 
-    The name of its frame is None where it tells the exposure; else the detection's time is 0.
+    The second value is None if the datagram has the exposure time. Otherwise it names the frame,
+    and the detection's time is 0.
     """
     try:
         message = json.loads(data)
@@ -112,8 +113,11 @@ def parse_host_port(text: str) -> tuple[str, int]:
 
 
 class DetectionListener:
-    """Receives detections on a thread; invalid datagrams are counted and ignored. Targets of two
-    senders with the same name are kept apart (`Senders`).
+    """Receives detections over UDP on a thread. Invalid datagrams are counted and ignored. Targets
+    of two senders with the same name are kept apart (`Senders`).
+
+    address: host:port to listen at; `ConfigError` if it cannot be used. on_detection: called on
+    that thread.
     """
 
     def __init__(
@@ -137,7 +141,7 @@ class DetectionListener:
     def close(self) -> None:
         """Stop listening."""
         self._stop.set()
-        joined(self._thread)
+        wait_for_end(self._thread)
         self._socket.close()
 
     def _run(self) -> None:

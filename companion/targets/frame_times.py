@@ -21,8 +21,9 @@ _SAME_S = 0.001  # presentation times that differ by less are of one picture
 class FrameTimes:
     """Gives each detection its frame's exposure time, at once or when the frame arrives.
 
-    A `PacketTap` that uses presentation times only. on_detection: receives detections with a time;
-    must not block. unmatched: number of detections whose frame never arrived. Thread-safe.
+    As a `PacketTap` it learns the frames' presentation times. on_detection: receives detections
+    with a time; must not block. unmatched: number of detections whose frame never arrived.
+    Thread-safe.
     """
 
     def __init__(self, on_detection: Callable[[Detection], None]) -> None:
@@ -34,7 +35,7 @@ class FrameTimes:
         self.unmatched = 0
 
     def add_detection(self, detection: Detection, name: FrameName | None = None) -> None:
-        """Pass a detection on, or keep it until its frame arrives."""
+        """Pass a detection on. With a frame name, it waits for the frame's exposure time first."""
         if name is None:
             self._on_detection(detection)
             return
@@ -49,7 +50,7 @@ class FrameTimes:
         self._on_detection(replace(detection, time_ns=time_ns))
 
     def add_frame(self, frame: Frame) -> None:
-        """Note a frame's number and exposure time. Never blocks."""
+        """Store a frame's number and exposure time, and pass on what waits for it. Never blocks."""
         with self._lock:
             self._by_sequence[frame.sequence] = frame.exposure_time_ns
             if len(self._by_sequence) > _KEPT:
@@ -57,7 +58,7 @@ class FrameTimes:
         self._release()
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A new connection restarts the presentation times: drop waiting detections."""
+        """A new connection restarts the presentation times: drop detections that wait for one."""
         with self._lock:
             self._by_pts.clear()
             kept = deque((d, n) for d, n in self._waiting if n.pts_s is None)
@@ -65,10 +66,10 @@ class FrameTimes:
             self._waiting = kept
 
     def packet(self, packet: av.Packet) -> None:
-        """Does nothing."""
+        """Does nothing; part of `PacketTap`."""
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """Note a frame's presentation time. Never blocks."""
+        """Store a frame's presentation time (s) and exposure time. Never blocks."""
         with self._lock:
             self._by_pts[pts] = exposure_time_ns
             if len(self._by_pts) > _KEPT:
@@ -76,7 +77,7 @@ class FrameTimes:
         self._release()
 
     def _release(self) -> None:
-        """Hand on what waited for the newest frame."""
+        """Pass on the detections whose frame has arrived."""
         with self._lock:
             timed = [(d, n, self._time_of(n)) for d, n in self._waiting]
             self._waiting = deque((d, n) for d, n, t in timed if t is None)

@@ -22,7 +22,7 @@ _LEAST_CHANGE = np.repeat([0.5, 0.05], 3)
 
 
 class PoseHistory:
-    """Accepted estimates in order of exposure. Thread-safe."""
+    """The newest 256 accepted estimates in order of exposure. Thread-safe."""
 
     def __init__(self) -> None:
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
@@ -42,8 +42,9 @@ class PoseHistory:
             return self._estimates[-1] if self._estimates else None
 
     def at(self, time_ns: int) -> PoseEstimate | None:
-        """The estimate at a time, interpolated between two neighbours if there is none; it then has
-        the worse covariance and state of both, increased by the possible change of motion.
+        """The estimate at time_ns (exposure, CLOCK_MONOTONIC); between frames it is interpolated,
+        with the worse covariance and state of both neighbours, increased by the possible change of
+        motion.
 
         None outside the history, and in gaps above a second.
         """
@@ -64,8 +65,8 @@ class PoseHistory:
 
 
 def _swing_s2(a: PoseEstimate, b: PoseEstimate, time_ns: int) -> float:
-    """By how much a straight line between two poses misses a motion that changes by 1 a second,
-    squared seconds: ``s (1 - s) T² / 2``.
+    """Error of linear interpolation between two poses per unit of acceleration: ``s (1 - s) T² /
+    2``, squared seconds.
     """
     gap_s = (b.exposure_time_ns - a.exposure_time_ns) * 1e-9
     share = (time_ns - a.exposure_time_ns) * 1e-9 / gap_s
@@ -73,8 +74,8 @@ def _swing_s2(a: PoseEstimate, b: PoseEstimate, time_ns: int) -> float:
 
 
 def _change(about: Sequence[PoseEstimate]) -> Array:
-    """(6,) m/s² and rad/s², world axes: by how much the motion changes from one of up to four
-    neighbours to the next, at most; 0 of two.
+    """(6,) m/s² and rad/s², world axes: the largest change of motion from one of up to four
+    neighbours to the next; 0 for two.
     """
     motions = [_motion(a, b) for a, b in pairwise(about)]
     most = np.zeros(6)
@@ -84,7 +85,7 @@ def _change(about: Sequence[PoseEstimate]) -> Array:
 
 
 def _motion(a: PoseEstimate, b: PoseEstimate) -> tuple[Array, float]:
-    """Mean velocity and turn rate (6,) from one pose to the next, and the middle's time, s."""
+    """Mean velocity and turn rate (6,), m/s, rad/s, between two poses; the middle's time, s."""
     p, q = a.world_from_camera, b.world_from_camera
     moved = np.concatenate([q.translation - p.translation, so3_log(q.rotation @ p.rotation.T)])
     span_s = (b.exposure_time_ns - a.exposure_time_ns) * 1e-9

@@ -1,4 +1,4 @@
-"""MAVLink numbers of targets."""
+"""Numbers by which MAVLink messages identify targets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MOST = 256  # names; many times as many as are followed at a time
 
 
 class TargetNumbers:
-    """Gives each target's name a number: the click's own, or the next one for detections.
+    """Gives each target's name a number: that of its click, or the next free one for detections.
 
     Numbers are unique; one is reused only after a million others. The 256 newest names are
     remembered.
@@ -26,12 +26,12 @@ class TargetNumbers:
         self._lock = threading.Lock()
 
     @property
-    def known(self) -> int:
+    def known_count(self) -> int:
         """Number of remembered names of detected targets."""
         return len(self._numbers)
 
-    def of(self, name: str) -> int:
-        """The number of the target of that name."""
+    def number_of(self, name: str) -> int:
+        """The number of the target of that name; a new name gets the next free one."""
         if (clicked := clicked_number(name)) is not None:
             return clicked
         with self._lock:

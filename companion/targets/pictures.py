@@ -12,9 +12,10 @@ Item = TypeVar("Item")
 
 
 class RecentPictures(Generic[Item]):
-    """A queue that drops the oldest beyond `most` items, or beyond 96 MiB. Not thread-safe.
+    """A queue that drops its oldest items beyond `most`, or beyond most_bytes if more than three
+    are left. Not thread-safe.
 
-    size: of one item in bytes.
+    size: gives the bytes of an item.
     """
 
     def __init__(
@@ -33,8 +34,8 @@ class RecentPictures(Generic[Item]):
         ):
             self.nbytes -= self._size(self._kept.popleft())
 
-    def keep(self, wanted: Callable[[Item], bool]) -> None:
-        """Drop all items that are not wanted."""
+    def retain(self, wanted: Callable[[Item], bool]) -> None:
+        """Keep only the items for which `wanted` is true."""
         self._kept = deque(item for item in self._kept if wanted(item))
         self.nbytes = sum(self._size(item) for item in self._kept)
 

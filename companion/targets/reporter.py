@@ -1,4 +1,4 @@
-"""Computes target coordinates from clicks, detections and estimates, on its own thread."""
+"""Computes target positions from clicks, detections and estimates, on a thread of its own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 
 from companion.config import TargetConfig
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.targets.detections import Detection
 from companion.targets.pictures import RecentPictures
 from companion.targets.target_manager import Click, TargetEstimate, TargetManager
@@ -29,12 +29,13 @@ _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
 
 
 class TargetReporter:
-    """Pairs detections with accepted estimates and updates the targets (`TargetManager`).
+    """Pairs detections with accepted estimates of the same frame and updates the targets
+    (`TargetManager`).
 
-    on_gone: called on the targets' thread with each name that ended, after the last on_target of
-    that name. report_alert: reports an alert to the operator. failed: number of calls that raised
-    an error, of which the first is logged; unmatched: number of detections whose frame has no
-    accepted estimate.
+    cast: intersects rays with the map. on_target: receives each fix. on_gone: receives the name of
+    each target that ended, after its last on_target. Both are called on the targets' thread.
+    report_alert: sends an alert to the operator. failed: number of calls that raised an error, of
+    which the first is logged; unmatched: number of detections whose frame has no accepted estimate.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class TargetReporter:
 
     @property
     def doubted(self) -> int:
-        """Number of detections whose position may not be reported (`TargetTrack.refusal`)."""
+        """Number of detections too uncertain to be reported (`TargetTrack.refusal`)."""
         return self._population.doubted
 
     @property
@@ -78,39 +79,39 @@ class TargetReporter:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread."""
+        """Stop the thread and wait for it."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Offer an estimate; only accepted ones are used. Never blocks."""
+        """Add an estimate; only accepted ones are used. Never blocks."""
         if estimate.accepted:
             with self._condition:
                 self._estimates.append(estimate)
                 self._condition.notify()
 
     def add_detection(self, detection: Detection) -> None:
-        """Offer a detection; it waits for its frame's estimate. Never blocks."""
+        """Add a detection; it waits for its frame's estimate. Never blocks."""
         with self._condition:
             self.unmatched += len(self._detections) == _KEPT  # the oldest makes room
             self._detections.append(detection)
             self._condition.notify()
 
     def begin(self, click: Click) -> None:
-        """Start a clicked target. Never blocks."""
+        """Start the target of a click. Never blocks."""
         with self._condition:
             self._clicks.append(click)
             self._condition.notify()
 
     def add_frame(self, frame: Frame) -> None:
-        """Offer a frame; clicked targets are tracked in it. Never blocks."""
+        """Add a frame, in which clicked targets are tracked. Never blocks."""
         with self._condition:
             self._pictures.append(frame)
 
     def forget(self, names: tuple[str, ...]) -> None:
-        """End these targets and drop their waiting detections. Never blocks."""
+        """End the targets of these names and drop their waiting detections. Never blocks."""
         with self._condition:
             self._forgotten += names
             kept = (d for d in self._detections if d.target_id not in names)
@@ -130,7 +131,7 @@ class TargetReporter:
                 newest = self._estimates[-1] if self._estimates else None
                 pictures = self._take_pictures()
             for estimate, frame in pictures:
-                self._guarded(self._population.look, estimate, _gray(frame))
+                self._guarded(self._population.add_image, estimate, _gray(frame))
             for click in clicks:
                 if not self._guarded(self._population.begin, click):
                     self._report_alert(alert(AlertId.TARGET_UNREADABLE, number=click.number))
@@ -140,13 +141,13 @@ class TargetReporter:
                 self._guarded(self._population.end, (name,))
             for detection, estimate in pairs:
                 if detection.target_id not in forgotten:
-                    self._guarded(self._population.see, detection, estimate)
+                    self._guarded(self._population.add_detection, detection, estimate)
             if newest is not None and newest is not self._held:
                 self._held = newest
-                self._guarded(self._population.hold, newest)
+                self._guarded(self._population.predict, newest)
 
     def _guarded(self, work: Callable[..., None], *arguments: Any) -> bool:
-        """Whether it went well."""
+        """Call `work`; False if it raised an error, which is counted."""
         try:
             work(*arguments)
         except Exception:  # a target must not end the flight
@@ -163,7 +164,7 @@ class TargetReporter:
         return any(self._match(d) is not None for d in self._detections)
 
     def _take_pairs(self) -> list[tuple[Detection, PoseEstimate]]:
-        """Detections whose frame has an estimate; the rest wait until newer frames pass them."""
+        """Take detections whose frame has an estimate; others wait until newer frames pass."""
         pairs, waiting = [], []
         newest = self._estimates[-1].exposure_time_ns if self._estimates else 0
         for detection in self._detections:
@@ -178,13 +179,13 @@ class TargetReporter:
         return pairs
 
     def _take_pictures(self) -> list[tuple[PoseEstimate, Frame]]:
-        """Pictures whose frame has an estimate; older ones never get one."""
+        """Take the frames that have an estimate, and drop the older ones, which never get one."""
         found = {e.exposure_time_ns: e for e in self._estimates}
         pairs = [
             (found[f.exposure_time_ns], f) for f in self._pictures if f.exposure_time_ns in found
         ]
         newest = self._estimates[-1].exposure_time_ns if self._estimates else 0
-        self._pictures.keep(lambda frame: frame.exposure_time_ns > newest)
+        self._pictures.retain(lambda frame: frame.exposure_time_ns > newest)
         return pairs
 
     def _match(self, detection: Detection) -> PoseEstimate | None:

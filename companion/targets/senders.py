@@ -1,4 +1,4 @@
-"""Keeps targets of different detectors with the same name apart."""
+"""Gives targets of different detectors different names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Address = tuple[str, int]
 
 @dataclass
 class _Named:
-    """Who uses a name. numbers: each sender's, 1 is the name's first; heard_ns: when last."""
+    """Senders of a name. numbers: of their targets, from 1; heard_ns: when each was heard last."""
 
     numbers: dict[Address, int] = field(default_factory=dict)
     heard_ns: dict[Address, int] = field(default_factory=dict)
@@ -36,7 +36,7 @@ class Senders:
         self._names: OrderedDict[str, _Named] = OrderedDict()
 
     def name_of(self, target_id: str, sender: Address, now_ns: int) -> str:
-        """The name of a sender's target. now_ns: CLOCK_MONOTONIC."""
+        """The target's name, with a number if senders share it. now_ns: CLOCK_MONOTONIC."""
         named = self._names.setdefault(target_id, _Named())
         self._names.move_to_end(target_id)
         if len(self._names) > _NAMES:
@@ -46,14 +46,14 @@ class Senders:
         if sender not in named.numbers:
             named.numbers[sender] = named.numbers.get(newest, 1) if newest is not None else 1
         elif newest is not None and newest != sender:
-            self._part(target_id, named, newest, named.numbers[sender])
+            self._split(target_id, named, newest, named.numbers[sender])
         named.heard_ns[sender], named.newest = now_ns, sender
         number = named.numbers[sender]
         return target_id if number == 1 else f"{target_id[:_LONGEST]} #{number}"
 
     @staticmethod
-    def _part(target_id: str, named: _Named, other: Address, number: int) -> None:
-        """Another sender has spoken since this one did: it has a number of its own from now on."""
+    def _split(target_id: str, named: _Named, other: Address, number: int) -> None:
+        """Give the `other` sender its own number, because both use the name in turn."""
         if named.numbers.get(other) != number:
             return
         named.count += 1
@@ -66,7 +66,7 @@ class Senders:
 
     @staticmethod
     def _forget(named: _Named, now_ns: int) -> None:
-        """Those that are gone, and the oldest of too many."""
+        """Remove the senders that are silent for 10 s, and the oldest of more than 8."""
         by_age = sorted(named.heard_ns, key=lambda a: -named.heard_ns[a])
         for k, sender in enumerate(by_age):
             if k >= _SENDERS or now_ns - named.heard_ns[sender] > _SILENT_NS:

@@ -1,6 +1,6 @@
-"""All active targets, each with one identity and one track.
+"""The active targets, each with one name and one track.
 
-It has no thread and no clock; the frames' exposure times are the time.
+No thread and no clock; the time is that of the frames' exposure.
 """
 
 from __future__ import annotations
@@ -68,8 +68,9 @@ def _off(a: Array, b: Array) -> float:
 @dataclass(frozen=True)
 class Click:
     """A click of the operator. estimate: pose of the frame that was clicked; pixel: the clicked
-    point; around: poses one sigma of the operator's delay before and after the frame, if known;
-    extent: width and height of the rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
+    point (u, v); around: poses one sigma of the operator's delay before and after the frame, if
+    known; extent: width and height of a clicked rectangle, pixels, None for a point; asked_by:
+    `GROUND_STATION` or `CONSOLE`.
     """
 
     number: int
@@ -81,13 +82,13 @@ class Click:
 
     @property
     def name(self) -> str:
-        """Name of its target."""
+        """Name of the target that the click begins."""
         return clicked_name(self.number, self.asked_by)
 
 
 @dataclass(frozen=True)
 class TargetEstimate:
-    """A target's position, and the pose estimate of its frame."""
+    """A target's position, and the pose estimate of the frame for which it is computed."""
 
     fix: TargetFix
     estimate: PoseEstimate
@@ -127,8 +128,8 @@ class _TargetState:
 
 @dataclass(frozen=True)
 class _Back:
-    """Where a target that was long unseen may have come out. since_ns: when it was first seen, at
-    position (3,); time_ns: when last.
+    """Where a target that was unseen for long may have reappeared. since_ns: when it was first seen
+    there, at position (3,) m; time_ns: when last.
     """
 
     since_ns: int
@@ -137,17 +138,17 @@ class _Back:
 
 
 def _number(name: str) -> int:
-    """Of a clicked target."""
+    """Number of a clicked target, by its name."""
     return clicked_number(name) or 0
 
 
 class TargetManager:
     """The active targets, by name. Not thread-safe.
 
-    tell: takes each fix. gone: takes the name of each target that ended. report_alert: tells the
-    operator. missed: number of detections without map under them: outside the frame, or in the sky;
-    doubted: of detections whose position is too uncertain to be reported; refused: of detections of
-    a 33rd target.
+    on_target: receives each fix. on_gone: receives the name of each target that ended.
+    report_alert: sends an alert to the operator. missed: number of detections without map under
+    them: outside the frame, or in the sky; doubted: of detections whose position is too uncertain
+    to be reported; refused: of detections of a 33rd target.
 
     Above 200 lines: a change of one target affects the others, so one class owns all.
     """
@@ -156,13 +157,13 @@ class TargetManager:
         self,
         config: TargetConfig,
         cast: RayCaster,
-        tell: Callable[[TargetEstimate], None],
-        gone: Callable[[str], None],
+        on_target: Callable[[TargetEstimate], None],
+        on_gone: Callable[[str], None],
         report_alert: Callable[[Alert], None],
     ) -> None:
         self._config = config
         self._cast = cast
-        self._tell, self._gone, self._report_alert = tell, gone, report_alert
+        self._on_target, self._on_gone, self._report_alert = on_target, on_gone, report_alert
         self._settings = TargetSettings(
             config.pixel_sigma,
             config.map_sigma_m,
@@ -181,7 +182,7 @@ class TargetManager:
         self.refused = 0
 
     def begin(self, click: Click) -> None:
-        """Start a clicked target and report its position, or why there is none."""
+        """Start the target of a click and report its position, or an alert why there is none."""
         name, time_ns = click.name, click.estimate.exposure_time_ns
         track = TargetTrack(name, replace(self._settings, confirm_s=0.0), self._cast)
         fix = track.observe(click.estimate, click.pixel, drift=self._drift(click))
@@ -190,7 +191,7 @@ class TargetManager:
             self._report_alert(
                 alert(AlertId.TARGET_REFUSED, number=click.number, why=Name(str(track.refusal)))
             )
-            self._gone(name)
+            self._on_gone(name)
             return
         life = _TargetState(track, time_ns, True, time_ns, found_ns=time_ns, begun_ns=time_ns)
         away = fix.position_world - click.estimate.world_from_camera.translation
@@ -203,8 +204,10 @@ class TargetManager:
         self._report(life, fix, click.estimate)
         self._follow(name, life, click, fix)
 
-    def see(self, detection: Detection, estimate: PoseEstimate) -> None:
-        """Process a detection in its frame, at most `rate_hz` times a second."""
+    def add_detection(self, detection: Detection, estimate: PoseEstimate) -> None:
+        """Update a target by a detection in the estimate's frame, and report its position; at most
+        `rate_hz` times a second.
+        """
         name, time_ns = detection.target_id, estimate.exposure_time_ns
         life = self._lives.get(name)
         if life is not None and time_ns - life.seen_ns < self._period_ns(life):
@@ -228,14 +231,14 @@ class TargetManager:
         life.reported_ns, life.refused_ns = time_ns, 0
         self._report(life, fix, estimate)
 
-    def look(self, estimate: PoseEstimate, gray: Gray) -> None:
-        """Track every clicked target in the image (H, W) grey of an accepted estimate."""
+    def add_image(self, estimate: PoseEstimate, gray: Gray) -> None:
+        """Track each clicked target in the image of an accepted estimate: (H, W) uint8 grey."""
         self._pictures.append((estimate, gray))
         for name, life in [(n, x) for n, x in self._lives.items() if x.follower is not None]:
             self._look_for(name, life, estimate, gray)
 
-    def hold(self, estimate: PoseEstimate) -> None:
-        """Predict every clicked target to a newer frame; end those hidden too long."""
+    def predict(self, estimate: PoseEstimate) -> None:
+        """Report each clicked target at a newer frame; end those out of view too long."""
         for name, life in [(n, x) for n, x in self._lives.items() if x.is_clicked]:
             time_ns = estimate.exposure_time_ns
             if not self._is_due(life, time_ns):
@@ -255,14 +258,14 @@ class TargetManager:
             self._report(life, fix, estimate)
 
     def end(self, names: tuple[str, ...]) -> None:
-        """End these targets and report the names of those that were active."""
+        """End these targets; on_gone receives the names of those that were active."""
         for name in names:
             if self._lives.pop(name, None) is not None:
-                self._gone(name)
+                self._on_gone(name)
 
     def _follow(self, name: str, life: _TargetState, click: Click, fix: TargetFix) -> None:
-        """Begin to track a clicked target in the image, from the clicked frame if it is kept,
-        through the newer frames. So the operator's delay causes no error.
+        """Begin to track a clicked target in the image: from the clicked frame, if it is kept,
+        through the newer ones, so that the operator's delay causes no error.
         """
         time_ns = click.estimate.exposure_time_ns
         kept = [p for p in self._pictures if abs(p[0].exposure_time_ns - time_ns) <= _PICTURE_NS]
@@ -286,16 +289,16 @@ class TargetManager:
                 self._look_for(name, life, newer, picture)
 
     def _look_for(self, name: str, life: _TargetState, estimate: PoseEstimate, gray: Gray) -> None:
-        """Measure its pixel where it is found; a moving one that is not coasts, then is lost."""
+        """Find a target in an image; one that moves and is not found is predicted, then lost."""
         time_ns, track, follower = estimate.exposure_time_ns, life.track, life.follower
         expected = track.expected(time_ns)
         if follower is None or expected is None:
             return
         since_s = (time_ns - life.found_ns) * 1e-9
         if track.moves:
-            found = self._found_moving(life, follower, estimate, gray)
+            found = self._find_moving(life, follower, estimate, gray)
         else:
-            found = self._found_leaving(name, life, (estimate, gray), expected[0])
+            found = self._find_leaving(name, life, (estimate, gray), expected[0])
         fix = None
         if found is not None:
             fix = track.observe(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
@@ -320,24 +323,26 @@ class TargetManager:
             )
             self.end((name,))
 
-    def _found_leaving(
+    def _find_leaving(
         self, name: str, life: _TargetState, picture: tuple[PoseEstimate, Gray], position: Array
     ) -> FollowedPosition | None:
-        """A target that was not measured to move yet, where it is beside its place (3,); None of
-        what is still there, or is not found.
+        """Find a target that was not measured to move yet, if it has left its place (3,); None if
+        it is still there, or is not found.
         """
         (estimate, gray), follower = picture, life.follower
         if follower is None:
             return None
         time_ns = estimate.exposure_time_ns
-        if (left := self._left(life, follower, estimate, gray, position)) is not None:
-            return left if self._drives(life, left, position, time_ns) else None
+        if (
+            left := self._find_departed_moving(life, follower, estimate, gray, position)
+        ) is not None:
+            return left if self._moves_steadily(life, left, position, time_ns) else None
         near = follower.find(gray, estimate, position, _STILL_M)
         is_over = time_ns - life.begun_ns > _DEPARTS_S * 1e9
         has_changed = follower.watch(gray, estimate, position)
         if near is None:
-            left = self._departed(life, follower, estimate, gray, position)
-            drives = left is not None and self._drives(life, left, position, time_ns)
+            left = self._find_departed(life, follower, estimate, gray, position)
+            drives = left is not None and self._moves_steadily(life, left, position, time_ns)
             return left if drives else None
         if has_changed:
             return None
@@ -346,7 +351,7 @@ class TargetManager:
         # It stands, and geometry holds it better than its look, which slides with every change of
         # view on what is not flat. What moved between pictures has left its place by now: if it is
         # still here, a roof or a crown about it moved against the ground instead.
-        self._stands(name, life, time_ns)
+        self._note_in_place(name, life, time_ns)
         if life.moved_at_once and is_over:
             life.moved_at_once = False
             follower.forget_shape()
@@ -361,8 +366,10 @@ class TargetManager:
         gray: Gray,
     ) -> bool:
         """Whether a target that was never measured to move ends, because the ground in its place is
-        visible. If the target only looks different, the operator is told: after a sudden change the
-        target may have left.
+        visible.
+
+        If the target only looks different, the operator is told: after a sudden change it may have
+        left.
         """
         number = _number(name)
         if life.moved_at_once and follower.shows_ground(gray, estimate):
@@ -385,7 +392,9 @@ class TargetManager:
         return False
 
     @staticmethod
-    def _drives(life: _TargetState, left: FollowedPosition, place: Array, time_ns: int) -> bool:
+    def _moves_steadily(
+        life: _TargetState, left: FollowedPosition, place: Array, time_ns: int
+    ) -> bool:
         """Whether successive matches away from the target's place (3,) move at a constant speed.
 
         A match in a single frame may be a similar corner of a roof or line of a sports field.
@@ -405,8 +414,8 @@ class TargetManager:
         off_m = [_off(a, b) for a, b in zip(at, ahead, strict=True)]
         return max(*off_m, _off(place, at[-1] - since_s * velocity)) <= _LEAVES_OFF_M
 
-    def _stands(self, name: str, life: _TargetState, time_ns: int) -> None:
-        """It is where it was, and looks as it did."""
+    def _note_in_place(self, name: str, life: _TargetState, time_ns: int) -> None:
+        """Note that a target is at its place and looks as before."""
         life.found_ns, life.unseen_ns = time_ns, 0
         if life.changed_ns:
             life.changed_ns = 0
@@ -414,8 +423,8 @@ class TargetManager:
 
     @staticmethod
     def _with_departure(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
-        """A held place whose target may have left it: nothing of it is seen, and it may be as far
-        away as it has driven since.
+        """The fix of a target that may have left its place: hidden, with the distance that it may
+        have driven since in its sigma.
         """
         gone_s = (fix.exposure_time_ns - life.changed_ns) * 1e-9
         sigma_m = min(_LEAVES_MPS * gone_s, most_m)
@@ -423,10 +432,10 @@ class TargetManager:
         seen = Visibility.HIDDEN if fix.visibility is Visibility.HELD else fix.visibility
         return replace(fix, visibility=seen, covariance=fix.covariance + level)
 
-    def _found_moving(
+    def _find_moving(
         self, life: _TargetState, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
     ) -> FollowedPosition | None:
-        """A moving target about where its motion leads; None where something hides it."""
+        """Find a moving target near its predicted position; None if something hides it."""
         time_ns = estimate.exposure_time_ns
         expected = life.track.expected(time_ns)
         if expected is None or life.track.is_being_hidden(estimate, expected[0]):
@@ -445,7 +454,7 @@ class TargetManager:
 
     @staticmethod
     def _is_back(life: _TargetState, found: FollowedPosition, time_ns: int) -> bool:
-        """Whether what was found goes on as the target did: a roof's edge does not."""
+        """Whether what was found moves on as the target did; a roof's edge does not."""
         back, velocity = life.back, life.track.velocity
         life.back = _Back(time_ns, time_ns, found.position)
         if back is None or velocity is None:
@@ -462,16 +471,16 @@ class TargetManager:
 
     @staticmethod
     def _may_be_back(life: _TargetState, time_ns: int) -> bool:
-        """Whether it is seen to come out this moment."""
+        """Whether a target that was unseen for long was found in the last 0.5 s."""
         back = life.back
         return back is not None and (time_ns - back.time_ns) * 1e-9 <= _BACK_GAP_S
 
-    def _left(
+    def _find_departed_moving(
         self, life: _TargetState, follower: ImageFollower, estimate: PoseEstimate, gray: Gray,
         position: Array,
     ) -> FollowedPosition | None:  # fmt: skip
-        """A target that moved when it was clicked, where it covers other ground than then; None of
-        what stands.
+        """Find a target that moved when it was clicked and now covers other ground; None if it
+        stands.
         """
         since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
         if not life.moved_at_once or since_s > _DEPARTS_S:
@@ -484,7 +493,7 @@ class TargetManager:
         self, life: _TargetState, follower: ImageFollower, picture: tuple[PoseEstimate, Gray],
         position: Array, reach_m: float, *, was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:  # fmt: skip
-        """Whether the pictures of a while ago can tell the target from the ground; where it is."""
+        """Whether earlier images can separate the target from the ground; where it is."""
         if not follower.is_isolated:
             return False, None
         estimate, gray = picture
@@ -496,15 +505,15 @@ class TargetManager:
         )
 
     @staticmethod
-    def _departed(
+    def _find_departed(
         life: _TargetState,
         follower: ImageFollower,
         estimate: PoseEstimate,
         gray: Gray,
         position: Array,
     ) -> FollowedPosition | None:
-        """A clicked target that moves, before its motion was measured. The ground that it has left
-        shows its shape. A car that only passes over a clicked place does not take the place's
+        """Find a clicked target that moves, before its motion was measured. The ground that it has
+        left shows its shape. A car that only passes over a clicked place does not take the place's
         appearance along, so no match is found.
         """
         if (estimate.exposure_time_ns - life.found_ns) * 1e-9 > _DEPARTS_S:
@@ -525,19 +534,19 @@ class TargetManager:
             scale = estimate.camera.fx / float(np.linalg.norm(away))
             extent = (life.extent_m[0] * scale, life.extent_m[1] * scale)
             fix = replace(fix, extent=extent)
-        self._tell(TargetEstimate(fix, estimate))
+        self._on_target(TargetEstimate(fix, estimate))
 
     def _is_due(self, life: _TargetState, time_ns: int) -> bool:
         return time_ns - life.reported_ns >= self._period_ns(life)
 
     def _period_ns(self, life: _TargetState) -> float:
-        """Between two reports; at most 0.2 s until the first one is confirmed."""
+        """Time between two reports; at most 0.2 s until the first one is confirmed."""
         # 0.9: frames do not fall on the period exactly.
         wanted = 0.9e9 / self._config.rate_hz
         return wanted if life.reported_ns else min(wanted, _CONFIRMS_NS)
 
     def _count_refusal(self, name: str, life: _TargetState, time_ns: int) -> None:
-        """Count what is not told, and why; the operator hears of one that he was told before."""
+        """Count a detection that is not reported; alert if the target was reported before."""
         reason = _reason(life.track)
         if reason is RefusalReason.NO_MAP:
             self.missed += 1
@@ -556,7 +565,7 @@ class TargetManager:
             )
 
     def _drift(self, click: Click) -> tuple[float, float]:
-        """One sigma, in pixels, of the picture's motion within the delay's error."""
+        """Motion of the image in one sigma of the operator's delay, pixels (u, v)."""
         eye, d = ray_in_world(click.estimate, click.pixel)
         distance = float(self._cast(eye, d[None]).distances[0])
         if not np.isfinite(distance):
@@ -570,7 +579,7 @@ class TargetManager:
         return float(u), float(v)
 
     def _has_room(self, now_ns: int) -> bool:
-        """Whether one more target can be followed, once those that are gone are forgotten."""
+        """Whether one more target can be followed; ends those long unseen if necessary."""
         detected = {n: x for n, x in self._lives.items() if not x.is_clicked}
         if len(detected) < _MAX_DETECTED:
             return True
@@ -585,5 +594,5 @@ class TargetManager:
 
 
 def _reason(track: TargetTrack) -> RefusalReason | None:
-    """Why the last sighting gave no fix; None where it gave one."""
+    """Why the last detection gave no fix; None if it gave one."""
     return None if track.refusal is None else track.refusal.reason

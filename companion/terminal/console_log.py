@@ -31,7 +31,7 @@ class Descriptor:
         self.encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
 
     def write(self, text: str) -> int:
-        """Write all of it, or what can be written."""
+        """Write as much as is accepted; returns the length of the text."""
         data = text.encode(self.encoding, "replace")
         with contextlib.suppress(OSError):
             while data:
@@ -51,7 +51,7 @@ class Descriptor:
 
 
 class _Queue(QueueHandler):
-    """Hands records on; those beyond the bound are lost."""
+    """Passes log records on to the writing thread; those beyond the bound are lost."""
 
     def enqueue(self, record: logging.LogRecord) -> None:
         with contextlib.suppress(queue.Full):

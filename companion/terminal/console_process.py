@@ -1,4 +1,4 @@
-"""Runs the console's process beside a flight, from its start to its end.
+"""Runs the console's process during a flight.
 
 A crash is reported once and not restarted: `companion console` starts it again. A pipe ends it if
 the flight process ends for any reason.

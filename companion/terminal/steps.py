@@ -80,7 +80,7 @@ def tally(show: Callable[..., None], total: int | None = None) -> Callable[..., 
 
 
 class _Lines:
-    """A log's: the first after two seconds, then one every few, and the last."""
+    """Log lines of counted work: the first after two seconds, then one every few, and the last."""
 
     def __init__(self, console: Console, what: str, every_s: float, begins: str) -> None:
         self._console, self._what = console, what
@@ -90,13 +90,13 @@ class _Lines:
         self._printed_s: float | None = None
 
     def begin(self) -> None:
-        """Nothing was counted yet."""
+        """Write that nothing was counted yet."""
         with self._lock:
             if self._printed_s is None:
                 self._print(self._begins)
 
     def show(self, done: int, total: int | None) -> None:
-        """So much is."""
+        """Write how much is done, if a line is due. total: None if unknown."""
         with self._lock:
             now_s = time.monotonic() - self._begun_s
             is_first = self._printed_s is None and now_s >= _SILENT_S
@@ -112,7 +112,7 @@ class _Lines:
 
 
 class _Work:
-    """A log's lines about work that goes on."""
+    """Log lines of work that cannot be counted."""
 
     def __init__(self, console: Console, what: str, every_s: float) -> None:
         self._console, self._what, self._every_s = console, what, every_s
@@ -122,7 +122,7 @@ class _Work:
         self._over = False
 
     def wait(self, seconds: float) -> None:
-        """Tell of it in so many seconds."""
+        """Write a line in `seconds`, unless the work ends before."""
         with self._lock:
             if not self._over:
                 self._timer = threading.Timer(seconds, self._tell)
@@ -130,7 +130,7 @@ class _Work:
                 self._timer.start()
 
     def end(self) -> None:
-        """It is done."""
+        """Write that the work is done, if a line was written before."""
         with self._lock:
             self._over = True
             if self._timer is not None:

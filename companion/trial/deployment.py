@@ -21,7 +21,7 @@ _SOURCE, _CONNECTION = "udp://0.0.0.0:5600", "serial:/dev/ttyTHS1:921600"
 
 
 def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
-    """Write the file; values that the footage does not give are marked for checking."""
+    """Write the deployment file of camera and map; returns `path`. Comments mark what to check."""
     settings = _settings(trial, map_cache)
     config = parse_config(settings, str(path))
     text = deployment_text(config, _notes(trial), "companion try")
@@ -31,7 +31,7 @@ def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
 
 
 def refuse_edited(path: Path) -> None:
-    """`ReportError` for a file there that somebody has changed since it was written."""
+    """`ReportError` if the file at `path` was changed by hand since `companion try` wrote it."""
     if not path.exists():
         return
     first, _, rest = path.read_text(encoding="utf-8", errors="replace").partition("\n")
@@ -54,8 +54,8 @@ def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
 def footage_settings(
     map_cache: Path, camera: Camera, mount_deg: Array, *, fixed: bool
 ) -> dict[str, Any]:
-    """A deployment's settings. mount_deg: (3,) roll, pitch, yaw of the camera on its gimbal, or on
-    the airframe if `fixed`.
+    """Settings of a deployment with this map and camera. mount_deg: (3,) roll, pitch, yaw of the
+    camera, degrees; on the airframe if `fixed`, otherwise on a gimbal.
     """
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     angles = {name: round(float(a), 2) for name, a in zip(names, mount_deg, strict=True)}
@@ -71,14 +71,14 @@ def footage_settings(
 
 
 def _model(camera: Camera) -> dict[str, Any]:
-    """Rounded to what footage can tell."""
+    """Camera model for the file, rounded to what footage can show."""
     model = of_stream_size(camera).to_dict()
     rounded = {name: round(model[name], 2) for name in ("fx", "fy", "cx", "cy")}
     return model | rounded | {"distortion": [round(k, 5) for k in model["distortion"]]}
 
 
 def _fixed_pitch_deg(trial: Trial) -> float | None:
-    """Of a camera on the airframe; None for a gimbal. Without angles it looks down."""
+    """Pitch of a camera fixed to the airframe, -90 (down) if unknown; None for a gimbal."""
     if trial.flight.log is not None:
         return trial.flight.log.fixed_pitch_deg
     is_measured = sum(p.measured for p in trial.priors) > len(trial.priors) / 2
@@ -86,7 +86,7 @@ def _fixed_pitch_deg(trial: Trial) -> float | None:
 
 
 def _mount_deg(trial: Trial) -> Array:
-    """Roll, pitch, yaw of the mounting: the gimbal's bias, or a fixed camera's direction."""
+    """Roll, pitch, yaw of the mounting, degrees: gimbal bias, or a fixed camera's direction."""
     turn = np.zeros(3) if trial.estimated is None else np.radians(trial.estimated.mount_deg)
     pitch = np.radians(_fixed_pitch_deg(trial) or 0.0)
     return np.degrees(euler_from_matrix(matrix_from_euler(0.0, pitch, 0.0) @ so3_exp(turn)))

@@ -1,4 +1,4 @@
-"""Estimates gimbal bias, focal length and map offset of footage, by `companion.calibrate`."""
+"""Estimates camera mounting, focal length and map offset of footage, by `companion.calibrate`."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ _LEAST_TILT_DEG = 0.5
 class Estimated:
     """Estimated errors of camera, gimbal and map.
 
-    focal_percent, focal_sigma_percent: against the given camera, kept within three sigmas; None if
-    this map cannot show it. mount_deg: (3,) about the boresight, up, right; shift_m: (3,) map minus
-    GNSS, east, north, up; has_shift: whether recorded positions show it. poses: of the frames used,
-    by frame.
+    camera: with the estimated focal length, or the given one if they differ by less than three
+    sigmas. focal_percent: difference from the given focal length; None if this map cannot show it.
+    mount_deg: (3,) of the camera on the gimbal: turn about the optical axis, up, right. shift_m:
+    (3,) map minus GNSS, east, north, up. has_shift: whether recorded positions show the shift.
+    poses: of the frames used, by frame number.
     """
 
     camera: Camera
@@ -62,9 +63,9 @@ class Estimated:
 
 
 @dataclass(frozen=True)
-class Tools:
-    """Renderer and extractor for images over the map. width: of the working image, pixels;
-    has_buildings: whether the map's heights contain them.
+class EstimateTools:
+    """Renderer and extractor for images over the map. width: pixels of the images compared;
+    has_buildings: whether the map's heights contain buildings.
     """
 
     renderer: MapRenderer
@@ -78,18 +79,18 @@ def estimate(
     priors: Sequence[FramePrior],
     localized: Sequence[Localized],
     guess: CameraGuess,
-    tools: Tools,
+    tools: EstimateTools,
     loader: FrameLocalizer,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Estimated | None:
     """Estimate the errors of focal length, mounting angles and map offset.
 
-    frames, priors and localized have one entry for each frame, in the same order. At most 40
-    consistent frames are used, spread over all. progress: is called with the number of frames done
-    and to do; both count two passes over the frames. None if fewer than four frames are consistent,
-    or fewer than four of the used ones can be read and matched.
+    frames, priors and localized have one entry for each frame, in the same order. guess: the camera
+    as given. At most 40 consistent frames are used, spread over all. progress: called with the
+    numbers of frames done and in all; each frame is used twice. None if fewer than four frames are
+    consistent, or fewer than four of the used ones can be read and matched.
     """
-    used = consistent(priors, localized)
+    used = consistent_frames(priors, localized)
     if len(used) > _MOST_FRAMES:
         used = [used[int(k)] for k in np.linspace(0, len(used) - 1, _MOST_FRAMES).round()]
     if len(used) < LEAST_FRAMES:
@@ -106,11 +107,11 @@ def estimate(
             progress(turn * len(used) + number, _TURNS * len(used))
             parts = _parts(frames[k], pose, believed, reader, loader)
             if parts is not None:
-                said = _said(priors[k], pose)
+                said = _telemetry_window(priors[k], pose)
                 sighted[k] = CalibrationFrame(10_000_000_000 * (k + 1), pose, parts, said)
         if len(sighted) < LEAST_FRAMES:
             return None
-        fixed = _fixed(list(sighted.values()), tools.has_buildings)
+        fixed = _fixed_parameters(list(sighted.values()), tools.has_buildings)
         evidence = CalibrationProblem(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
         solution = solve(evidence, fixed, _sigmas(guess))
         focal = _focal(solution, fixed)
@@ -126,11 +127,12 @@ def estimate(
     return _estimated(camera, solution, focal, priors, poses)
 
 
-def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> list[int]:
-    """Indices of frames whose ground point on the optical axis is consistent with most others:
-    recorded position plus one map offset and one tilt error.
+def consistent_frames(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> list[int]:
+    """Indices of the localized frames whose error of the ground point on the optical axis fits that
+    of most others: one map offset plus one tilt error.
 
-    This point is used because correlated errors of position and tilt cancel there.
+    The ground point is used because correlated errors of position and tilt cancel there. If fewer
+    than four frames have a recorded position and height, all accepted frames.
     """
     which = [k for k, one in enumerate(localized) if one.pose is not None]
     placed = [k for k in which if priors[k].pose is not None and priors[k].height_known]
@@ -163,7 +165,7 @@ def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> 
 
 
 def _axis_ground(pose: Pose, height_m: float) -> Array:
-    """(2,): where the optical axis meets flat ground so far below the camera."""
+    """(2,) east, north where the optical axis meets flat ground height_m below the camera."""
     axis = pose.rotation[:, 2]
     down = max(-float(axis[2]), 0.2)
     return np.asarray(pose.translation[:2] + axis[:2] * height_m / down)
@@ -182,9 +184,9 @@ def _parts(
     return reader.read(replace(frame, camera=camera), pose, None)
 
 
-def _said(prior: FramePrior, pose: Pose) -> AutopilotWindow:
-    """The telemetry, the same at all offsets: no time offset is looked for. An unknown heading is
-    the registration's.
+def _telemetry_window(prior: FramePrior, pose: Pose) -> AutopilotWindow:
+    """The frame's telemetry for the calibration, equal at all time offsets, because no time offset
+    is estimated. An unknown heading is taken from the registration `pose`.
     """
     rotation = prior.rotation
     if prior.heading_sigma_deg is None:
@@ -200,11 +202,11 @@ def _said(prior: FramePrior, pose: Pose) -> AutopilotWindow:
     )  # fmt: skip
 
 
-def _fixed(sighted: Sequence[CalibrationFrame], has_buildings: bool) -> np.ndarray:
-    """Which numbers keep their value: all but focal length, mounting and map offset. The focal
-    length is fixed, too, over flat ground, because it cannot be separated from the height, and over
-    a map without the buildings that the images show, because these are nearer than the map's
-    ground.
+def _fixed_parameters(sighted: Sequence[CalibrationFrame], has_buildings: bool) -> np.ndarray:
+    """Which calibration parameters keep their value: all but focal length, mounting and map offset.
+    The focal length is fixed, too, over flat ground, because it cannot be separated from the
+    height, and over a map without buildings, because buildings in the image are nearer than the
+    map's ground.
     """
     fixed = np.ones(u.COUNT, bool)
     fixed[u.MOUNT], fixed[u.SHIFT] = False, False
@@ -214,7 +216,7 @@ def _fixed(sighted: Sequence[CalibrationFrame], has_buildings: bool) -> np.ndarr
 
 
 def _relief(one: CalibrationFrame) -> float:
-    """How far the ground in an image strays from a plane, as a share of the height above it."""
+    """Deviation of an image's ground from a plane (1 sigma), as a share of the height above it."""
     points = one.parts.points
     design = np.column_stack([points[:, :2] - points[:, :2].mean(axis=0), np.ones(len(points))])
     left = points[:, 2] - design @ np.linalg.lstsq(design, points[:, 2], rcond=None)[0]
@@ -230,7 +232,7 @@ def _sigmas(guess: CameraGuess) -> Array:
 
 
 def _focal(solution: Solution, fixed: np.ndarray) -> tuple[float, float] | None:
-    """The focal length's difference and its sigma, per cent; None where it was not looked for."""
+    """Focal length minus the given one, and its sigma, per cent; None if it was fixed."""
     if fixed[u.FOCAL]:
         return None
     difference = float(np.expm1(solution.guess.shared[u.FOCAL]))
@@ -248,7 +250,7 @@ def _estimated(
     has_shift = any(priors[k].pose is not None and priors[k].height_known for k in poses)
     shift, shift_sigma = shared[u.SHIFT].copy(), sigma[u.SHIFT].copy()
     if not has_shift:
-        shift, shift_sigma, has_shift = _shift_alone(priors, poses)
+        shift, shift_sigma, has_shift = _horizontal_shift(priors, poses)
     housing = so3_exp(shared[u.MOUNT])
     mount = GIMBAL_FROM_CAMERA.T @ housing @ GIMBAL_FROM_CAMERA
     left = max(float(np.degrees(solution.attitude.sigma[:3].max())), _LEAST_TILT_DEG)
@@ -260,8 +262,10 @@ def _estimated(
     )  # fmt: skip
 
 
-def _shift_alone(priors: Sequence[FramePrior], poses: dict[int, Pose]) -> tuple[Array, Array, bool]:
-    """Horizontal offset from positions without a usable height: the median, and its spread."""
+def _horizontal_shift(
+    priors: Sequence[FramePrior], poses: dict[int, Pose]
+) -> tuple[Array, Array, bool]:
+    """Horizontal offset and sigma (m) from positions without height; whether there is one."""
     away = [
         pose.translation[:2] - prior.translation[:2]
         for k, pose in poses.items()

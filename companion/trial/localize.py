@@ -29,9 +29,9 @@ _FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
 
 @dataclass(frozen=True)
 class Localized:
-    """One frame's result. pose: the registration's, also if it was not accepted; covariance: (6, 6)
-    as `PosePrior`'s; quality: 0 to 1; problem: why there is no pose; beside_map: its view does not
-    meet the map.
+    """One frame's result. pose: of the registration, even if not accepted; None: `problem` says
+    why. covariance: (6, 6) as `PosePrior`'s; quality: 0 to 1; searched: found by the relocalizer,
+    not from a prior; beside_map: the view does not meet the map.
     """
 
     name: str
@@ -45,16 +45,17 @@ class Localized:
 
 
 class FrameLocalizer:
-    """Localizes recorded frames independently. camera: of the footage; told: called with each
-    complete prior, by its time, for the localizer's sensors (`sensors_of`).
+    """Localizes recorded frames independently. relocalizer: opens it at the first search. camera:
+    of the footage. recorded_poses: receives each complete prior by its time (ns), from which
+    `sensors_of` gives the localizer attitude and height.
     """
 
     def __init__(
         self, localizer: Localizer, relocalizer: Callable[[], Relocalizer], camera: Camera,
-        told: dict[int, Pose] | None = None,
+        recorded_poses: dict[int, Pose] | None = None,
     ) -> None:  # fmt: skip
         self._localizer, self._relocalizer, self._camera = localizer, relocalizer, camera
-        self._told = {} if told is None else told
+        self._recorded_poses = {} if recorded_poses is None else recorded_poses
         self._loaded = 0
         self._found_heights_m: list[float] = []  # of frames whose height was not known
 
@@ -65,7 +66,7 @@ class FrameLocalizer:
         return recorded.load(self._camera, self._loaded * _STEP_NS)
 
     def from_prior(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
-        """Localize from telemetry; unknown heading or height is searched."""
+        """Localize from telemetry; an unknown heading or height is searched near the position."""
         if prior.pose is None:
             return Localized(recorded.name, None, problem="has no position")
         try:
@@ -74,19 +75,19 @@ class FrameLocalizer:
             return Localized(recorded.name, None, problem=str(error))
         if prior.is_complete:
             if prior.pose is not None and not prior.was_searched:
-                self._told[frame.exposure_time_ns] = prior.pose
+                self._recorded_poses[frame.exposure_time_ns] = prior.pose
             return self._tracked(recorded.name, frame, prior.pose_prior(frame.exposure_time_ns))
         radius = max(_REGION_SIGMAS * prior.sigma_m, _LEAST_REGION_M)
         region = SearchRegion.circle(prior.pose.translation[:2], radius)
-        return self._found(recorded.name, frame, prior, region)
+        return self._search(recorded.name, frame, prior, region)
 
-    def anywhere(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
-        """Search the whole map, without the frame's position."""
+    def search_map(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
+        """Localize by a search of the whole map, without the frame's position."""
         try:
             frame = self.load(recorded)
         except (StreamDecodeError, StreamSizeError, OSError) as error:
             return Localized(recorded.name, None, problem=str(error))
-        return self._found(recorded.name, frame, prior, None)
+        return self._search(recorded.name, frame, prior, None)
 
     def _tracked(self, name: str, frame: Frame, prior: PosePrior) -> Localized:
         self._localizer.set_prior(prior)
@@ -101,7 +102,7 @@ class FrameLocalizer:
             estimate.accepted,
         )  # fmt: skip
 
-    def _found(
+    def _search(
         self, name: str, frame: Frame, prior: FramePrior, region: SearchRegion | None
     ) -> Localized:
         heading = prior.heading_sigma_deg
@@ -138,8 +139,8 @@ def likely_height(prior: FramePrior, found_m: Sequence[float]) -> list[tuple[flo
 
 
 def height_bands(prior: FramePrior) -> list[tuple[float, float]]:
-    """Of an unknown height, each with half its range: a search registers its candidates from the
-    middle, and from twice or half the true height that fails.
+    """Split the range of an unknown height into four: (middle, half range), world z, m. A search
+    registers its candidates from the middle; from twice or half the true height that fails.
     """
     ground, half = prior.height_m - prior.clearance_m, prior.height_sigma_m
     edges = np.geomspace(prior.clearance_m - half, prior.clearance_m + half, _HEIGHT_BANDS + 1)

@@ -30,7 +30,7 @@ from companion.reporting.layout import write_report
 from companion.reporting.pictures import MapPictures, ShownFrame, map_pictures, silent
 from companion.reporting.record import VISION
 from companion.terminal.steps import Say
-from companion.trial.result import Judgement, Trial, because, spread_limit_m
+from companion.trial.result import Trial, TrialVerdict, main_reason, spread_limit_m
 from companion.versions import made_by
 from companion.writing import writing
 from localizer.geometry.pose import Array
@@ -43,26 +43,26 @@ _TILT_DEG, _FOCAL_PERCENT, _SHIFT_M = 2.0, 2.0, 3.0
 
 
 def write_trial(
-    folder: Path, trial: Trial, judgement: Judgement, map_cache: Path, say: Say = silent
+    folder: Path, trial: Trial, verdict: TrialVerdict, map_cache: Path, say: Say = silent
 ) -> Path:
-    """``report.html``, ``trial.json`` and ``frames.csv`` in the folder; returns the page's path."""
+    """Write ``report.html``, ``trial.json``, ``frames.csv`` to `folder`; returns the page."""
     with writing(folder, "--report"):
         _write_frames(folder / "frames.csv", trial)
-        text = json.dumps(_figures(trial, judgement), indent=1)
+        text = json.dumps(_figures(trial, verdict), indent=1)
         (folder / "trial.json").write_text(text, encoding="utf-8")
     with map_pictures(map_cache, say) as pictures:
-        report = _report(trial, judgement, pictures)
+        report = _report(trial, verdict, pictures)
     return write_report(report, folder / "report.html")
 
 
-def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report:
+def _report(trial: Trial, verdict: TrialVerdict, pictures: MapPictures) -> Report:
     errors, levels = trial.errors_m(), trial.levels_m()
     is_placed = bool(np.isfinite(errors).any())
     number = np.arange(len(trial.best), dtype=np.float64)
     is_joined = trial.flight.kind != "photos"  # between photos nothing is known
     camera = trial.flight.camera
     return Report(
-        f"{trial.flight.name}: {judgement.kind}",
+        f"{trial.flight.name}: {verdict.kind}",
         f"{len(trial.best)} {trial.flight.kind if trial.flight.kind == 'photos' else 'frames'}, "
         f"camera by {camera.source}, focal length {camera.camera.fx:.0f} px of "
         f"{camera.camera.width}",
@@ -86,7 +86,7 @@ def _report(trial: Trial, judgement: Judgement, pictures: MapPictures) -> Report
         settings={"notes": list(trial.notes)},
         versions=made_by(),
         notes=(*trial.notes, *pictures.notes),
-        verdict=judgement.sentence,
+        verdict=verdict.sentence,
         overlays_of="Frames that failed, then localized ones, spread over the flight",
     )  # fmt: skip
 
@@ -102,7 +102,7 @@ def _verdicts(trial: Trial, errors: Array) -> tuple[CriterionResult, ...]:
     count = len(trial.best)
     share = 100.0 * sum(one.accepted for one in trial.best) / count
     rows = [CriterionResult("frames localized", f"{share:.0f} %", ">= 80 %", share >= 80.0,
-                    f"no position for the others{because(trial)}",
+                    f"no position for the others{main_reason(trial)}",
                     "the overlays of failed frames")]  # fmt: skip
     known = errors[np.isfinite(errors)]
     if len(known):
@@ -136,7 +136,7 @@ def _sheet(trial: Trial, pictures: MapPictures) -> MapSheet | None:
 
 
 def _marks(trial: Trial) -> list[MapMark]:
-    """Where vision has each frame, and where GNSS has those that failed."""
+    """Accepted positions with protection levels, and recorded positions of failed frames."""
     levels = trial.levels_m()
     marks = []
     for k, (one, prior) in enumerate(zip(trial.best, trial.priors, strict=True)):
@@ -221,7 +221,7 @@ def _failures(trial: Trial) -> tuple[tuple[str, ReportTable], ...]:
 
 
 def _overlays(trial: Trial, pictures: MapPictures) -> tuple[Overlay, ...]:
-    """Half of them frames that failed, the others spread over the flight."""
+    """Map overlays: up to half of failed frames, the others of accepted ones over the flight."""
     best = trial.best
     failed = [k for k in sorted(trial.reasons) if best[k].pose is not None][: _OVERLAYS // 2]
     good = [k for k, one in enumerate(best) if one.accepted]
@@ -257,7 +257,7 @@ def _write_frames(path: Path, trial: Trial) -> None:
             writer.writerow([*row, trial.reasons.get(k, "")])
 
 
-def _figures(trial: Trial, judgement: Judgement) -> dict[str, Any]:
+def _figures(trial: Trial, verdict: TrialVerdict) -> dict[str, Any]:
     found = trial.estimated
     estimated: dict[str, Any] | None = None
     if found is not None:
@@ -271,7 +271,7 @@ def _figures(trial: Trial, judgement: Judgement) -> dict[str, Any]:
         }  # fmt: skip
     searched, right, wrong = trial.search_outcome()
     return {
-        "verdict": asdict(judgement), "frames": len(trial.best), "accepted": trial.accepted,
+        "verdict": asdict(verdict), "frames": len(trial.best), "accepted": trial.accepted,
         "searched": searched, "found": right, "found_elsewhere": wrong, "estimated": estimated,
         "notes": list(trial.notes), "risk": ProtectionConfig().risk,
     }  # fmt: skip

@@ -42,9 +42,11 @@ _ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
 
 @dataclass(frozen=True)
 class FramePrior:
-    """Prior of one frame. pose: None if no position is known. sigma_m: horizontal; height_m: world
-    z and its sigma, half of the range if unknown; clearance_m: above the map's ground;
-    was_searched: from a search instead of telemetry.
+    """Prior of one frame, in map coordinates (east, north, up; m). pose: None without a recorded
+    position; rotation: (3, 3) world from camera; sigma_m: horizontal; height_m: z, an unknown one
+    the middle of its range with half the range as sigma; measured: the tilt was; over_map: the
+    position is; clearance_m: height above the map's ground; was_searched: from a search instead of
+    telemetry.
     """
 
     pose: Pose | None
@@ -62,11 +64,11 @@ class FramePrior:
 
     @property
     def is_complete(self) -> bool:
-        """Whether registration can start from it without a search."""
+        """Whether a registration can start from this prior without a search."""
         return self.pose is not None and self.height_known and self.heading_sigma_deg is not None
 
     def pose_prior(self, time_ns: int) -> PosePrior:
-        """As a `PosePrior`; ValueError if it is incomplete."""
+        """As a `PosePrior` at this time (ns); ValueError without position or heading."""
         if self.pose is None or self.heading_sigma_deg is None:
             raise ValueError("the prior is not complete")
         tilt, heading = np.radians([self.tilt_sigma_deg, self.heading_sigma_deg])
@@ -76,8 +78,8 @@ class FramePrior:
 
 @dataclass(frozen=True)
 class Correction:
-    """Estimated errors of the telemetry. mount: (3, 3), rotation in the camera's axes; shift: (3,)
-    m east, north, up, map minus GNSS; tilt_sigma_deg: remaining error.
+    """Estimated errors of the telemetry. mount: (3, 3) rotation, recorded from true camera axes;
+    shift: (3,) m east, north, up, map minus GNSS; tilt_sigma_deg: error that remains.
     """
 
     mount: Array
@@ -85,7 +87,7 @@ class Correction:
     tilt_sigma_deg: float
 
     def applied(self, prior: FramePrior) -> FramePrior:
-        """The prior, corrected by these errors."""
+        """A corrected copy of the prior."""
         rotation = prior.rotation @ self.mount
         pose = prior.pose
         if pose is not None:
@@ -97,7 +99,7 @@ class Correction:
 
 
 class Ground:
-    """Surface heights of the map."""
+    """Surface heights of the map, buildings included where the map has them."""
 
     def __init__(self, cache: TileCache) -> None:
         self._surface = MapSurface(cache)
@@ -105,7 +107,7 @@ class Ground:
         self._top = float(cache.index.box_max[:, 2].max()) + _ABOVE_M
 
     def height(self, east: float, north: float) -> float | None:
-        """World z, m; None outside the map."""
+        """World z of the surface, m, at these map coordinates, m; None outside the map."""
         down = np.array([[0.0, 0.0, -1.0]])
         try:
             eye = np.array([east, north, self._top])
@@ -117,8 +119,8 @@ class Ground:
 
 @dataclass(frozen=True)
 class FlightPriors:
-    """Priors of all frames in order. datum: of the heights used, None if unknown; notes: decisions
-    and reasons.
+    """Priors of all frames in order. datum: of the recorded heights used, None if none is usable;
+    notes: decisions and reasons, for the user.
     """
 
     priors: tuple[FramePrior, ...]
@@ -127,7 +129,7 @@ class FlightPriors:
 
 
 def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
-    """Priors of a flight's frames over this map."""
+    """Priors of a flight's frames over this map. `FootageError` if all lie far from it."""
     _check_near(flight, cache)
     ground, frame = Ground(cache), cache.frame
     geoid_m = cache.manifest.geoid_separation_m
@@ -138,9 +140,9 @@ def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     heights: list[Height | None] = [None] * len(places)
     datum: Datum | None = None
     if known:
-        levels = _levels(flight.frames, frame, geoid_m, known[0], float(np.std(known)))
-        datum = _usable(levels, below, notes)
-        notes += _feet(levels, known[0] + frame.origin.height_m, geoid_m)
+        levels = _world_heights(flight.frames, frame, geoid_m, known[0], float(np.std(known)))
+        datum = _usable_datum(levels, below, notes)
+        notes += _feet_note(levels, known[0] + frame.origin.height_m, geoid_m)
         if datum is not None:
             heights = [by_datum.get(datum) for by_datum in levels]
     usual = float(np.median(known)) if known else float(cache.index.box_min[:, 2].min())
@@ -153,7 +155,7 @@ def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
 
 
 def _check_near(flight: RecordedFlight, cache: TileCache) -> None:
-    """`FootageError` where all positions lie far from the map, with the likely slip."""
+    """`FootageError`, with the likely mistake, if all positions lie far from the map."""
     told = [f.telemetry.position for f in flight.frames if f.telemetry.position is not None]
     places = np.array([(p.latitude_deg, p.longitude_deg) for p in told]).reshape(-1, 2)
     low, high = cache.index.box_min[:, :2].min(axis=0), cache.index.box_max[:, :2].max(axis=0)
@@ -191,7 +193,7 @@ def _enu(position: RecordedPosition | None, frame: LocalFrame) -> Array | None:
     )
 
 
-def _levels(
+def _world_heights(
     frames: Sequence[RecordedFrame], frame: LocalFrame, geoid_m: float, takeoff_m: float,
     relief_m: float,
 ) -> list[dict[Datum, Height]]:  # fmt: skip
@@ -213,10 +215,12 @@ def _levels(
     return levels
 
 
-def _usable(
+def _usable_datum(
     levels: Sequence[dict[Datum, Height]], below: Sequence[float | None], notes: list[str]
 ) -> Datum | None:
-    """The datum with the smallest sigma whose heights can be true over this map."""
+    """Of the datums possible over this map the one with the smallest sigma; adds notes. below:
+    world z of the ground below each frame.
+    """
     sigmas: dict[Datum, float] = {}
     clearances: dict[Datum, float] = {}
     for datum in Datum:
@@ -254,9 +258,11 @@ def _usable(
     return best
 
 
-def _feet(levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: float) -> list[str]:
-    """A note if the heights seem to be in feet: absolute minus relative height is the height of the
-    take-off, which then differs from the map's by the ratio of feet and metres.
+def _feet_note(
+    levels: Sequence[dict[Datum, Height]], takeoff_m: float, geoid_m: float
+) -> list[str]:
+    """A note if the map's heights seem to be in feet, otherwise []. Absolute minus relative height
+    is the take-off's height; then it is 0.3 of the map's.
 
     takeoff_m: the map's ground at the take-off, above the ellipsoid.
     """

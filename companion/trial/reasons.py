@@ -26,8 +26,8 @@ _FAR_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class ImageState:
-    """bright, dark: shares of the image without detail; contrast: grey levels; sharpness: variance
-    of the Laplacian at 640 px width.
+    """bright, dark: shares of white and of black pixels; contrast: standard deviation, grey levels;
+    sharpness: variance of the Laplacian at 640 px width.
     """
 
     bright: float
@@ -47,7 +47,7 @@ def image_state(image: Image) -> ImageState:
     )  # fmt: skip
 
 
-def states_of(frames: Sequence[RecordedFrame]) -> list[ImageState | None]:
+def image_states(frames: Sequence[RecordedFrame]) -> list[ImageState | None]:
     """Image quality of each frame; None if it cannot be read."""
     found: list[ImageState | None] = []
     for one in frames:
@@ -65,11 +65,11 @@ def reasons(
     estimated: Estimated | None,
     kind: MapKind | None = None,
 ) -> dict[int, str]:
-    """The likely reason by index, for each frame that was not accepted."""
+    """Likely reason by frame number, for each frame that was not accepted. None: no map figures."""
     failed = [k for k, one in enumerate(localized) if not one.accepted]
     if not failed:
         return {}
-    states = states_of(frames)
+    states = image_states(frames)
     sharp = [s.sharpness for s in states if s is not None]
     usual = float(np.median(sharp)) if sharp else 0.0
     return {
@@ -125,7 +125,7 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
 
 
 def map_reason(kind: MapKind | None) -> str:
-    """Why a good image in the right place fails over such a map."""
+    """Reason by the map: why a good image at the right position fails."""
     if kind is not None and not kind.has_buildings:
         what = "flat" if kind.heights == "flat" else "bare terrain"
         return f"the map is {what} without buildings and trees; use a surface model, which has them"
@@ -133,7 +133,7 @@ def map_reason(kind: MapKind | None) -> str:
 
 
 def _setup_reason(estimated: Estimated | None) -> str:
-    """Where too few frames agreed, nobody knows which of them is wrong."""
+    """Reason if too few frames agree, so that none can be named; otherwise ""."""
     if estimated is not None:
         return ""
     return (

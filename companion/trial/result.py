@@ -26,7 +26,8 @@ _STILL_MPS = (0.0, 0.0)  # of photos: time stamps are no part of their positions
 @dataclass(frozen=True)
 class Trial:
     """All results. priors: corrected; first: localized with the telemetry as recorded; second: with
-    estimated corrections; searched: without positions, by frame; reasons: of failed frames.
+    estimated corrections; searched: without positions, by frame number; estimated: None if it
+    failed; reasons: of the frames that failed in `second`, by frame number.
     """
 
     flight: RecordedFlight
@@ -40,12 +41,12 @@ class Trial:
 
     @property
     def accepted(self) -> int:
-        """Number of frames localized from telemetry."""
+        """Number of frames localized from telemetry, after the correction."""
         return sum(one.accepted for one in self.second)
 
     @property
     def best(self) -> tuple[Localized, ...]:
-        """For each frame the result from telemetry, otherwise that of the search."""
+        """Each frame's result from telemetry; an accepted one of the search if that failed."""
         return tuple(
             one if one.accepted or not found.accepted else found
             for k, one in enumerate(self.second)
@@ -53,8 +54,8 @@ class Trial:
         )
 
     def errors_m(self) -> Array:
-        """(F,) horizontal distance of accepted positions from the recorded ones, without the
-        estimated offset; NaN if unknown.
+        """(F,) horizontal distance of accepted positions from the recorded ones, m, after
+        correction by the estimated map offset; NaN if either is missing.
         """
         found = np.full(len(self.best), np.nan)
         for k, (one, prior) in enumerate(zip(self.best, self.priors, strict=True)):
@@ -75,14 +76,14 @@ class Trial:
         return levels
 
     def search_outcome(self) -> tuple[int, int, int]:
-        """Numbers of frames that were searched without position, found correctly, and found far
-        from both the recorded and the telemetry-based position.
+        """Numbers of frames that were searched without position, found there, and found elsewhere:
+        far from both the recorded and the telemetry-based position.
         """
         results = list(self.search_results().values())
         return len(results), results.count(FOUND), results.count(ELSEWHERE)
 
     def search_results(self) -> dict[int, str]:
-        """Result of each search without position, by frame."""
+        """Result of each search without position, by frame: found, elsewhere or "not found"."""
         results = dict.fromkeys(self.searched, "not found")
         for k, one in self.searched.items():
             if not one.accepted or one.pose is None:
@@ -100,19 +101,19 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """kind: one of four words; sentence: the verdict; exit_code: 0 works, else 1."""
+class TrialVerdict:
+    """kind: WORKS, PARTLY, NOT or UNKNOWN; sentence: the verdict for the user."""
 
     kind: str
     sentence: str
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command."""
+        """Exit code of the command: 0 for WORKS, otherwise 1."""
         return 0 if self.kind == WORKS else 1
 
 
-def judge(trial: Trial) -> Judgement:
+def trial_verdict(trial: Trial) -> TrialVerdict:
     """The verdict: its kind, which sets the exit code, and a sentence with the figures.
 
     WORKS: 80 % of the frames are localized, no search finds a wrong place, and the median
@@ -136,7 +137,7 @@ def judge(trial: Trial) -> Judgement:
         parts.append(found + (f" and {wrong} at a wrong place" if wrong else ""))
     if kind == UNKNOWN:
         parts.append(f"give {LEAST_FRAMES} or more, so that a wrong angle or focal length shows")
-    return Judgement(kind, f"Vision {kind} here: {'; '.join(parts)}{because(trial)}.")
+    return TrialVerdict(kind, f"Vision {kind} here: {'; '.join(parts)}{main_reason(trial)}.")
 
 
 def _kind(share: float, trial: Trial, known: Array) -> str:
@@ -151,14 +152,14 @@ def _kind(share: float, trial: Trial, known: Array) -> str:
 
 
 def spread_limit_m(trial: Trial) -> float:
-    """Limit of the median difference from GNSS: its own error plus 3 m."""
+    """Limit of the median distance from GNSS, m: root sum square of 3 m and two sigmas of GNSS."""
     sigmas = [p.sigma_m for p in trial.priors if p.pose is not None]
     own = float(np.median(sigmas)) if sigmas else 0.0
     return float(np.hypot(2.0 * own, 3.0))
 
 
-def because(trial: Trial) -> str:
-    """The most frequent reason of failures, as the end of a sentence."""
+def main_reason(trial: Trial) -> str:
+    """The most frequent reason of failures, as the end of a sentence; "" without failures."""
     if not trial.reasons:
         return ""
     heads = [text.split(":", maxsplit=1)[0] for text in trial.reasons.values()]

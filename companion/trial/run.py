@@ -12,7 +12,7 @@ import numpy as np
 
 from companion.offline.localize import sensors_of
 from companion.recorded.flight import RecordedFlight
-from companion.trial.estimate import Tools, estimate
+from companion.trial.estimate import EstimateTools, estimate
 from companion.trial.localize import FrameLocalizer, Localized
 from companion.trial.priors import FlightPriors, FramePrior, priors_of
 from companion.trial.reasons import reasons
@@ -42,7 +42,7 @@ _AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """width: of the working image, pixels; searches: number of frames searched without position."""
+    """width: of the image registered, pixels; searches: frames also searched without position."""
 
     width: int = 320
     searches: int = 20
@@ -54,9 +54,10 @@ def run_trial(
     options: TrialOptions | None = None,
     stage: Stage = lambda _what: nullcontext(lambda _done, _total: None),
 ) -> Trial:
-    """Localize the footage over the map. stage: context manager for the progress of a step.
+    """Localize the footage over the map. stage(name): context manager that gives a function for
+    progress (frames done, in all).
 
-    Errors of the map and of images that cannot be used are named ones.
+    Raises named errors for a map or footage that cannot be used.
     """
     options = options or TrialOptions()
     config = LocalizerConfig(width=options.width, feature_threads=2)
@@ -65,14 +66,14 @@ def run_trial(
         opened.callback(stack.close)
         known = priors_of(flight, stack.cache)
         kind = map_kind(stack.cache)
-        search = _opened_once(stack.cache, config, opened)
+        search = _lazy_relocalizer(stack.cache, config, opened)
         first_loader = FrameLocalizer(
             build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
         )
-        flight, known, first = placed(flight, known, first_loader, stage)
+        flight, known, first = localize_from_telemetry(flight, known, first_loader, stage)
         extractor = DetailExtractor(load_extractor(None, threads=2))
         width = _measured_width(flight.camera.camera, known.priors, kind, options.width)
-        tools = Tools(stack.renderer, extractor, width, kind.has_buildings)
+        tools = EstimateTools(stack.renderer, extractor, width, kind.has_buildings)
         with stage("estimating camera and map offset") as count:
             found = estimate(
                 flight.frames, known.priors, first, flight.camera, tools, first_loader, count
@@ -80,13 +81,16 @@ def run_trial(
         priors, second, loader = known.priors, first, first_loader
         if found is not None:
             priors = tuple(found.correction.applied(p) for p in known.priors)
-            begun = tuple(map(_begun, priors, first))
-            told: dict[int, Pose] = {}
-            sure = build_localizer(stack, found.camera, _known_to(config, begun), sensors_of(told))
-            loader = FrameLocalizer(sure, search, found.camera, told)
+            started = tuple(map(_prior_from_search, priors, first))
+            recorded_poses: dict[int, Pose] = {}
+            sure = build_localizer(
+                stack, found.camera, _corrected_config(config, started), sensors_of(recorded_poses)
+            )
+            loader = FrameLocalizer(sure, search, found.camera, recorded_poses)
             second = tuple(
                 localize_each(
-                    range(len(begun)), (), lambda k: loader.from_prior(flight.frames[k], begun[k]),
+                    range(len(started)), (),
+                    lambda k: loader.from_prior(flight.frames[k], started[k]),
                     stage("localizing again"),
                 ).values()
             )  # fmt: skip
@@ -96,8 +100,8 @@ def run_trial(
     return Trial(flight, priors, first, second, searched, found, why, notes)
 
 
-def spread(items: Sequence[int], most: int) -> list[int]:
-    """At most so many of them, in an order of which every beginning is spread over all."""
+def evenly_spread(items: Sequence[int], most: int) -> list[int]:
+    """At most `most` of the items. Each beginning of the result is spread over all items."""
     return [items[k] for k in sorted(range(len(items)), key=lambda k: f"{k:032b}"[::-1])][:most]
 
 
@@ -107,7 +111,9 @@ def localize_each(
     localize: Callable[[int], Localized],
     counter: AbstractContextManager[Count],
 ) -> dict[int, Localized]:
-    """Localize frames in this order: of those in `searched` no more than 6 if none is found."""
+    """Localize in this order; results by frame number. If 6 frames of `searched` failed and none
+    was found, its others are left out.
+    """
     done: dict[int, Localized] = {}
     with counter as count:
         for k in order:
@@ -119,15 +125,15 @@ def localize_each(
     return done
 
 
-def placed(
+def localize_from_telemetry(
     flight: RecordedFlight, known: FlightPriors, loader: FrameLocalizer, stage: Stage
 ) -> tuple[RecordedFlight, FlightPriors, tuple[Localized, ...]]:
-    """Localize from telemetry. Of frames without heading or height, which need a search, those that
-    are not tried are left out of the flight; a note says so.
+    """Localize all frames from telemetry. A frame without heading or height needs a search; at most
+    24 of them are searched, and the others are left out of all three results. A note says so.
     """
     frames, priors = flight.frames, known.priors
     slow = [k for k, p in enumerate(priors) if p.pose is not None and not p.is_complete]
-    chosen = spread(slow, _MOST_PLACED)
+    chosen = evenly_spread(slow, _MOST_PLACED)
     done = localize_each(
         [*chosen, *(k for k in range(len(priors)) if k not in slow)], chosen,
         lambda k: loader.from_prior(frames[k], priors[k]), stage("localizing"),
@@ -150,9 +156,9 @@ def placed(
     )
 
 
-def _known_to(config: LocalizerConfig, priors: tuple[FramePrior, ...]) -> LocalizerConfig:
-    """The settings for corrected roll, pitch and height, as sure as those of most frames: over flat
-    ground a tilt of the camera and a shift of its position look alike.
+def _corrected_config(config: LocalizerConfig, priors: tuple[FramePrior, ...]) -> LocalizerConfig:
+    """Settings with the median sigmas of the corrected tilt and height: over flat ground a tilt of
+    the camera and a shift of its position look alike.
     """
     tilt_deg = float(np.median([p.tilt_sigma_deg for p in priors]))
     height_m = float(np.median([p.height_sigma_m for p in priors]))
@@ -163,7 +169,7 @@ def _known_to(config: LocalizerConfig, priors: tuple[FramePrior, ...]) -> Locali
 def _measured_width(
     camera: Camera, priors: tuple[FramePrior, ...], kind: MapKind, least: int
 ) -> int:
-    """Of the image in which its parts are measured: as fine as the map's imagery, in bounds."""
+    """Image width for the estimate, pixels: as fine as the map's imagery, in bounds."""
     most = max(least, min(_MEASURED_WIDTH, camera.width))
     ground_m = float(np.median([p.clearance_m for p in priors])) * camera.width / camera.fx
     return int(np.clip(ground_m / max(kind.effective_resolution_m, 1e-3), least, most))
@@ -174,10 +180,10 @@ def _map_notes(kind: MapKind, flight: RecordedFlight) -> tuple[str, ...]:
     return (f"map: {kind.line()}", *([advice] if advice else []))
 
 
-def _opened_once(
+def _lazy_relocalizer(
     cache: TileCache, config: LocalizerConfig, opened: ExitStack
 ) -> Callable[[], Relocalizer]:
-    """Opens the relocalizer when it is first needed: it computes the map's overview."""
+    """A function that opens the relocalizer at its first call: it computes the map's overview."""
     relocalization = replace(config.relocalization, threads=2)
 
     @functools.cache
@@ -189,8 +195,8 @@ def _opened_once(
     return relocalizer
 
 
-def _begun(prior: FramePrior, first: Localized) -> FramePrior:
-    """The second time, a frame that was searched begins where it was found."""
+def _prior_from_search(prior: FramePrior, first: Localized) -> FramePrior:
+    """Prior for the second pass: the pose where a search found the frame, otherwise unchanged."""
     if prior.is_complete or not first.accepted or first.pose is None:
         return prior
     return replace(
@@ -207,12 +213,12 @@ def _searched(
     most: int,
     stage: Stage,
 ) -> tuple[dict[int, Localized], tuple[str, ...]]:
-    """Frames without their positions, spread over the flight, and a note if some were left out."""
-    chosen = spread(range(len(priors)), most)
+    """Results of frames searched without positions, and a note if some were left out."""
+    chosen = evenly_spread(range(len(priors)), most)
     if not chosen:
         return {}, ()
     found = localize_each(
-        chosen, chosen, lambda k: loader.anywhere(flight.frames[k], priors[k]),
+        chosen, chosen, lambda k: loader.search_map(flight.frames[k], priors[k]),
         stage("searching without positions"),
     )  # fmt: skip
     left_out = len(chosen) - len(found)

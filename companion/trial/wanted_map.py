@@ -21,7 +21,7 @@ _WORKING_PX = 320  # of the image that is registered
 
 @dataclass(frozen=True)
 class WantedMap:
-    """Bounds in degrees, and the finest useful ground sampling distance, m."""
+    """Bounds in degrees (WGS84), and the coarsest useful size of a map pixel on the ground, m."""
 
     south: float
     west: float
@@ -31,7 +31,7 @@ class WantedMap:
 
     @property
     def sentence(self) -> str:
-        """Description for the user."""
+        """Sentence for the user, without full stop: "It needs a map of ..." (It: the footage)."""
         return (
             f"It needs a map of latitude {self.south:.5f} to {self.north:.5f}, longitude "
             f"{self.west:.5f} to {self.east:.5f}, with pixels of {self.gsd_m:.2g} m or finer and, "
@@ -39,33 +39,33 @@ class WantedMap:
         )
 
     def command(self, out: str) -> str:
-        """Command that fetches such a map from open data."""
+        """Command that fetches imagery of these bounds from open data into the folder `out`."""
         box = f"{self.west:.5f},{self.south:.5f},{self.east:.5f},{self.north:.5f}"
         return f"companion map fetch --rectangle {box} --out {out}"
 
 
 def wanted_map(flight: RecordedFlight) -> WantedMap:
-    """The map that the footage needs. `FootageError` without any position."""
-    told = [f.telemetry for f in flight.frames if f.telemetry.position is not None]
-    if not told:
+    """The map that the footage needs. `FootageError` if no frame has a position."""
+    recorded = [f.telemetry for f in flight.frames if f.telemetry.position is not None]
+    if not recorded:
         raise FootageError(
             f"{flight.name}: neither a map nor a position: give --map, or footage with positions "
             "in it or beside it (--places, --log)"
         )
-    height = _height_m(told)
-    points = np.array([point for one in told for point in _seen(one, height)])
+    height = _height_m(recorded)
+    points = np.array([point for one in recorded for point in _viewed_points(one, height)])
     south, west = points.min(axis=0)
     north, east = points.max(axis=0)
     up = max(_MARGIN_SHARE * min(height, _HIGHEST_M), _LEAST_MARGIN_M) / _METRES_PER_DEGREE
     across = up / math.cos(math.radians(south))
     camera = flight.camera.camera
-    slant = height / math.cos(math.radians(_tilt_deg(told[0])))
+    slant = height / math.cos(math.radians(_tilt_deg(recorded[0])))
     gsd = slant / (camera.fx * _WORKING_PX / camera.width)
     return WantedMap(south - up, west - across, north + up, east + across, gsd)
 
 
-def flat_ground(flight: RecordedFlight) -> str:
-    """How to build a flat map at the take-off's height; empty if the footage does not tell it."""
+def flat_map_advice(flight: RecordedFlight) -> str:
+    """Advice to build a flat map at the take-off's height; "" if the height is unknown."""
     heights = [
         {h.datum: h.value_m for h in f.telemetry.position.heights}
         for f in flight.frames
@@ -87,12 +87,12 @@ def flat_ground(flight: RecordedFlight) -> str:
     return ""
 
 
-def _height_m(told: Sequence[Telemetry]) -> float:
-    """Above the ground as far as it is known without a map: above the take-off, or the sea."""
+def _height_m(recorded: Sequence[Telemetry]) -> float:
+    """Height above ground without a map: median above take-off, else above the sea, else 100 m."""
     for datum in (Datum.TAKEOFF, Datum.AMSL):
         heights = [
             h.value_m
-            for one in told
+            for one in recorded
             if one.position is not None
             for h in one.position.heights
             if h.datum is datum
@@ -106,8 +106,8 @@ def _tilt_deg(one: Telemetry) -> float:
     return 0.0 if one.view is None else min(one.view.nadir_angle_deg, _STEEPEST_DEG)
 
 
-def _seen(one: Telemetry, height_m: float) -> list[tuple[float, float]]:
-    """Latitude and longitude below the camera and where its axis meets the ground."""
+def _viewed_points(one: Telemetry, height_m: float) -> list[tuple[float, float]]:
+    """(latitude, longitude) below the camera and where the optical axis meets flat ground."""
     position = one.position
     if position is None:
         return []

@@ -1,5 +1,6 @@
-"""An alert as components pass it on: an identifier and values. It becomes text only where it leaves
-the process.
+"""An alert as components pass it on: an identifier and values.
+
+It becomes text only where it leaves the process.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ AlertKey = tuple[AlertId, bool, tuple[str, ...]]
 
 
 class Severity(enum.IntEnum):
-    """MAV_SEVERITY."""
+    """Severity of the STATUSTEXT (MAV_SEVERITY)."""
 
     CRITICAL = 2
     ERROR = 3
@@ -53,11 +54,11 @@ class AlertSpec:
     """One row of the catalogue.
 
     title: its name in tables and when it is cleared. text: template of the STATUSTEXT without the
-    prefix, with the values by name. kinds: of each value, in the order of `Alert.values`. raised,
-    cleared: under which condition; cleared is empty for an event, which happens once and does not
-    end. cleared_text: sent when it ends; None: "cleared: TITLE"; empty: nothing is sent, the next
-    alert or status follows. raise_s, clear_s: how long the condition must last. repeat_s: period
-    while it is active, 0 for once. lead: what the text begins with.
+    prefix, with the values by name. kinds: unit or type of each value, in the order of
+    `Alert.values`. raised, cleared: conditions in words; cleared is empty for an event, which
+    happens once and does not end. cleared_text: sent when it ends; None: "cleared: TITLE"; empty:
+    nothing is sent, the next alert or status follows. raise_s, clear_s: how long the condition must
+    last. repeat_s: period while it is active, 0 for once. lead: what the text begins with.
     """
 
     id: AlertId
@@ -84,7 +85,7 @@ class AlertSpec:
 
     @property
     def reports_end(self) -> bool:
-        """Whether a text is sent when it is cleared."""
+        """Whether a text is sent when the alert is cleared."""
         return bool(self.cleared) and self.cleared_text != ""
 
     @property
@@ -132,5 +133,5 @@ class Alert:
 
     @property
     def key(self) -> AlertKey:
-        """Equal for alerts that differ only in numbers."""
+        """Value that is equal for alerts that differ only in numbers."""
         return self.id, self.active, tuple(v for v in self.values if isinstance(v, str))

@@ -16,7 +16,7 @@ TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
 def spec_of(alert: Alert | AlertId) -> AlertSpec:
-    """The catalogue row of an alert."""
+    """The catalogue row of an alert or identifier."""
     return CATALOGUE[alert.id if isinstance(alert, Alert) else alert]
 
 
@@ -29,14 +29,14 @@ def alert(of: AlertId, **values: Value) -> Alert:
 
 
 def cleared(of: AlertId) -> Alert:
-    """The ended alert; ValueError if its end is not reported."""
+    """The end of an alert; ValueError if the catalogue has no text for its end."""
     if not CATALOGUE[of].reports_end:
         raise ValueError(f"{of}: its end has no text")
     return Alert(of, active=False)
 
 
 def severity(of: Alert) -> Severity:
-    """Severity of the text; the end of an alert is a notice."""
+    """MAV_SEVERITY of the text; NOTICE for the end of an alert."""
     return spec_of(of).severity if of.active else Severity.NOTICE
 
 
@@ -50,15 +50,15 @@ def reason(of: Alert) -> str:
     return body(of).removeprefix(spec_of(of).lead)
 
 
-def named(of: Alert) -> dict[str, Value | str]:
-    """The alert's values by name; another alert as its title."""
+def values_by_name(of: Alert) -> dict[str, Value | str]:
+    """The alert's values by name; a value that is another alert as its title."""
     shown = (CATALOGUE[v].title if isinstance(v, AlertId) else v for v in of.values)
     return dict(zip(spec_of(of).values, shown, strict=True)) if of.active else {}
 
 
 def text(of: Alert) -> str:
-    """The STATUSTEXT of an alert."""
+    """The STATUSTEXT of an alert, with the prefix."""
     spec = spec_of(of)
     if of.active:
-        return spec.template.format(**named(of))
+        return spec.template.format(**values_by_name(of))
     return PREFIX + (f"cleared: {spec.title}" if spec.cleared_text is None else spec.cleared_text)

@@ -1,4 +1,4 @@
-"""Find the alert of a STATUSTEXT, for ground programs that have only the text.
+"""Finds the alert of a STATUSTEXT, for ground programs that have only the text.
 
 For recordings (`.tlog`), the simulator's ground station and records of version 0.1. No component of
 the flight process uses it: they have the alerts themselves.
@@ -17,7 +17,7 @@ _FIELD = re.compile(r"\{(\w+)[^}]*\}")
 
 @cache
 def _patterns() -> tuple[tuple[AlertId, re.Pattern[str]], ...]:
-    """Most fixed characters first: "lost" is no reason of "lost: {why}"."""
+    """Patterns, most fixed characters first: "lost" must not be read as "lost: {why}"."""
     found = [(spec.id, _pattern(spec.template)) for spec in CATALOGUE.values()]
     return tuple(sorted(found, key=lambda one: -len(_FIELD.sub("", CATALOGUE[one[0]].template))))
 
@@ -29,7 +29,7 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def values_of(statustext: str) -> tuple[AlertId, dict[str, str]] | None:
-    """The active alert of a text and its values as they are shown; None for other texts."""
+    """Identifier and shown values of an active alert's text; None for other texts."""
     for of, pattern in _patterns():
         match = pattern.fullmatch(statustext)
         if match is not None:
@@ -38,7 +38,7 @@ def values_of(statustext: str) -> tuple[AlertId, dict[str, str]] | None:
 
 
 def alert_of(statustext: str) -> tuple[AlertId, bool] | None:
-    """The alert of a text and whether it is active; None for other texts."""
+    """Identifier of a text's alert, and whether the alert is active; None for other texts."""
     read = values_of(statustext)
     if read is not None:
         return read[0], True

@@ -33,7 +33,7 @@ class SenderRefusal(Word):
 
 
 class LookAtRefusal(Word):
-    """Why the gimbal is not turned."""
+    """Why the gimbal is not pointed at a position."""
 
     OFF = "bridge.look_at is off"
     FIXED_CAMERA = "the camera is fixed"
@@ -41,7 +41,7 @@ class LookAtRefusal(Word):
 
 
 class CommandAnswer(Word):
-    """The autopilot's MAV_RESULT, or why there is none."""
+    """The autopilot's MAV_RESULT for a position command, or why there is none."""
 
     NOT_ASKED = "not asked, no GNSS"
     NOT_ANSWERED = "not answered"
@@ -142,7 +142,7 @@ class Direction(Word):
 
 
 class MapOffsetUse(Word):
-    """Whether an offset of the map is applied."""
+    """Whether the fixes are corrected by the map offset."""
 
     REPORTED = ""
     APPLIED = ", applied"
@@ -156,7 +156,7 @@ class ProcessFault(Word):
 
 
 class ClickRefusal(Word):
-    """Why no target is made of a click."""
+    """Why a click begins no target."""
 
     UNKNOWN = "position not known"
     UNCONFIRMED = "position not confirmed yet"

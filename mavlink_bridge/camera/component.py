@@ -63,7 +63,7 @@ class _ClickRate:
         self._times_ns: deque[int] = deque(maxlen=_MOST_CLICKS)
 
     def is_exceeded(self, time_ns: int) -> bool:
-        """Whether one more click is too many; otherwise it is counted."""
+        """Count a click at time_ns; whether it is one too many, which is not counted."""
         times = self._times_ns
         if len(times) == _MOST_CLICKS and time_ns - times[0] < _CLICKS_NS:
             return True
@@ -111,26 +111,26 @@ class CameraComponent:
         return len(self._targets)
 
     def report(self, target: TargetReport) -> None:
-        """The newest fix of a target."""
+        """Set the newest fix of a target, to be sent by `tick`."""
         self._targets[target.target_id] = target
 
     def forget(self, target_id: int) -> None:
-        """Stop reporting that target."""
+        """Stop reporting the target of this number."""
         self._targets.pop(target_id, None)
         for kind in ("image", "geo", "adsb"):
             self._sent_ns.pop((kind, target_id), None)
 
-    def look(self, view: CameraView) -> None:
-        """The newest camera pose."""
+    def report_view(self, view: CameraView) -> None:
+        """Set the newest camera pose, to be sent by `tick`."""
         self._view = view
 
     def tick(self, now_ns: int, vehicle: Origin | None, uptime_ms: int, send: Send) -> None:
-        """Send what is due."""
+        """Send the messages that are due. vehicle: its position, None if unknown."""
         for target_id in [
             i for i, t in self._targets.items() if abs(now_ns - t.time_ns) > _TARGET_AGE_NS
         ]:
             self.forget(target_id)
-        told = self._told()
+        told = self._reported_targets()
         for number in self._due("image", told, self._image_ns, now_ns):
             send(tracking_image_status(self._targets[number]), self._component)
         for number in self._due("geo", told, self._geo_ns, now_ns):
@@ -154,24 +154,22 @@ class CameraComponent:
             self._view = None
 
     def _capture(self, marks: Marks, now_ns: int, uptime_ms: int, send: Send) -> None:
-        """Send a marker for the map for each target when it is confirmed."""
+        """Send a map marker for each target when it is confirmed."""
         mark = marks.due(self._targets, now_ns)
         if mark is not None:
             utc_us = self._utc.utc_ns(mark.report.time_ns) // 1000
             message = image_captured(mark.report, self._geoid_m, mark.index, uptime_ms, utc_us)
             send(message, self._component)
 
-    def _told(self) -> list[int]:
-        """The target that the camera protocol reports. The protocol has room for one target,
-        without a number.
-
-        It is the last clicked target. Without a click, the detected targets are reported in turn.
+    def _reported_targets(self) -> list[int]:
+        """Numbers of the targets for the camera protocol, which has room for one: the last clicked
+        target; without a click all detected targets, which are reported in turn.
         """
         clicked = [number for number, target in self._targets.items() if target.clicked]
         return [max(clicked)] if clicked else list(self._targets)
 
     def _due(self, kind: str, numbers: list[int], period_ns: int, now_ns: int) -> list[int]:
-        """Targets whose message of that kind is due, the longest waiting first; noted as sent."""
+        """Targets whose message of that kind is due, the longest waiting first; marks them sent."""
         sent = {number: self._sent_ns.get((kind, number), 0) for number in numbers}
         waited = sorted(sent, key=lambda number: sent[number])
         due = [number for number in waited if now_ns - sent[number] >= period_ns][:_PER_TICK]
@@ -222,7 +220,7 @@ class CameraComponent:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _is_repeated(self, message: Any, request: TrackRequest) -> bool:
-        """Whether a station without an answer repeats a request that was already accepted."""
+        """Whether a station without an answer repeats a request that was accepted."""
         if self._last_click is None or not getattr(message, "confirmation", 0):
             return False
         system, command, last = self._last_click
@@ -241,7 +239,7 @@ class CameraComponent:
                 self._camera
             ),
             mavlink.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS: lambda: tracking_image_status(
-                next((self._targets[number] for number in self._told()), None)
+                next((self._targets[number] for number in self._reported_targets()), None)
             ),
         }
         answer = answers.get(int(message_id)) if math.isfinite(message_id) else None
@@ -251,7 +249,7 @@ class CameraComponent:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _interval(self, message_id: float, interval_us: float) -> int:
-        """SET_MESSAGE_INTERVAL of the tracking messages; 0 is the default rate, -1 is off."""
+        """Set the interval of a tracking message; 0: default, -1: off. Returns a MAV_RESULT."""
         if not (math.isfinite(message_id) and math.isfinite(interval_us)):
             return int(mavlink.MAV_RESULT_DENIED)
         interval = self._period_ns

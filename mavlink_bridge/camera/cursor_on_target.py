@@ -46,11 +46,11 @@ class CursorOnTarget:
         self._next_ns = 0
 
     def send(self, target: TargetReport) -> None:
-        """Send one event; events that the network refuses are lost."""
+        """Send a target's event; events that the network refuses are lost."""
         self._write(cursor_on_target(target, self._config, self._utc))
 
-    def look(self, view: CameraView) -> None:
-        """Send aircraft and camera, once a second if `cot_aircraft` is set."""
+    def report_view(self, view: CameraView) -> None:
+        """Send aircraft and camera, at most once a second, if `cot_aircraft` is set."""
         if not self._config.cot_aircraft:
             return
         with self._lock:

@@ -1,8 +1,8 @@
 """Look-at: commands the autopilot to point the gimbal at a position or a target.
 
-MAV_CMD_DO_SET_ROI_LOCATION (195) of the gimbal protocol v2, sent on to the autopilot as its gimbal
-manager; https://mavlink.io/en/services/gimbal_v2.html. ArduCopter turns the whole aircraft where
-the mount has no yaw of its own. Off unless `look_at` allows it.
+MAV_CMD_DO_SET_ROI_LOCATION (195) of the gimbal protocol v2, forwarded to the autopilot as its
+gimbal manager; https://mavlink.io/en/services/gimbal_v2.html. ArduCopter turns the whole aircraft
+if the mount has no yaw of its own. Off unless `look_at` allows it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _PATIENCE_NS = 3_000_000_000  # for the autopilot's answer
 
 @dataclass(frozen=True)
 class _Place:
-    """degrees, metres above the frame's reference."""
+    """Position in degrees; altitude in metres above the reference of `frame` (MAV_FRAME)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -49,10 +49,10 @@ class _Place:
 
 
 class LookAt:
-    """The gimbal's target. Thread-safe; `due` and `answered` are called in the flight controller's
-    thread.
+    """Keeps the gimbal's target. Thread-safe; `due` and `answered` are called in the flight
+    controller's thread.
 
-    report: tells the operator.
+    report: sends an alert to the operator.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class LookAt:
         self._lock = threading.Lock()
 
     def report(self, target: TargetReport) -> None:
-        """Update the position of a target."""
+        """Update the position of a target, which the gimbal may follow."""
         with self._lock:
             self._targets[target.target_id] = target
             if self._number and target.target_id == self._number:
                 self._wanted = self._place_of(target)
 
     def forget(self, number: int) -> None:
-        """A target ended: the gimbal keeps its direction, which is reported."""
+        """A target ended: a gimbal that follows it keeps its direction, which is reported."""
         with self._lock:
             self._targets.pop(number, None)
             if self._number != number:
@@ -91,14 +91,14 @@ class LookAt:
         """Process a COMMAND_LONG or COMMAND_INT of `LOOKS`; returns its MAV_RESULT. Refusals are
         reported.
         """
-        refused = self._obey(message)
+        refused = self._execute(message)
         if refused is None:
             return int(mavlink.MAV_RESULT_ACCEPTED)
         self._report(refused)
         return int(mavlink.MAV_RESULT_DENIED)
 
     def due(self, now_ns: int) -> tuple[int, int, int, int, float] | None:
-        """The COMMAND_INT to send to the autopilot now: command, frame, x, y, z."""
+        """COMMAND_INT for the autopilot: command, frame, x, y, z; None if none is due."""
         with self._lock:
             if self._asked_ns is not None and now_ns - self._asked_ns > _PATIENCE_NS:
                 self._asked_ns = None
@@ -128,8 +128,8 @@ class LookAt:
             self._wanted, self._number = None, 0
         self._report(alert(AlertId.LOOK_AT_DENIED, result=CommandAnswer.of(result)))
 
-    def _obey(self, message: Any) -> Alert | None:
-        """Why the command is refused; None if it was carried out."""
+    def _execute(self, message: Any) -> Alert | None:
+        """Execute the command; returns why it is refused, or None."""
         if not self._allowed:
             return alert(AlertId.LOOK_AT_REFUSED, why=LookAtRefusal.OFF)
         if not self._has_gimbal:

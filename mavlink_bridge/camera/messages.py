@@ -24,7 +24,7 @@ _FIRMWARE = 1  # 0.0.0.1 as MAVLink packs it: (dev << 24) + (patch << 16) + (min
 
 
 def _text(value: str, length: int) -> list[int]:
-    """A uint8[length] field, zero-terminated."""
+    """Text as a uint8[length] field, zero-terminated."""
     raw = value.encode("ascii", "replace")[: length - 1]
     return list(raw) + [0] * (length - len(raw))
 
@@ -75,8 +75,8 @@ def video_stream_information(config: CameraConfig) -> Any:
 
 
 def stream_address(uri: str) -> tuple[int, str]:
-    """VIDEO_STREAM_TYPE and the uri field: the address to connect to; for UDP the port to listen
-    at.
+    """VIDEO_STREAM_TYPE and the message's uri field: the address to connect to, or for UDP the port
+    to listen at.
 
     QGroundControl and Mission Planner append the field of an MPEG-TS stream to "0.0.0.0:", so the
     field contains the port alone.
@@ -94,8 +94,7 @@ def camera_fov_status(
     view: CameraView, config: CameraConfig, geoid_separation_m: float, uptime_ms: int
 ) -> Any:
     """CAMERA_FOV_STATUS (271): camera position, attitude and the ground point in the middle of the
-    image. The message contains heights above mean sea level. geoid_separation_m: ellipsoid height
-    minus height above mean sea level.
+    image, with heights above mean sea level. geoid_separation_m: geoid above the ellipsoid.
     """
 
     def degrees_e7(value: float | None) -> int:
@@ -120,7 +119,7 @@ def camera_fov_status(
 
 
 def track_request(message: Any, time_ns: int) -> TrackRequest | None:
-    """The track request of a COMMAND_LONG or COMMAND_INT to the camera; None if it is none."""
+    """Track request of a COMMAND_LONG or COMMAND_INT; None for another command."""
     if message.command == mavlink.MAV_CMD_CAMERA_TRACK_POINT:
         coordinates = (message.param1, message.param2)
         if not all(0.0 <= c <= 1.0 for c in coordinates):

@@ -26,7 +26,7 @@ _ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's numbe
 
 
 def tracking_image_status(report: TargetReport | None) -> Any:
-    """CAMERA_TRACKING_IMAGE_STATUS (275): position of the target in the image; None: idle."""
+    """CAMERA_TRACKING_IMAGE_STATUS (275): the target's position in the image; None: idle."""
     if report is None or (report.pixel is None and report.rectangle is None):
         active, mode = mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE, 0
         point, rectangle = (NAN, NAN), (NAN,) * 4
@@ -108,7 +108,7 @@ def image_captured(
 
 
 def is_confirmed(report: TargetReport, sigma_m: float) -> bool:
-    """Whether it is detected now, with at most sigma_m, and probably on this surface."""
+    """Whether the target is detected now, with at most sigma_m, and probably on this surface."""
     accuracy = report.h_accuracy_m
     is_known = accuracy is not None and accuracy <= sigma_m
     return is_known and not report.coasting and report.elsewhere < _ELSEWHERE

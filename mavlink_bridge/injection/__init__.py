@@ -1,1 +1,1 @@
-"""Convert vision fixes to messages for the flight controller, and check their effect."""
+"""Converts vision fixes to messages for the flight controller, and checks their effect."""

@@ -43,7 +43,7 @@ class LoopVerdict:
 
 
 class ClosedLoopCheck:
-    """Compares sent positions with the EKF's; one thread.
+    """Compares sent positions with the EKF's; one thread. message: kind of the sent messages.
 
     jumping: the EKF was not yet seen at the positions after the last announced jump.
     """
@@ -60,7 +60,7 @@ class ClosedLoopCheck:
         self._announced_ns = 0
         self._repeats = 0
 
-    def sent(
+    def add_sent(
         self,
         stamp_ns: int,
         now_ns: int,
@@ -69,7 +69,7 @@ class ClosedLoopCheck:
         sigma_m: float,
         reset_counter: int = 0,
     ) -> None:
-        """A position was sent: valid at stamp_ns, NE metres from the EKF origin."""
+        """Add a sent position: valid at stamp_ns, metres north and east of the EKF origin."""
         if self._reset_counter not in (None, reset_counter):
             self._jump_ns = now_ns + _TAKES_NS
             self._announced_ns, self.jumping = now_ns, True
@@ -85,7 +85,9 @@ class ClosedLoopCheck:
         state: VehicleState,
         local_at: Callable[[int], tuple[float, ...] | None],
     ) -> LoopVerdict | None:
-        """The verdict, or None while it is too early to tell or nothing is being sent."""
+        """The verdict of the last 3 s; None before, or while nothing is sent. local_at: the EKF's
+        position (north, east, down) at a time, m.
+        """
         self._compare(now_ns, local_at)
         recent = [s for s in self._sent if now_ns - s[0] < _WINDOW_NS]
         if not recent or self._began_ns is None or now_ns - self._began_ns < _SETTLE_NS:
@@ -103,16 +105,17 @@ class ClosedLoopCheck:
             self.jumping, self._repeats = False, 0  # another jump may be missed as often
         return LoopVerdict(reason is None, reason, difference)
 
-    def waiting(self) -> dict[str, int]:
-        """Lengths of the queues."""
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of entries in each queue, by name."""
         return {
             "sent": len(self._sent),
             "pending": len(self._pending),
             "differences": len(self._differences),
         }
 
-    def jump_missed(self) -> bool:
-        """Whether an announced jump must be announced again, because the EKF is still elsewhere.
+    def is_jump_missed(self) -> bool:
+        """Whether an announced jump must be announced again (up to five times): the EKF did not
+        follow.
 
         In each of its steps ArduPilot's EKF uses only the newest measurement. If two arrive
         together, it never uses the first one, which had the new reset_counter. It then refuses all
@@ -132,9 +135,7 @@ class ClosedLoopCheck:
         return self._repeats <= _MOST_REPEATS
 
     def _compare(self, now_ns: int, local_at: Callable[[int], tuple[float, ...] | None]) -> None:
-        """Compare each sent position with the EKF's at the same time, when that has
-        been received.
-        """
+        """Compare each sent position with the EKF's at the same time, 0.3 s after that time."""
         while self._pending and now_ns - self._pending[0][0] > _COMPARE_AFTER_NS:
             stamp_ns, north, east, sigma = self._pending.popleft()
             local = local_at(stamp_ns)
@@ -164,5 +165,5 @@ class ClosedLoopCheck:
 
 
 def _is_there(distance_m: float, sigma_m: float) -> bool:
-    """Whether the EKF has followed an announced jump."""
+    """Whether the EKF is at the sent position, so that it has followed an announced jump."""
     return distance_m <= _JUMP_SIGMAS * sigma_m + _JUMP_SLACK_M

@@ -1,4 +1,4 @@
-"""Encode an estimate as the configured one of five messages, or return why it cannot be sent."""
+"""Encodes an estimate as the configured one of five messages, or says why it cannot be sent."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 @dataclass(frozen=True)
 class EncodedEstimate:
-    """An estimate to send. position: as propagated; quaternion: body to NED, None where unknown.
-
-    fresh: the fix itself, not propagated. quality: 0..100. velocity_is_new: the fix measured a
-    velocity, which was not sent before. protection_m: horizontal and vertical level.
+    """An estimate to send. position: propagated to the message's time; quaternion: body to NED,
+    None where unknown; fresh: the fix itself, not propagated; quality: 0 to 100; velocity_is_new:
+    the fix measured a velocity, which was not sent before; protection_m: horizontal and vertical
+    level, None if unknown.
     """
 
     position: PropagatedFix
@@ -61,7 +61,7 @@ class EncodedEstimate:
 
     @property
     def levels_m(self) -> tuple[float, float]:
-        """Horizontal and vertical protection level; from the covariance if none is given."""
+        """Horizontal and vertical protection level, m; 3.7 sigma if `protection_m` is None."""
         if self.protection_m is not None:
             return self.protection_m
         p = self.position
@@ -69,13 +69,13 @@ class EncodedEstimate:
 
 
 def claimed_dilution(level_m: float) -> float:
-    """Dilution of precision of a GNSS receiver with this protection level."""
+    """Dilution of precision (HDOP, VDOP) that a GNSS receiver with this protection level states."""
     return min(max(level_m / _METRES_PER_DOP, _LEAST_DOP), _MOST_DOP)
 
 
 def claimed_satellites(level_m: float, alert_limit_m: float) -> int:
-    """Number of satellites: 12 for a good position, falling to 6 at the alert limit; 5, too few to
-    arm, above.
+    """Number of satellites to state: 12 for a good position, falling to 6 at the alert limit; above
+    the limit 5, too few to arm.
     """
     if level_m > alert_limit_m:
         return _ENOUGH_SATELLITES - 1
@@ -86,9 +86,9 @@ def claimed_satellites(level_m: float, alert_limit_m: float) -> int:
 def pose_covariance(
     P: np.ndarray, attitude_sigma_rad: float, formula: CovarianceFormula
 ) -> list[float]:
-    """The 21 entries of VISION_POSITION_ESTIMATE and ODOMETRY for an NED covariance P (3, 3).
+    """The 21 entries of VISION_POSITION_ESTIMATE and ODOMETRY for an NED covariance P (3, 3), m².
 
-    ArduPilot reads one error from the three position entries, so all three carry the worst
+    ArduPilot reads one error from the three position entries, so all three hold the worst
     horizontal sigma; PX4 reads variances.
     """
     entries = [0.0] * 21
@@ -107,7 +107,7 @@ def pose_covariance(
 def vision_position_estimate(
     e: EncodedEstimate, ned: tuple[float, float, float], formula: CovarianceFormula
 ) -> Any:
-    """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
+    """VISION_POSITION_ESTIMATE (102). ned: metres from the EKF origin; yaw from true north."""
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
     angles = (NAN, NAN, NAN) if e.quaternion is None else quat.to_euler(e.quaternion)
     return mavlink.MAVLink_vision_position_estimate_message(
@@ -122,10 +122,11 @@ def odometry(
     formula: CovarianceFormula,
     frame: int,
 ) -> Any:
-    """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion.
+    """ODOMETRY (331): position NED (ned: metres from the EKF origin), velocity in the body frame.
 
-    A velocity that is repeated or derived from the positions is sent as NaN ("unknown"), because
-    the EKF would treat its error as independent.
+    q: body to NED, to turn the velocity. frame: MAV_FRAME of the position. A velocity that is
+    repeated or derived from the positions is sent as NaN ("unknown"), because the EKF would treat
+    its error as independent.
     """
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
     body, velocity_covariance = (NAN, NAN, NAN), [NAN] * 21
@@ -160,7 +161,8 @@ def vision_position_delta(
     """VISION_POSITION_DELTA (11011): motion and rotation between two fixes, in body axes at the
     second; None if the velocity is less certain than the message can state.
 
-    ArduPilot dates it VISO_DELAY_MS before its arrival.
+    before, now: each fix with the autopilot's attitude at its time. ArduPilot dates the message
+    VISO_DELAY_MS before its arrival.
     """
     (first, then), (last, at) = before, now
     seconds = (last.time_ns - first.time_ns) * 1e-9
@@ -189,8 +191,8 @@ def gps_input(
 ) -> Any:
     """GPS_INPUT (232), every field filled: ArduPilot does not arm if HDOP is marked as ignored.
 
-    Dilution and number of satellites follow from the protection level, because ArduPilot judges a
-    receiver by them.
+    week_ms: GPS week and milliseconds in it. Dilution and number of satellites follow from the
+    protection level, because ArduPilot judges a receiver by them.
     """
     p = e.position
     horizontal_m, vertical_m = e.levels_m
@@ -274,7 +276,7 @@ def external_position_estimate(
 
 @dataclass(frozen=True)
 class HeldOutput:
-    """Why nothing is sent although it is due. counter: name of the counter."""
+    """Why a message that is due is not sent. counter: name of the counter to increment."""
 
     reason: Alert
     counter: str
@@ -290,7 +292,9 @@ class EncodedMessage:
 
 @dataclass(frozen=True)
 class InjectionContext:
-    """Vehicle data for the injector. now: the origin and profile at this time."""
+    """Vehicle data for the injector. origin: of the EKF, None if unknown; profile: of the firmware;
+    attitude_at: the autopilot's attitude at a time (ns); system_id: of the autopilot.
+    """
 
     origin: Origin | None
     profile: FirmwareProfile
@@ -298,7 +302,9 @@ class InjectionContext:
     system_id: int = 1
 
 
-def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat.Quaternion | None:
+def vision_attitude(
+    fix: VisionFix, time_ns: int, context: InjectionContext
+) -> quat.Quaternion | None:
     """Vision's attitude at time_ns: that of the fix, rotated as the autopilot rotated since."""
     if time_ns == fix.time_ns or fix.quaternion is None:
         return fix.quaternion
@@ -309,8 +315,8 @@ def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> quat
     return quat.multiply(fix.quaternion, turned)
 
 
-class MessageMaker:
-    """Encodes estimates one after another; one thread."""
+class MessageEncoder:
+    """Encodes estimates in turn; one thread. geoid_separation_m: geoid above ellipsoid."""
 
     def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
         self._config = config
@@ -321,7 +327,7 @@ class MessageMaker:
     def make(
         self, e: EncodedEstimate, now_ns: int, context: InjectionContext
     ) -> EncodedMessage | HeldOutput:
-        """The configured message of an estimate."""
+        """The configured message; `HeldOutput` without a usable EKF origin or attitude."""
         kind = self._config.message
         altitude = e.position.height_m - self._geoid_m
         message = self._global(kind, e, altitude, now_ns, context.system_id)
@@ -374,7 +380,7 @@ class MessageMaker:
         formula: CovarianceFormula,
         context: InjectionContext,
     ) -> EncodedMessage | HeldOutput:
-        """ODOMETRY. The velocity is in the frame of its quaternion, so the attitude is needed."""
+        """ODOMETRY; `HeldOutput` without the attitude that turns the velocity to body axes."""
         q = e.quaternion
         if q is None:
             now = context.attitude_at(e.position.time_ns)

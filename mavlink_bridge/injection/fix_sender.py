@@ -1,4 +1,4 @@
-"""Sends fixes of any thread as positions on the link, or reports why none is sent."""
+"""Sends fixes, queued by any thread, as positions on the link, or reports why none is sent."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ _AIDING = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_GPS_GLITCHING
 
 
 class PositionCommand:
-    """Tracks whether the autopilot accepts MAV_CMD_EXTERNAL_POSITION_ESTIMATE.
+    """Tracks whether the autopilot accepts MAV_CMD_EXTERNAL_POSITION_ESTIMATE. answer: its last
+    answer.
 
     An autopilot that fuses such positions accepts the command while its EKF uses GNSS. ArduPilot
     4.7 refuses it then. After the loss of GNSS it accepts the command, but only to reset the
@@ -49,8 +50,8 @@ class PositionCommand:
         self._asked_ns = self._accepted_ns = 0
         self._held_ns = self._held_since_ns = 0  # fixes that were not sent
 
-    def take(self, result: int, now_ns: int) -> None:
-        """Note the MAV_RESULT of a sent command."""
+    def add_answer(self, result: int, now_ns: int) -> None:
+        """Process the MAV_RESULT of a sent command."""
         self.answer = CommandAnswer.of(result)
         is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
         if self._fuses is None:
@@ -58,12 +59,12 @@ class PositionCommand:
         if is_accepted:
             self._accepted_ns = now_ns
 
-    def flows(self, now_ns: int) -> bool:
-        """Whether the autopilot accepts the command, so that each fix is sent."""
+    def is_accepted(self, now_ns: int) -> bool:
+        """Whether the autopilot accepted the command in the last 2 s, so that each fix is sent."""
         return bool(self._fuses) and now_ns - self._accepted_ns < _ANSWERED_NS
 
-    def asks(self, state: VehicleState, now_ns: int) -> bool:
-        """Whether to send a fix as a test although the command was not accepted."""
+    def should_ask(self, state: VehicleState, now_ns: int) -> bool:
+        """Whether to send this fix as a test although no command was accepted; once a second."""
         if now_ns - self._held_ns > _ASK_NS:
             self._held_since_ns = now_ns
         self._held_ns = now_ns
@@ -80,15 +81,15 @@ class PositionCommand:
         return True
 
     def is_held(self, now_ns: int) -> bool:
-        """Whether no fix was sent for longer than an answer takes."""
+        """Whether no fix was sent for more than 2 s, longer than an answer takes."""
         is_recent = now_ns - self._held_ns < _ASK_NS
         return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
 
 
 class FixSender:
-    """Runs in the flight-controller link's thread; only `put` is called from others.
+    """Sends queued fixes in the flight-controller link's thread; any thread may call `put`.
 
-    vision: the last position that was sent or scored.
+    vision: the last position that was sent or, in shadow mode, compared; None before the first.
     """
 
     def __init__(
@@ -122,21 +123,21 @@ class FixSender:
         self.dropped += len(self._fixes) == _QUEUE
         self._fixes.append(fix)
 
-    def take(self, now_ns: int) -> None:
-        """The fixes since the last call, oldest first."""
+    def drain_queue(self, now_ns: int) -> None:
+        """Pass the fixes that were queued since the last call to the injector, oldest first."""
         while self._fixes:
             self.injector.submit(self._fixes.popleft(), now_ns)
 
     def acknowledged(self, link: Link, ack: Any, now_ns: int) -> None:
-        """Process a COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE. A ground station may also send that
-        command.
+        """Process a COMMAND_ACK of EXTERNAL_POSITION_ESTIMATE. An ack for a ground station that
+        also sends the command is ignored.
         """
         ours = ack.target_system in (0, link.system_id)
         if self._command is not None and ours and ack.target_component in (0, self._component):
-            self._command.take(ack.result, now_ns)
+            self._command.add_answer(ack.result, now_ns)
 
     def rebooted(self) -> None:
-        """Reset after a reboot of the autopilot."""
+        """Reset yaw guard and command state after a reboot of the autopilot."""
         self.injector.guard.reset()
         self._command = None if self._command is None else PositionCommand()
 
@@ -148,12 +149,12 @@ class FixSender:
         if injection is not None:
             self.vision = injection.estimate.position
             self._deliver(link, state, mode, injection, now_ns)
-        delta = self.injector.motion.take()
+        delta = self.injector.motion.take_message()
         if delta is not None and mode == "inject" and link.send(delta, self._component):
             self._counters["injected_deltas"] += 1
         reason = self.injector.reason
         command = self._command if mode == "inject" else None
-        if reason is None and command is not None and not command.flows(now_ns):
+        if reason is None and command is not None and not command.is_accepted(now_ns):
             reason = alert(AlertId.COMMAND_NOT_TAKEN, answer=command.answer)
         if reason is None and not self._taken:
             reason = alert(AlertId.LINK_FULL)
@@ -167,41 +168,41 @@ class FixSender:
             self._notifier.notify_settled("inject", reason, relief, now_ns)
 
     def is_good(self, now_ns: int) -> bool:
-        """Whether positions were received lately (and sent, in mode ``inject``), and the yaw guard
-        does not block.
+        """Whether a position was sent (in shadow mode: computed) in the last second, and the yaw
+        guard does not block.
         """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
     def reaches_ekf(self, now_ns: int) -> bool:
-        """Whether positions were sent to the flight controller lately: not in shadow mode, while
-        output is held, or while the port is full.
+        """Whether a position was sent to the flight controller in the last second: not in shadow
+        mode, while output is held, or while the port is full.
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
 
-    def fed(self, now_ns: int) -> bool:
-        """Whether the EKF's state may still depend on our positions."""
+    def may_feed_ekf(self, now_ns: int) -> bool:
+        """Whether a position was sent in the last 10 s: the EKF's state may depend on it."""
         return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
 
     @property
     def refusal(self) -> Alert | None:
-        """Why due positions are not sent, if this has lasted and was reported; else None."""
+        """Why due positions are not sent, once this has been reported; else None."""
         reported = self._notifier.reported("inject")
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 
-    def waiting(self) -> dict[str, int]:
-        """Lengths of the queues."""
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of entries in each queue, by name."""
         return {"fixes": len(self._fixes), "due": self.injector.waiting}
 
     def _deliver(
         self, link: Link, state: VehicleState, mode: Mode, injection: EncodedMessage, now_ns: int
     ) -> None:
-        self._outcome.made(injection.estimate)
+        self._outcome.add_computed(injection.estimate)
         if self._command is not None and mode == "inject":
             if not injection.estimate.fresh:
                 return  # it has its age with it: nothing is propagated
-            if not self._command.flows(now_ns):
-                if self._command.asks(state, now_ns):
+            if not self._command.is_accepted(now_ns):
+                if self._command.should_ask(state, now_ns):
                     self._counters["position_commands"] += 1
                     link.send(injection.message, self._component)
                 return
@@ -218,4 +219,4 @@ class FixSender:
             # A process that died had counted as far: the autopilot sees a jump with the next one.
             self.injector.announce_jump()
         self._sent_ns = now_ns
-        self._outcome.sent(injection.estimate, now_ns)
+        self._outcome.add_sent(injection.estimate, now_ns)

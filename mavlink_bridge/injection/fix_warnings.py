@@ -1,5 +1,5 @@
-"""Warnings about late or unchecked fixes, a wrong clock and unknown firmware, each
-reported once.
+"""Warnings about late or unchecked fixes, a wrong clock and unknown firmware; each is reported
+once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _IN_TIME_S = 15.0  # until lateness is over; a computer at its limit is late and
 
 
 class FixWarnings:
-    """Checks the injector and the computer's clock; one thread."""
+    """Checks the injector and the computer's clock, and reports; one thread."""
 
     def __init__(self, shared: Shared, injector: Injector, notifier: StatusNotifier) -> None:
         self._config = shared.config.injection
@@ -28,8 +28,8 @@ class FixWarnings:
         self._injector = injector
         self._notifier = notifier
 
-    def firmware(self, state: VehicleState, profile: FirmwareProfile) -> None:
-        """Report firmware that is unknown or does not support the configured message."""
+    def check_firmware(self, state: VehicleState, profile: FirmwareProfile) -> None:
+        """Report a firmware that is unknown or does not support the configured message."""
         if not state.connected or state.version is None:
             return
         self._notifier.notify("profile", None if profile.known else alert(AlertId.UNKNOWN_FIRMWARE))
@@ -40,8 +40,8 @@ class FixWarnings:
         )
         self._notifier.notify("message", unsupported)
 
-    def fixes(self, profile: FirmwareProfile, now_ns: int) -> None:
-        """Report fixes that are late, not checked, or without a valid time."""
+    def check_fixes(self, profile: FirmwareProfile, now_ns: int) -> None:
+        """Report fixes that are late, not checked for yaw, or (GPS_INPUT) without a valid UTC."""
         tell = self._notifier.notify
         late = self._latency(profile)
         relief = alert(AlertId.FIXES_IN_TIME)

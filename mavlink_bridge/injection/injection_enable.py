@@ -34,8 +34,8 @@ class InjectionEnable:
     If the RC receiver goes silent, injection continues: without a position, ArduPilot would land
     instead of returning. Any thread may call.
 
-    changed: called with an alert when injection is enabled or disabled. memory: whether a process
-    before this one had enabled it.
+    changed: called with an alert when injection is enabled or disabled. memory: stores the state
+    for a restart, None without.
     """
 
     def __init__(
@@ -64,24 +64,24 @@ class InjectionEnable:
             self._open = True
             self._at_start = alert(AlertId.INJECTION_RESTORED, seconds=age_s)
         if self._memory is not None:
-            self._memory.opened(by_channel=by_channel)
+            self._memory.store_enabled(by_channel=by_channel)
 
     def announce(self) -> None:
-        """Report the state at the start, once a link is connected."""
+        """Report the state after the start; called once a link is connected."""
         self._changed(self._at_start)
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """Stop; a clean shutdown keeps nothing for a restart."""
+        """End the memory; a clean shutdown keeps nothing for a restart."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
     @property
     def open(self) -> bool:
-        """Whether positions may be sent."""
+        """Whether injection is enabled."""
         return self._open
 
-    def channels(self, pulses_us: Sequence[int]) -> None:
-        """Process RC_CHANNELS: a channel that crosses its threshold enables or disables."""
+    def on_rc_channels(self, pulses_us: Sequence[int]) -> None:
+        """Process RC_CHANNELS (us): crossing the threshold enables or disables injection."""
         number = self._config.channel
         pulse = pulses_us[number - 1] if len(pulses_us) >= number else 0
         if not _PULSE_US[0] <= pulse <= _PULSE_US[1]:
@@ -98,7 +98,7 @@ class InjectionEnable:
     def command(self, command: int, wanted: float) -> int:
         """Process a command to the localizer's component; returns the MAV_RESULT.
 
-        wanted: its param1, 1 opens and 0 closes.
+        wanted: the command's param1, 1 enables and 0 disables injection.
         """
         if self._config.command is None or command != COMMANDS[self._config.command]:
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
@@ -114,7 +114,7 @@ class InjectionEnable:
             self._open = wanted
             if self._memory is not None:
                 if wanted:
-                    self._memory.opened(by_channel=isinstance(by, RcChannel))
+                    self._memory.store_enabled(by_channel=isinstance(by, RcChannel))
                 else:
-                    self._memory.closed()
+                    self._memory.store_disabled()
         self._changed(alert(AlertId.INJECTION_ON if wanted else AlertId.INJECTION_OFF, by=by))

@@ -1,12 +1,13 @@
 """Converts vision fixes to messages that a flight controller fuses.
 
 Timing. A fix is sent when its age reaches `delay_ms`, the value that ArduPilot is told
-(VISO_DELAY_MS, GPSn_DELAY_MS), so the least latency it sees is exactly that; a late fix goes out at
-once with its own exposure time, and the jitter is removed by the flight controller. PX4 maps the
-exposure time by TIMESYNC and needs no such value.
-Between fixes, and for fixes older than it can fuse, the newest fix is propagated to ``now -
-delay_ms`` with its covariance grown; what is sent between them never makes a fix late. Stamps never
-run back.
+(VISO_DELAY_MS, GPSn_DELAY_MS), so the least latency it sees is exactly that. A fix that arrives
+later is sent at once with its own exposure time, and the flight controller removes the jitter. PX4
+maps the exposure time by TIMESYNC and needs no such value.
+
+Between fixes, and for fixes older than the autopilot can fuse, the newest fix is propagated to
+``now - delay_ms`` with its covariance grown. These messages never delay a fix. Time stamps never
+decrease.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from mavlink_bridge.injection.encode import (
     EncodedMessage,
     HeldOutput,
     InjectionContext,
-    MessageMaker,
-    attitude_of,
+    MessageEncoder,
+    vision_attitude,
     vision_position_delta,
 )
 from mavlink_bridge.injection.propagate import FixPropagator, propagated_protection
@@ -48,23 +49,23 @@ class Latency:
     def __init__(self) -> None:
         self._ages_ms: deque[float] = deque(maxlen=_AGES)
 
-    def take(self, age_ms: float) -> None:
+    def add(self, age_ms: float) -> None:
         """Add the age of a fix."""
         self._ages_ms.append(age_ms)
 
     @property
     def is_known(self) -> bool:
-        """Whether there are enough fixes."""
+        """Whether there are 50 fixes."""
         return len(self._ages_ms) == _AGES
 
     @property
     def median_ms(self) -> float | None:
-        """None before the first fix."""
+        """Median age; None before the first fix."""
         return statistics.median(self._ages_ms) if self._ages_ms else None
 
     @property
     def least_ms(self) -> float | None:
-        """Age of the youngest; None before the first fix."""
+        """Age of the youngest fix; None before the first."""
         return min(self._ages_ms, default=None)
 
 
@@ -76,8 +77,8 @@ class _FixRate:
         self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
         self._taken_ns = 0
 
-    def note(self, time_ns: int, last_ns: int | None, now_ns: int) -> None:
-        """A fix of time_ns was used now, after one of last_ns."""
+    def add(self, time_ns: int, last_ns: int | None, now_ns: int) -> None:
+        """Add a fix of exposure time_ns, used at now_ns; last_ns: of the fix before, or None."""
         self._taken_ns = now_ns
         if last_ns is not None and time_ns - last_ns < _STALE_NS:
             self._intervals_ns.append(time_ns - last_ns)
@@ -88,8 +89,8 @@ class _FixRate:
         usual = self._usual_ns()
         return None if usual is None else self._taken_ns + round(usual)
 
-    def overdue(self, now_ns: int) -> bool:
-        """Whether the next fix is late, by the usual interval."""
+    def is_overdue(self, now_ns: int) -> bool:
+        """Whether the next fix is late by `overdue_intervals` of the usual interval."""
         usual = self._usual_ns()
         return usual is not None and now_ns - self._taken_ns > self._overdue_intervals * usual
 
@@ -100,14 +101,14 @@ class _FixRate:
 
 
 class WithheldMotion:
-    """Motion of the vehicle between two fixes while its position is withheld."""
+    """Makes VISION_POSITION_DELTA from two fixes whose positions are withheld."""
 
     def __init__(self) -> None:
         self._before: VisionFix | None = None
         self._message: Any | None = None
 
-    def note(self, fix: VisionFix, now_ns: int, context: InjectionContext) -> None:
-        """A fix with a withheld position reached its age."""
+    def add(self, fix: VisionFix, now_ns: int, context: InjectionContext) -> None:
+        """Add a fix with a withheld position that has reached the age `delay_ms`."""
         before, self._before = self._before, fix
         late = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
         if before is None or late or not context.profile.position_delta:
@@ -116,18 +117,18 @@ class WithheldMotion:
         if then is not None and now is not None and fix.time_ns - before.time_ns <= _DELTA_NS:
             self._message = vision_position_delta((before, then), (fix, now))
 
-    def take(self) -> Any | None:
-        """The message that is due, once."""
+    def take_message(self) -> Any | None:
+        """The message that is due, once; otherwise None."""
         message, self._message = self._message, None
         return message
 
 
 class Injector:
-    """Sends fixes at a steady rate. One thread calls `submit` and `step`."""
+    """Sends fixes at a steady rate; see the module. One thread calls `submit` and `step`."""
 
     def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
         self._config = config
-        self._maker = MessageMaker(config, geoid_separation_m, utc)
+        self._encoder = MessageEncoder(config, geoid_separation_m, utc)
         self._delay_ns = int(config.delay_ms * 1e6)
         self._period_ns = int(1e9 / config.rate_hz)
         self._least_gap_ns = int(self._period_ns / 1.5)  # 30 Hz never passes 50 Hz
@@ -154,12 +155,12 @@ class Injector:
 
     @property
     def reset_counter(self) -> int:
-        """The counter of the last message."""
+        """The reset counter of the last message."""
         return self._reset_counter
 
     @property
     def waiting(self) -> int:
-        """Number of fixes that have not reached their age."""
+        """Number of fixes that have not reached the age `delay_ms`."""
         return len(self._waiting)
 
     @property
@@ -168,15 +169,15 @@ class Injector:
         return self.yaw_difference_rad if self.guard.blocked else None
 
     def submit(self, fix: VisionFix, now_ns: int) -> None:
-        """Queue a fix. Fixes that are late by seconds, from the future or out of order
-        are dropped.
+        """Queue a fix that arrived at now_ns. A fix that is late by 3 s, from the future or out of
+        order is dropped.
         """
         unusable = self._unusable(fix, now_ns)
         if unusable is not None:
             self.counters[unusable] += 1
             return
         self._newest_ns = fix.time_ns
-        self.latency.take((now_ns - fix.time_ns) * 1e-6)
+        self.latency.add((now_ns - fix.time_ns) * 1e-6)
         self.counters["fixes"] += 1
         if len(self._waiting) == _QUEUE:
             self.counters["fixes_overflowed"] += 1
@@ -191,16 +192,16 @@ class Injector:
         return "fixes_stale" if now_ns - fix.time_ns > _STALE_NS else None
 
     def announce_jump(self) -> None:
-        """Increment the reset counter with the next message."""
+        """Increment the reset counter with the next message, so that the EKF resets to it."""
         self._announced += 1
 
-    def skip(self) -> None:
-        """Nothing can be sent now: clear the queue."""
+    def clear(self) -> None:
+        """Drop the queued fixes, because nothing can be sent now."""
         self._waiting.clear()
         self._fresh = None
 
     def step(self, now_ns: int, context: InjectionContext) -> EncodedMessage | None:
-        """The message to send now, or the reason why none is."""
+        """The message to send at now_ns, or None; `reason` says why nothing was sent."""
         self._take_due(now_ns, context)
         outcome = self._next(now_ns, context)
         if outcome is None:
@@ -240,11 +241,11 @@ class Injector:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
             if fix.position_withheld or fix.horizontal_sigma_m > self._config.max_sigma_m:
-                self.motion.note(fix, now_ns, context)
+                self.motion.add(fix, now_ns, context)
             if fix.position_withheld:
                 continue
             last = self._propagator.fix
-            self._pace.note(fix.time_ns, None if last is None else last.time_ns, now_ns)
+            self._pace.add(fix.time_ns, None if last is None else last.time_ns, now_ns)
             self._propagator.update(fix)
             if self._fresh is not None:
                 self.counters["fixes_superseded"] += 1
@@ -257,7 +258,7 @@ class Injector:
 
     def _fill_due_ns(self) -> int:
         """When the next propagated message is due. It is sent so early that it does not delay the
-        next fix, or not at all. The EKF fuses a late fix at its position of that time, which is
+        next fix, or not at all: the EKF fuses a late fix at its position of that time, which is
         wrong by the distance flown. If the next fix is late, the message waits once for half a
         period.
         """
@@ -295,7 +296,7 @@ class Injector:
         if fix is None or position is None or time_ns <= self._last_stamp_ns:
             return None
         too_far = (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s
-        if too_far or (not fresh and self._pace.overdue(now_ns)):
+        if too_far or (not fresh and self._pace.is_overdue(now_ns)):
             return HeldOutput(alert(AlertId.NO_FRESH_FIX), "withheld_stale")
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:
@@ -305,7 +306,7 @@ class Injector:
         counter = (self._reset_counter + (jumps != self._sent_jumps)) % 256
         estimate = EncodedEstimate(
             position,
-            attitude_of(fix, time_ns, context),
+            vision_attitude(fix, time_ns, context),
             fix.attitude_sigma_rad,
             fix.quality,
             counter,
@@ -313,7 +314,7 @@ class Injector:
             velocity_is_new=fix.velocity_ned is not None and fix.time_ns != self._sent_fix_ns,
             protection_m=propagated_protection(fix, position),
         )
-        outcome = self._maker.make(estimate, now_ns, context)
+        outcome = self._encoder.make(estimate, now_ns, context)
         if isinstance(outcome, EncodedMessage):
             self._reset_counter, self._sent_jumps = counter, jumps
             self._sent_fix_ns = fix.time_ns

@@ -2,7 +2,7 @@
 
 The EKF accepts a map with a 20 m offset without a warning. While there is GNSS, nothing is sent
 before the shadow check has passed. Without GNSS from the start (an indoor vehicle, a restart)
-nothing can be compared; injection then begins with an alert.
+vision cannot be compared; injection then begins with an alert.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _GO_NS = 600_000_000_000
 class ShadowInterlock:
     """Decides at each step whether fixes may be injected; one thread.
 
-    force: `bridge.injection.force`. score: the current result of the shadow check. compared_ns:
-    when a fix was last compared with GNSS, 0 if never. memory: keeps a failed shadow check over a
-    restart.
+    force: `bridge.injection.force`. score: gives the result of the shadow check at a time.
+    compared_ns: when a fix was last compared with GNSS, 0 if never. memory: keeps a failed shadow
+    check over a restart. inhibited_by: active alerts that inhibit injection.
     """
 
     def __init__(
@@ -53,19 +53,20 @@ class ShadowInterlock:
         self._open = False
 
     def recall(self) -> None:
-        """Restore the failed shadow check of a process that was killed."""
+        """Restore the failed shadow check of a process that was killed, and report it."""
         if self._memory is not None and self._memory.recall():
             self._against = self._reason = alert(AlertId.SHADOW_RESTORED)
             self._notifier.report(self._against)
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """Stop; a clean shutdown keeps nothing for a restart."""
+        """End the memory; a clean shutdown keeps nothing for a restart."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
-        """The mode that is allowed. by_pilot: the pilot enabled injection in mode ``rc``; this is
-        followed, and reported if the shadow check has not passed.
+        """The mode that is allowed: ``shadow`` for ``inject`` while the interlock holds. by_pilot:
+        the pilot enabled injection in mode ``rc``; this is followed, and reported if the shadow
+        check has not passed.
         """
         self._update(state, now_ns)
         if wanted != "inject":
@@ -79,11 +80,11 @@ class ShadowInterlock:
         return "inject" if self._open else "shadow"
 
     def _remember(self) -> None:
-        """Keep the failure for a restart, unless injection runs: injection that has started is not
+        """Store the failure for a restart, unless injection runs: injection that has started is not
         stopped by a restart or a spoofed receiver.
         """
         if self._memory is not None:
-            self._memory.note(not self._open and self._against is not None)
+            self._memory.store(not self._open and self._against is not None)
 
     @property
     def reason(self) -> Alert | None:
@@ -96,7 +97,7 @@ class ShadowInterlock:
         return self._reason
 
     def may_switch(self, now_ns: int) -> bool:
-        """Whether the EKF may switch to vision: it was verified lately, or there never was GNSS."""
+        """Whether the EKF may switch to vision: verified lately, never any GNSS, or `force`."""
         if self._force:
             return True
         if self.inhibited_by:
@@ -111,7 +112,7 @@ class ShadowInterlock:
         return before_last_ns <= _BEFORE_LAST_NS and now_ns - self._go_ns <= _GO_NS
 
     def _may_begin(self, now_ns: int, *, by_pilot: bool) -> bool:
-        """Whether injection may start; reports a start without verification. Never revoked."""
+        """Whether injection may start; reports a start without a passed check. Never revoked."""
         since_ns = self._without_since_ns
         without = since_ns is not None and now_ns - since_ns >= _WITHOUT_GNSS_NS
         if self._recent_go(now_ns) and not self.inhibited_by:
@@ -127,7 +128,7 @@ class ShadowInterlock:
         return True
 
     def _update(self, state: VehicleState, now_ns: int) -> None:
-        """Update with GNSS, and with the score once a second."""
+        """Update the time without GNSS, and once a second the result of the shadow check."""
         if gnss_healthy(state, now_ns) or not state.connected:
             self._without_since_ns = None
         elif self._without_since_ns is None:

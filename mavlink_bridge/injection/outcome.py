@@ -1,4 +1,4 @@
-"""Compares positions with GNSS, and checks whether the EKF follows them."""
+"""Compares positions with GNSS, and checks whether the EKF follows the sent ones."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class InjectionOutcome:
         self._counters = counters
         self._to_compare: deque[PropagatedFix] = deque(maxlen=_QUEUE)
 
-    def made(self, estimate: EncodedEstimate) -> None:
-        """An estimate is due, whether it is sent or not."""
+    def add_computed(self, estimate: EncodedEstimate) -> None:
+        """Add an estimate that is due, whether it is sent or not, for the comparison with GNSS."""
         if estimate.fresh:
             self._to_compare.append(estimate.position)
 
-    def sent(self, estimate: EncodedEstimate, now_ns: int) -> None:
-        """An estimate was sent to the flight controller."""
+    def add_sent(self, estimate: EncodedEstimate, now_ns: int) -> None:
+        """Add an estimate that was sent to the flight controller, for the check of the EKF."""
         origin, position = self._origin.origin, estimate.position
         if origin is None:
             return
@@ -64,7 +64,7 @@ class InjectionOutcome:
             position.latitude_deg,
             position.longitude_deg,
         )
-        self._loop.sent(
+        self._loop.add_sent(
             position.time_ns,
             now_ns,
             north,
@@ -74,8 +74,9 @@ class InjectionOutcome:
         )
 
     def compare(self, state: VehicleState, now_ns: int, *, on_gnss: bool | None) -> None:
-        """Compare fixes with the EKF's position at the same time while the EKF uses GNSS; with the
-        receiver's position if the EKF's source is unknown (None).
+        """Compare fixes, 0.5 s after exposure, with the EKF's position while it uses GNSS.
+
+        on_gnss: whether the EKF uses GNSS; None if unknown, then the receiver's position is used.
         """
         while self._to_compare and now_ns - self._to_compare[0].time_ns > _REFERENCE_WAIT_NS:
             fix = self._to_compare.popleft()
@@ -97,22 +98,22 @@ class InjectionOutcome:
         if self.verdict is not None and (self.verdict.reason or not unsettled):
             follows = alert(AlertId.EKF_FOLLOWS)
             self._notifier.notify_settled("loop", self.verdict.reason, follows, now_ns)
-        if not self._loop.jump_missed():
+        if not self._loop.is_jump_missed():
             return False
         self._counters["jumps_repeated"] += 1
         self._notifier.report(alert(AlertId.JUMP_REPEATED))
         return True
 
-    def waiting(self) -> dict[str, int]:
-        """Lengths of the queues."""
-        return {"to compare": len(self._to_compare), **self._loop.waiting()}
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of entries in each queue, by name."""
+        return {"to compare": len(self._to_compare), **self._loop.queue_lengths()}
 
 
 def _by_receiver(
     state: VehicleState, fix: PropagatedFix, altitude_m: float
 ) -> tuple[float, float, float] | None:
-    """The receiver's position, extrapolated to a fix's time by its velocity: latitude, longitude
-    and the given altitude AMSL; None if it has none.
+    """The receiver's position at the fix's time, extrapolated by the fix's velocity: latitude,
+    longitude (degrees) and altitude_m; None without a position.
     """
     if state.gps_latitude_deg is None or state.gps_longitude_deg is None:
         return None

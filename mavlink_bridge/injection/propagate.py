@@ -23,7 +23,9 @@ RISK_SIGMAS = 3.7  # of a risk of 1e-3
 
 @dataclass(frozen=True)
 class PropagatedFix:
-    """Position at a time. covariance_ned (3, 3) m^2; velocity_ned (3,) m/s or None if unknown."""
+    """Position at a time; height above the ellipsoid. covariance_ned (3, 3) m², velocity_ned (3,)
+    m/s.
+    """
 
     time_ns: int
     latitude_deg: float
@@ -35,26 +37,26 @@ class PropagatedFix:
 
     @property
     def horizontal_sigma_m(self) -> float:
-        """1 sigma along the worst horizontal direction."""
+        """1 sigma along the worst horizontal direction, m."""
         return horizontal_sigma_m(self.covariance_ned)
 
     @property
     def vertical_sigma_m(self) -> float:
-        """1 sigma of the height."""
+        """1 sigma of the height, m."""
         return float(np.sqrt(self.covariance_ned[2, 2]))
 
     @property
     def speed_sigma_mps(self) -> float:
-        """1 sigma of the speed along the worst direction."""
+        """1 sigma of the speed along the worst direction, m/s."""
         return float(np.sqrt(np.linalg.eigvalsh(self.velocity_covariance_ned)[-1]))
 
 
-def propagated_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, float] | None:
-    """The fix's protection levels, increased as its sigmas are by propagation."""
+def propagated_protection(fix: VisionFix, propagated: PropagatedFix) -> tuple[float, float] | None:
+    """The fix's protection levels, m, increased as its sigmas by propagation; or None."""
     if fix.protection_m is None:
         return None
     begun = (fix.horizontal_sigma_m, fix.vertical_sigma_m)
-    now = (carried.horizontal_sigma_m, carried.vertical_sigma_m)
+    now = (propagated.horizontal_sigma_m, propagated.vertical_sigma_m)
     horizontal, vertical = (
         level + RISK_SIGMAS * max(after - before, 0.0)
         for level, before, after in zip(fix.protection_m, begun, now, strict=True)
@@ -79,7 +81,7 @@ class FixPropagator:
 
     @property
     def fix(self) -> VisionFix | None:
-        """The newest fix."""
+        """The newest fix; None before the first."""
         return self._fix
 
     def update(self, fix: VisionFix) -> None:

@@ -1,8 +1,9 @@
-"""State that a restarted process reads from a small file, and the age limit of that state.
+"""State that a process stores in a small file for the process that replaces it.
 
 Without it, a companion that is killed while it injects would restart with injection disabled, and
-the vehicle would lose its position and land. One whose shadow check had failed would inject after
-GNSS is lost. The file is renewed while its state holds.
+the vehicle would lose its position and land. If the shadow check had failed, the new process would
+inject after GNSS is lost. The file is renewed every 30 s while its state holds; after 600 s it is
+not used.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ _STOP_S = 2.0
 
 
 class RestartMemory:
-    """State for the process that replaces a killed one. It reads once. It writes in its own thread,
-    so that a hanging disk blocks no other thread.
+    """Stores a state for the process that replaces a killed one, and reads that of the process
+    before. It writes in its own thread, so that a hanging disk blocks no other thread.
 
     about: what the state refers to, for example map and camera; the state of another `about` is
     ignored. wall_s: UTC seconds; boot, clock_s: identifier of the boot, and CLOCK_MONOTONIC. The
@@ -49,7 +50,7 @@ class RestartMemory:
         self._boot = boot_id() if boot is None else boot
         self._wake = threading.Event()
         self._stopping = self._in_use = False
-        self._told: dict[str, Any] | None = None
+        self._state: dict[str, Any] | None = None
         self._thread = threading.Thread(target=self._run, name=path.stem, daemon=True)
         self._thread.start()
 
@@ -74,19 +75,19 @@ class RestartMemory:
             return None
         return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
 
-    def store(self, told: dict[str, Any]) -> None:
-        """Store this state from now on."""
+    def store(self, state: dict[str, Any]) -> None:
+        """Write this state now and every 30 s."""
         self._in_use = True
-        self._told = told
+        self._state = state
         self._wake.set()
 
     def drop(self) -> None:
-        """Store no state from now on."""
-        self._told = None
+        """Delete the file, and store nothing from now on."""
+        self._state = None
         self._wake.set()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """End the thread. After a clean shutdown the state is removed, otherwise it is kept for the
+        """End the thread. After a clean shutdown the file is removed, otherwise it is kept for the
         next process. Only the first call has an effect.
 
         A standby that never flew does not touch the file, because the file belongs to the flight
@@ -94,7 +95,7 @@ class RestartMemory:
         """
         if not self._stopping:
             if clean_shutdown:
-                self._told = None
+                self._state = None
             else:
                 self._in_use = False
             self._stopping = True
@@ -110,13 +111,13 @@ class RestartMemory:
     def _run(self) -> None:
         known: bool | None = None  # whether there is a file of ours
         while True:
-            self._wake.wait(_RENEW_S if self._told is not None else None)
+            self._wake.wait(_RENEW_S if self._state is not None else None)
             self._wake.clear()
             stopping = self._stopping  # before the write: an order to end that comes in it is next
-            told = self._told
+            state = self._state
             try:
-                if told is not None:
-                    self._write(told)
+                if state is not None:
+                    self._write(state)
                 elif self._in_use:
                     self._path.unlink(missing_ok=True)
                 known = True
@@ -127,11 +128,11 @@ class RestartMemory:
             if stopping:
                 return
 
-    def _write(self, told: dict[str, Any]) -> None:
+    def _write(self, state: dict[str, Any]) -> None:
         """Replace the file atomically."""
         stamps = {"utc_s": self._wall_s(), "boot": self._boot, "clock_s": self._clock_s()}
         about = {"about": self.about} if self.about else {}
-        replace_file(self._path, json.dumps(told | about | stamps), durable=True)
+        replace_file(self._path, json.dumps(state | about | stamps), durable=True)
 
 
 class InjectionEnableMemory:
@@ -149,16 +150,16 @@ class InjectionEnableMemory:
             return None
         return found[0].get("by_channel") is True, found[1]
 
-    def opened(self, *, by_channel: bool) -> None:
-        """Injection is enabled from now on."""
+    def store_enabled(self, *, by_channel: bool) -> None:
+        """Store that injection is enabled. by_channel: by an RC channel, otherwise by a command."""
         self._memory.store({"open": True, "by_channel": by_channel})
 
-    def closed(self) -> None:
-        """Injection is disabled from now on."""
+    def store_disabled(self) -> None:
+        """Delete the stored state, because injection is disabled."""
         self._memory.drop()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """Stop; see `RestartMemory.stop`."""
+        """End the memory; see `RestartMemory.stop`."""
         self._memory.stop(clean_shutdown=clean_shutdown)
 
 
@@ -172,14 +173,14 @@ class ShadowFailureMemory:
     def recall(self) -> bool:
         """Whether the shadow check had failed in the previous process."""
         found = self._memory.recall()
-        told = None if found is None else found[0].get("against")
-        of_0_1 = isinstance(told, str) and bool(told) and told.isprintable()  # the reason
-        against = told is True or of_0_1
-        self.note(against)
+        state = None if found is None else found[0].get("against")
+        of_0_1 = isinstance(state, str) and bool(state) and state.isprintable()  # the reason
+        against = state is True or of_0_1
+        self.store(against)
         return against
 
-    def note(self, against: bool) -> None:
-        """Whether the shadow check has failed."""
+    def store(self, against: bool) -> None:
+        """Store whether the shadow check has failed, if this changed."""
         if against == self._kept:
             return
         self._kept = against
@@ -189,5 +190,5 @@ class ShadowFailureMemory:
             self._memory.drop()
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """Stop; see `RestartMemory.stop`."""
+        """End the memory; see `RestartMemory.stop`."""
         self._memory.stop(clean_shutdown=clean_shutdown)

@@ -36,12 +36,12 @@ _CONSISTENCY_LIMIT = 9.0 * 1.39
 
 @dataclass(frozen=True)
 class ShadowScore:
-    """How vision compared with GNSS over the last two minutes; errors are horizontal.
+    """Comparison of vision with GNSS over the last two minutes; errors are horizontal.
 
-    Without samples the figures are None. bias_ne_m: mean north and east difference. height_m:
-    median difference of the heights. consistency: median squared Mahalanobis distance (1.4 is
-    ideal). reasons: why the check has not passed; empty if it has. against: those of the reasons
-    that show wrong positions, and not only too few.
+    go: the check has passed. Without samples the figures are None. bias_ne_m: mean north and east
+    difference. height_m: median difference of the heights. consistency: median squared Mahalanobis
+    distance (1.4 is ideal). reasons: why the check has not passed; empty if it has. against: those
+    of the reasons that show wrong positions, and not only too few.
     """
 
     go: bool
@@ -67,7 +67,7 @@ class ShadowScore:
 
 
 def gnss_healthy(state: VehicleState, now_ns: int) -> bool:
-    """Whether the receiver reports a 3D fix now."""
+    """Whether the receiver has reported a 3D fix in the last 1.5 s."""
     fresh = now_ns - state.gps_time_ns < _GNSS_FRESH_NS
     return fresh and state.gps_fix_type >= _MINIMUM_FIX
 
@@ -81,9 +81,7 @@ class ShadowScorer:
         self._samples: deque[tuple[int, float, float, float, float]] = deque(maxlen=_LENGTH)
 
     def compare(self, fix: PropagatedFix, reference: tuple[float, ...]) -> None:
-        """Compare a fix with the autopilot's (latitude, longitude, altitude AMSL) at
-        the same time.
-        """
+        """Compare a fix with the autopilot's (latitude, longitude, altitude AMSL) at its time."""
         difference = np.array(
             north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
         )

@@ -52,7 +52,7 @@ class SwitchOrder:
 
     @property
     def alert(self) -> Alert:
-        """For the operator."""
+        """Alert that tells the operator about the order."""
         return Alert(AlertId.SOURCE_SET_SELECTED, (self.source_set, self.cause, self.metres))
 
 
@@ -71,17 +71,17 @@ def _ekf(state: VehicleState) -> _Place | None:
     return state.latitude_deg, state.longitude_deg
 
 
-def _apart_m(a: _Place, b: _Place) -> float:
-    """Horizontal distance."""
+def _distance_m(a: _Place, b: _Place) -> float:
+    """Horizontal distance, m."""
     return math.hypot(*north_east(*a, *b))
 
 
 def _inconsistent_m(state: VehicleState, vision: PropagatedFix | None, sigmas: float) -> float:
-    """Difference of GNSS and vision if it exceeds both errors, else 0."""
+    """Distance of GNSS from vision, m, if above `sigmas` of both errors, otherwise 0."""
     receiver = _receiver(state)
     if vision is None or receiver is None:
         return 0.0
-    apart = _apart_m(receiver, (vision.latitude_deg, vision.longitude_deg))
+    apart = _distance_m(receiver, (vision.latitude_deg, vision.longitude_deg))
     accuracy = VEHICLE_SENSORS.gnss_sigma_m(state.gps_h_accuracy_m, _LARGEST_SIGMA_M)
     speed = math.hypot(*vision.velocity_ned[:2])
     limit = sigmas * math.hypot(accuracy, vision.horizontal_sigma_m) + speed * _SPEED_SLACK_S
@@ -93,13 +93,14 @@ def _ekf_is_with_vision(state: VehicleState, vision: PropagatedFix) -> bool:
     receiver, ekf = _receiver(state), _ekf(state)
     if receiver is None or ekf is None:
         return False
-    return _apart_m((vision.latitude_deg, vision.longitude_deg), ekf) < _apart_m(receiver, ekf)
+    place = (vision.latitude_deg, vision.longitude_deg)
+    return _distance_m(place, ekf) < _distance_m(receiver, ekf)
 
 
 @dataclass(frozen=True)
 class GnssFault:
-    """What is wrong with GNSS. proven: evidence other than vision shows it. metres: difference from
-    vision if that is the cause.
+    """What is wrong with GNSS. proven: evidence other than vision shows it. metres: distance from
+    vision if that is the cause, otherwise 0.
     """
 
     cause: GnssProblem
@@ -115,8 +116,8 @@ class GnssFault:
 def gnss_fault(
     state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
 ) -> GnssFault | None:
-    """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; or None.
-    sigmas: how many of both errors a difference may have.
+    """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; None if
+    good. sigmas: how many of both errors a distance may have.
     """
     if not gnss_healthy(state, now_ns):
         return GnssFault(GnssProblem.LOST, proven=True)
@@ -130,8 +131,8 @@ def gnss_fault(
 
 
 class SourceSwitch:
-    """Decides about the source set; the caller sends the command and reports the acknowledgement.
-    One thread.
+    """Decides about the EKF's source set; the caller sends the command and reports the
+    acknowledgement. One thread.
 
     refusal: why the vision set is not selected although GNSS is bad; else None. current: the set in
     use, None if unknown. returning: the check of GNSS while it is not used.
@@ -150,16 +151,16 @@ class SourceSwitch:
         self._next_ns = 0
 
     def reset(self) -> None:
-        """The flight controller rebooted: it uses its first set."""
+        """Assume the GNSS set, because the flight controller rebooted and uses its first set."""
         self.current, self._ordered = self._config.gnss_set, None
         self._bad_since_ns = self._sound_since_ns = None
         self._was_chosen = self._overruled = False
 
-    def met_in_flight(self) -> None:
-        """The first heartbeat was of an armed vehicle: its source set is unknown."""
+    def on_armed_contact(self) -> None:
+        """Mark the set as unknown, because the vehicle was armed at the first heartbeat."""
         self.current = None
 
-    def chosen(self, source_set: int) -> None:
+    def on_reported_set(self, source_set: int) -> None:
         """Process the autopilot's report of the set in use. A set that we did not order is the
         pilot's choice. A chosen vision set stays; a chosen GNSS set stays until the present fault
         of GNSS ends.
@@ -170,7 +171,7 @@ class SourceSwitch:
         self._overruled = self._bad_since_ns is not None
 
     def acknowledged(self, accepted: bool) -> bool:
-        """Process a COMMAND_ACK; returns whether it answers an order."""
+        """Process a COMMAND_ACK (accepted or not); returns whether it answers an order."""
         if self._ordered is None:
             return False
         if accepted:
@@ -187,15 +188,16 @@ class SourceSwitch:
         good: bool,
         may_switch: bool,
     ) -> SwitchOrder | None:
-        """The order to send now. good: fixes are being sent and pass the yaw guard. may_switch: the
-        shadow check of this flight has passed.
+        """The order to send at now_ns, or None. vision: last position, None if none. good:
+        positions are being sent and pass the yaw guard. may_switch: the shadow check of this flight
+        has passed.
         """
         self.refusal = None
         fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
         if self.current == self._config.gnss_set:
             self.returning.reset()
         else:
-            self.returning.look(state, vision if fresh and good else None, now_ns)
+            self.returning.update(state, vision if fresh and good else None, now_ns)
         if not self._config.enabled:
             return None
         fault = gnss_fault(
@@ -256,13 +258,13 @@ class SourceSwitch:
         # went by itself, or not where vision was while it could be asked, may be a wrong one.
         receiver, ekf = _receiver(state), _ekf(state)
         refused = self.returning.refusal is not None
-        if refused or receiver is None or ekf is None or _apart_m(receiver, ekf) > _RETURN_M:
+        if refused or receiver is None or ekf is None or _distance_m(receiver, ekf) > _RETURN_M:
             return None
         return SwitchOrder(self._config.gnss_set, ReturnCause.VISION_LOST)
 
 
 class SourceOrders:
-    """Sends the decisions of `SourceSwitch`; one thread."""
+    """Sends the orders of `SourceSwitch` and reports them; one thread."""
 
     def __init__(
         self,
@@ -294,33 +296,33 @@ class SourceOrders:
 
     @property
     def gnss_refused(self) -> bool:
-        """Whether a receiver is there, is not used, and contradicts vision."""
+        """Whether a receiver with a fix is not used because it contradicts vision."""
         return self._switch.returning.refusal is not None
 
-    def met(self, state: VehicleState) -> None:
-        """The first message of the vehicle. An armed ArduPilot may use any source set (this process
-        was restarted); a disarmed one uses its first.
+    def on_first_message(self, state: VehicleState) -> None:
+        """Process the vehicle's first message. An armed ArduPilot may use any source set (this
+        process was restarted); a disarmed one uses its first.
         """
         if self._has_met:
             return
         self._has_met = True
         if state.armed and state.autopilot == "ardupilot":
-            self._switch.met_in_flight()
+            self._switch.on_armed_contact()
             self._notifier.report(alert(AlertId.SOURCE_SET_UNKNOWN))
 
     def on_text(self, text: str) -> None:
-        """Process a STATUSTEXT of the autopilot."""
+        """Process a STATUSTEXT of the autopilot, which may name the source set in use."""
         told = _CHOSEN.match(text)
         if told is not None:
-            self._switch.chosen(int(told[1]))
+            self._switch.on_reported_set(int(told[1]))
 
     def rebooted(self) -> None:
-        """The flight controller uses its first set."""
+        """Assume the first source set after a reboot of the flight controller."""
         self._switch.reset()
         self._notifier.forget("switch")
 
     def acknowledged(self, accepted: bool) -> None:
-        """Process a COMMAND_ACK of an order."""
+        """Process a COMMAND_ACK of an order (accepted or not); a refusal is reported."""
         if self._switch.acknowledged(accepted) and not accepted:
             self._notifier.report(alert(AlertId.SOURCE_SET_REFUSED))
 
@@ -334,9 +336,11 @@ class SourceOrders:
         may_switch: bool,
         now_ns: int,
     ) -> None:
-        """Order a change if it is due. good: positions are sent and reliable."""
+        """Send an order if one is due, and report refusals. good: positions are sent
+        and reliable.
+        """
         order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
-        self._tell_refused(now_ns)
+        self._report_refused(now_ns)
         refusal = self._switch.refusal
         if refusal is not None and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
             self._refused_ns = now_ns  # again as long as it lasts: the operator decides
@@ -347,7 +351,7 @@ class SourceOrders:
         self._commander.send(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
         self._notifier.notify("switch", order.alert)
 
-    def _tell_refused(self, now_ns: int) -> None:
+    def _report_refused(self, now_ns: int) -> None:
         returning, alerted_ns = self._switch.returning, self._alerted_ns
         again_ns = spec_of(AlertId.GNSS_REFUSED).repeat_s * 1e9
         if returning.refusal is not None:

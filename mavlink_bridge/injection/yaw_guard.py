@@ -27,8 +27,8 @@ _BLIND_AFTER = 20  # fixes in a row
 
 @dataclass(frozen=True)
 class YawVerdict:
-    """Result of the check of one fix. accept: send it; difference_rad: vision minus autopilot, None
-    if one of them is unknown.
+    """Result of the check of one fix. accept: send it; difference_rad: vision's yaw minus the
+    autopilot's, None if one of them is unknown.
     """
 
     accept: bool
@@ -40,6 +40,7 @@ class YawGuard:
 
     It blocks if the majority of `minimum_samples` fixes fail, because noise lets some fixes of a
     rotated frame pass. It releases after as many good fixes in a row, tested with a smaller limit.
+    unchecked: number of fixes without a yaw to compare.
     """
 
     def __init__(self, config: YawGuardConfig) -> None:
@@ -58,13 +59,13 @@ class YawGuard:
         return self._unchecked_in_a_row >= _BLIND_AFTER
 
     def reset(self) -> None:
-        """The autopilot rebooted, and its yaw with it."""
+        """Forget the history, because the autopilot rebooted and its yaw changed."""
         self._accepted.clear()
         self._last.clear()
         self.blocked = False
 
     def check(self, fix: VisionFix, autopilot: Attitude | None) -> YawVerdict:
-        """Check one fix; if a yaw is unknown, the last result is used."""
+        """Check one fix; it passes as the last result if a yaw is unknown (`unchecked`)."""
         if not self._config.enabled:
             return YawVerdict(True, None)
         time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad
@@ -78,7 +79,7 @@ class YawGuard:
         difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
         to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)
         good = self._agrees(time_ns, difference, to_gyros, reset)
-        self._note(good)
+        self._update_block(good)
         accept = good and not self.blocked
         if good and reset:
             self._accepted.clear()  # what follows is held against this fix, not against the past
@@ -86,8 +87,8 @@ class YawGuard:
             self._accepted.append((time_ns, to_gyros, difference))
         return YawVerdict(accept, difference)
 
-    def _note(self, good: bool) -> None:
-        """Block or release by the last results."""
+    def _update_block(self, good: bool) -> None:
+        """Add a result; block or release by the last ones."""
         last = self._last
         last.append(good)
         if self.blocked:

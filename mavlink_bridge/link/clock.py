@@ -38,7 +38,7 @@ def monotonic_ns() -> int:
 
 
 def boot_id() -> str:
-    """Id of this computer's boot, with which CLOCK_MONOTONIC restarts; empty if unknown."""
+    """Id of this computer's boot, with which CLOCK_MONOTONIC restarts; "" if unknown."""
     try:
         return _BOOT.read_text(encoding="ascii").strip()
     except OSError:
@@ -46,7 +46,7 @@ def boot_id() -> str:
 
 
 class SteadyUtc:
-    """UTC that cannot jump: it follows CLOCK_MONOTONIC from one reading of the wall clock.
+    """UTC that cannot jump: it follows CLOCK_MONOTONIC from one reading of both clocks (None: now).
 
     If the wall clock steps in flight (NTP, GNSS), the timestamps of this flight do not.
     """
@@ -61,11 +61,11 @@ class SteadyUtc:
 
     @property
     def is_set(self) -> bool:
-        """Whether the wall clock is set; without a battery or network it starts in the past."""
+        """Whether the wall clock was set: without a battery or network it starts before 2023."""
         return self.utc_ns(monotonic_ns()) >= _NOT_BEFORE_UNIX_S * 1_000_000_000
 
     def gps_week_ms(self, time_ns: int) -> tuple[int, int]:
-        """GPS week and milliseconds of the week; (0, 0) if the clock is not set.
+        """GPS week and its milliseconds at a CLOCK_MONOTONIC time; (0, 0) if the clock is not set.
 
         ArduPilot takes week 0 for no time; any other sets its clock.
         """
@@ -93,14 +93,14 @@ def utc_us() -> int:
 
 @dataclass(frozen=True)
 class _Sync:
-    """One TIMESYNC answer: the boot time at `middle_ns`, right within half the round trip."""
+    """One TIMESYNC answer: boot time at `middle_ns`, right within half the round trip."""
 
     middle_ns: int
     boot_ns: int
     round_trip_ns: int
 
-    def explains(self, other: _Sync, rate: float) -> bool:
-        """Whether both are of one clock that runs at `rate`: true times lie within the trips."""
+    def agrees_with(self, other: _Sync, rate: float) -> bool:
+        """Whether both answers can be of one clock that runs at `rate`."""
         elapsed = other.middle_ns - self.middle_ns
         apart = other.boot_ns - self.boot_ns - rate * elapsed
         trips = max(rate, 1.0) * (self.round_trip_ns + other.round_trip_ns) / 2.0
@@ -108,7 +108,7 @@ class _Sync:
 
 
 class _StampRun:
-    """Stamps in a row, each after the one before, of a time that is not the one that is known."""
+    """Consecutive stamps, each after the one before, that contradict the known time."""
 
     def __init__(self) -> None:
         self._count = self._last_ns = 0
@@ -122,11 +122,11 @@ class _StampRun:
         self._last_ns = boot_ns
 
     def clear(self) -> None:
-        """What is known goes on."""
+        """End the series, because a stamp agrees with the known time."""
         self._count = self._last_ns = 0
 
     def is_confirmed(self, alone_ns: int) -> bool:
-        """Whether the time is another from now on. alone_ns: for how long none was in time."""
+        """Whether the series replaces the known time. alone_ns: since when no stamp agreed."""
         return self._count >= _CONFIRMATIONS and alone_ns >= _ALONE_NS
 
 
@@ -167,14 +167,14 @@ class BootClock:
         return None if self._anchor is None else self._anchor[0] - self._anchor[1]
 
     @property
-    def doubts(self) -> bool:
+    def is_stamp_doubtful(self) -> bool:
         """Whether the last time stamp does not fit the known offset: it is from another sender, or
         the first after a reboot.
         """
         return bool(self._behind) or bool(self._ahead)
 
     def observe(self, boot_ns: int, received_ns: int) -> bool:
-        """Process the boot time of a message; True if the flight controller rebooted."""
+        """Process a message's boot time, ns; True if the flight controller rebooted."""
         rebooted = self._ran_back(boot_ns, received_ns)
         if self._behind:
             return False  # an old frame that came late, or the first ones after a reboot
@@ -202,8 +202,8 @@ class BootClock:
         self.answered_ns = received_ns
         sample = _Sync((sent_ns + received_ns) // 2, boot_ns, round_trip)
         rebooted = False
-        if self._sync and not self._sync[-1].explains(sample, self.rate):
-            rebooted = self._reconsider(sample)
+        if self._sync and not self._sync[-1].agrees_with(sample, self.rate):
+            rebooted = self._resolve_contradiction(sample)
         else:
             self._doubted = None
             self._sync.append(sample)
@@ -211,14 +211,14 @@ class BootClock:
         return rebooted
 
     def to_monotonic(self, boot_ns: int, received_ns: int) -> int:
-        """CLOCK_MONOTONIC of a boot time; never later than the message's arrival."""
+        """CLOCK_MONOTONIC of a boot time; at most received_ns, the message's arrival."""
         if self._anchor is None:
             return received_ns
         middle_ns, at_ns = self._anchor
         return min(middle_ns + round((boot_ns - at_ns) / self.rate), received_ns)
 
     def _contradicts(self, boot_ns: int, received_ns: int) -> bool:
-        """Whether the stamps of now say quite another time than a TIMESYNC answer does."""
+        """Whether current stamps differ from a TIMESYNC answer by more than 10 s; counts those."""
         since_ns = received_ns - self._in_time_ns
         if not self._newest_boot_ns or since_ns > _ALONE_NS:
             return False
@@ -228,9 +228,9 @@ class BootClock:
         return wrong
 
     def _ran_back(self, boot_ns: int, received_ns: int) -> bool:
-        """Whether boot time restarted: several stamps in a row, each after the one before.
+        """Whether the boot time restarted: several stamps in a row, each after the one before.
 
-        One alone may be an old frame that was duplicated or came late.
+        A single stamp may be of an old frame that was duplicated or came late.
         """
         if self._newest_boot_ns - boot_ns <= _RUN_BACK_NS:
             self.strays += bool(self._behind)
@@ -243,7 +243,7 @@ class BootClock:
         return True
 
     def _runs_ahead(self, boot_ns: int, received_ns: int) -> bool:
-        """Whether a stamp is ahead of the time that has passed, and is not yet confirmed."""
+        """Whether a stamp is ahead of the elapsed time, and this is not yet confirmed."""
         passed = max(self.rate, 1.0) * (received_ns - self._newest_at_ns)
         if not self._newest_boot_ns or boot_ns - self._newest_boot_ns <= passed + _RUN_BACK_NS:
             self.strays += bool(self._ahead)
@@ -255,14 +255,14 @@ class BootClock:
         self._ahead.clear()
         return False
 
-    def _reconsider(self, sample: _Sync) -> bool:
-        """An answer that contradicts the last: another rate, or a step; True for a reboot."""
+    def _resolve_contradiction(self, sample: _Sync) -> bool:
+        """An answer contradicts the last: another rate, or a step; True for a reboot."""
         before, last = self._doubted, self._sync[-1]
         elapsed = sample.middle_ns - last.middle_ns
         rate = (sample.boot_ns - last.boot_ns) / elapsed if elapsed > 0 else 0.0
         self._sync.clear()
         self._doubted = last
-        if before is not None and _RATES[0] < rate < _RATES[1] and before.explains(sample, rate):
+        if before is not None and _RATES[0] < rate < _RATES[1] and before.agrees_with(sample, rate):
             self.rate = rate
             self._sync.extend((before, last, sample))
             return False

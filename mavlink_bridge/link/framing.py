@@ -30,7 +30,7 @@ _NEW_STREAM_SLACK = 60 * 100_000  # a new signing stream may lag by one minute (
 
 @dataclass
 class FramingCounters:
-    """Counters of one stream."""
+    """Counters of one stream. skipped_messages: not in `wanted`; lost: by sequence numbers."""
 
     messages: int = 0
     skipped_messages: int = 0
@@ -46,9 +46,8 @@ class VerifyingMavlink(mavlink.MAVLink):
     """pymavlink's codec, changed to verify the signature before it uses the timestamp.
 
     pymavlink stores the timestamp of a frame before it checks the signature, so one forged frame
-    from the future would block the real sender.
-
-    window: remembers over restarts the newest timestamp of each stream.
+    from the future would block the real sender. window: remembers over restarts the newest
+    timestamp of each stream.
     """
 
     window: ReplayWindow | None = None
@@ -70,16 +69,15 @@ class VerifyingMavlink(mavlink.MAVLink):
         self.signing.stream_timestamps[stream] = stamp
         self.signing.timestamp = max(self.signing.timestamp, stamp)
         if self.window is not None:
-            self.window.note(stream, stamp)
+            self.window.add_accepted(stream, stamp)
         return True
 
 
 class FrameReader:
     """Decodes MAVLink messages from byte fragments of any size.
 
-    wanted: message ids to decode; None decodes all of the dialect. `raw` holds the frames of the
-    last `feed` for a recorder. window: of the key's streams; frames that are not newer than it are
-    refused.
+    wanted: message ids to decode; None: all. key: signing key (32 bytes), None: unsigned frames are
+    accepted. window: newest timestamps of the key's streams; frames that are not newer are refused.
     """
 
     def __init__(
@@ -109,7 +107,7 @@ class FrameReader:
         return int(self._codec.signing.timestamp) if self._signed else 0
 
     def reset(self) -> None:
-        """Drop an incomplete frame (the transport was reopened); signing streams are kept."""
+        """Drop an incomplete frame: the transport was reopened. Signing streams are kept."""
         self._buffer.clear()
         self._sequences.clear()
 
@@ -124,7 +122,7 @@ class FrameReader:
         return len(self._sequences)
 
     def feed(self, data: bytes, raw: deque[bytes] | None = None) -> list[Any]:
-        """Messages completed by `data`; their raw frames are appended to `raw` if given."""
+        """Messages completed by `data`; raw frames of right checksum are appended to `raw`."""
         buffer = self._buffer
         buffer += data
         messages: list[Any] = []
@@ -157,7 +155,7 @@ class FrameReader:
         return messages
 
     def _check(self, frame: bytearray) -> bool:
-        """Whether the frame's checksum is right; unknown ids cannot be checked and are not."""
+        """Whether the checksum is right; False for an unknown id, which cannot be checked."""
         version2 = frame[0] == _V2
         header = 10 if version2 else 6
         if version2 and frame[2] & ~_SIGNED:
@@ -207,7 +205,7 @@ class FrameReader:
 
 
 def _frame_length(buffer: bytearray, start: int, size: int) -> int | None:
-    """Length of the frame that starts here, None while the bytes that tell it are missing."""
+    """Length of the frame that begins at start; None while the bytes that state it are missing."""
     if start + 3 > size:
         return None
     if buffer[start] == _V1:

@@ -39,18 +39,18 @@ _MAX_READS = 64
 
 
 class LinkHandler(Protocol):
-    """Callbacks of a link, always called in its owner thread."""
+    """Callbacks of a link, called in its owner thread. Errors are counted and logged."""
 
     def on_open(self, link: Link) -> None:
-        """The transport was (re)opened."""
+        """The transport was opened or reopened."""
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """A message arrived; time_ns is when its bytes were read."""
+        """A message arrived; its bytes were read at time_ns, CLOCK_MONOTONIC."""
 
     def on_tick(self, link: Link, now_ns: int) -> int:
         """Do what is due; return when to be called next (CLOCK_MONOTONIC ns).
 
-        It is called also while the transport is closed. Messages sent then are dropped and counted.
+        Called also while the transport is closed; messages sent then are dropped and counted.
         """
 
 
@@ -95,7 +95,7 @@ class LinkOptions:
 
 
 class Link:
-    """A MAVLink 2 link that reconnects by itself.
+    """A MAVLink 2 link that reconnects by itself. system_id: as which it sends; 0: nothing is sent.
 
     Above 200 lines: one thread owns transport, parser, packers and send queue. The order in which
     its loop serves them gives positions priority on a slow port.
@@ -149,18 +149,18 @@ class Link:
     def congested(self) -> bool:
         """Whether the send queue of a slow port is so long that only positions should be added.
 
-        To be asked in the owner thread.
+        Only the owner thread may read it.
         """
         return len(self._unsent) > _CONGESTED
 
     @property
     def stranger(self) -> str:
-        """UDP: newest sender whose datagrams are dropped because it is not the peer; or empty."""
+        """UDP: newest sender whose datagrams are dropped because it is not the peer; or ""."""
         transport = self._transport
         return transport.stranger if isinstance(transport, UdpTransport) else ""
 
     def keep_peer(self) -> None:
-        """UDP: accept and answer only the sender of the message that is being handled."""
+        """UDP: accept and answer only the sender of the present message; called in `on_message`."""
         if isinstance(self._transport, UdpTransport):
             self._transport.keep_peer()
 
@@ -187,7 +187,7 @@ class Link:
         self._waker.wake()
 
     def send(self, message: Any, component: int) -> bool:
-        """Send as `component` of the vehicle's system; False when it was dropped at once."""
+        """Send as `component` of system_id; False if dropped at once. Other threads queue it."""
         if threading.current_thread() is self._thread:
             return self._send_now(message, component)
         if len(self._outbox) == _OUTBOX:
@@ -203,7 +203,7 @@ class Link:
         mine = {**asdict(self.counters), "rx_of_strangers": refused}
         return {**mine, **asdict(self._reader.counters)}
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Lengths of the queues: messages of other threads, bytes received and to send."""
         return {
             "outbox": len(self._outbox),
@@ -242,7 +242,7 @@ class Link:
     def _with_peer(self, transport: Transport) -> Transport:
         if isinstance(transport, UdpTransport):
             if self._only is not None:
-                transport.hear_only(*self._only)
+                transport.accept_only(*self._only)
             if self._follow_hosts_after_s is not None:
                 transport.follow_hosts_after(self._follow_hosts_after_s)
         return transport
@@ -260,7 +260,7 @@ class Link:
             transport.close()
 
     def _idle(self, seconds: float) -> None:
-        """Wait without a transport: the handler's clock goes on."""
+        """Wait without a transport; `on_tick` is still called."""
         end_ns = monotonic_ns() + int(seconds * 1e9)
         while (left_ns := end_ns - monotonic_ns()) > 0:
             if self._stop.wait(min(left_ns * 1e-9, _IDLE_TICK_S)):
@@ -332,7 +332,7 @@ class Link:
         return received
 
     def _guard(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a handler; its error is logged and counted, and the link lives on."""
+        """Call a handler; its error is logged and counted, and the link continues."""
         try:
             return function(*arguments)
         except Exception:
@@ -387,12 +387,12 @@ class Link:
         return True
 
     def _flush(self) -> None:
-        """Send what is left over of a stream."""
+        """Send the bytes of a stream that the transport did not take before."""
         if self._unsent:
             del self._unsent[: self._put(bytes(self._unsent))]
 
     def _put(self, data: bytes) -> int:
-        """Write to the transport; that it is gone is the link's affair, not its handler's."""
+        """Write to the transport; its error is raised later, in the loop of the link."""
         assert self._transport is not None
         try:
             return self._transport.write(data)

@@ -50,8 +50,8 @@ class ReplayWindow:
         with self._lock:
             return max(self._leases.values(), default=0)
 
-    def note(self, stream: Stream, stamp: int) -> None:
-        """A frame of a stream was accepted; never blocks on the disk."""
+    def add_accepted(self, stream: Stream, stamp: int) -> None:
+        """Store the timestamp of an accepted frame; never blocks on the disk."""
         with self._lock:
             if stamp + _LEASE // 2 <= self._leases.get(stream, 0):
                 return
@@ -109,7 +109,7 @@ def _stream(key: str) -> Stream:
 
 
 def _stamp(given: object) -> int:
-    """A stamp that a frame can carry: our own would begin beyond it, and none could be packed."""
+    """A timestamp that a frame can carry; ValueError for others: ours would begin after it."""
     if not isinstance(given, int) or isinstance(given, bool) or not 0 <= given < NO_STAMP:
         raise ValueError(f"{str(given)[:40]} is no stamp of a frame")
     return given

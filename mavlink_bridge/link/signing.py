@@ -46,7 +46,7 @@ def load_key(path: Path) -> bytes:
 
 
 def create_key(path: Path) -> bytes:
-    """Write a new random key to a file of mode 0600, and return it."""
+    """Write a new random key to a new file of mode 0600, and return it. May raise OSError."""
     key = os.urandom(32)
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
@@ -55,7 +55,7 @@ def create_key(path: Path) -> bytes:
 
 
 def signing_timestamp(unix_time_s: float | None = None) -> int:
-    """Signing time stamp: 10 microsecond ticks since 2015-01-01 UTC.
+    """Signing time stamp of a time (now if None): 10 microsecond ticks since 2015-01-01 UTC.
 
     0 before that: a computer without a battery clock may wake up in 1970.
     """

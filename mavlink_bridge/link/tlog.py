@@ -1,5 +1,4 @@
-"""Writes and reads .tlog files: each raw frame after its UTC time, as MAVLink ground tools use
-them.
+"""Writes and reads .tlog files: each raw frame after its UTC time, as MAVLink ground tools do.
 
 A thread writes the file, so that a slow memory card does not delay an injection.
 """
@@ -45,13 +44,13 @@ def is_disk_fault(error: OSError) -> bool:
 
 
 class RecordFile(Protocol):
-    """An unbuffered file."""
+    """An unbuffered file opened for appending."""
 
     def write(self, data: bytes | bytearray, /) -> int:
         """Append; returns the number of bytes written. Raises OSError."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the file."""
 
 
 def _append_to(path: Path) -> RecordFile:
@@ -62,8 +61,8 @@ class TlogRecorder:
     """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
     Raises `TlogError` if the file cannot be opened, unless the disk is full or failing. Frames that
-    cannot be written are dropped and counted. on_failure: called once with the reason, in the
-    recorder's thread. open_file: raises OSError as `Path.open` does.
+    cannot be written are dropped and counted, also beyond max_bytes. on_failure: called once with
+    the reason, in the recorder's thread. open_file: raises OSError as `Path.open` does.
     """
 
     def __init__(
@@ -95,12 +94,12 @@ class TlogRecorder:
         self.dropped = 0
 
     def start(self) -> None:
-        """Start writing."""
+        """Start the thread that writes the file."""
         self._thread = threading.Thread(target=self._run, name="tlog", daemon=True)
         self._thread.start()
 
     def write(self, frame: bytes, time_us: int) -> None:
-        """Record one frame; never blocks."""
+        """Queue one frame, received or sent at time_us (UTC, microseconds); never blocks."""
         if len(self._waiting) >= _MAX_WAITING:
             self.dropped += 1
             return
@@ -128,7 +127,7 @@ class TlogRecorder:
         self._write_waiting()
 
     def _write_waiting(self) -> None:
-        """One write of whole records, so that a crash leaves a file that can be read."""
+        """Write all queued records at once, so that a crash leaves a file that can be read."""
         records = bytearray()
         count = len(self._waiting)
         for _ in range(count):

@@ -45,7 +45,7 @@ class Endpoint:
 
     @classmethod
     def parse(cls, text: str) -> Endpoint:
-        """From ``kind:address:number``, such as ``udpin:0.0.0.0:14550``; EndpointError if not."""
+        """Parse ``kind:address:number``, such as ``udpin:0.0.0.0:14550``; else `EndpointError`."""
         kind, _, rest = text.partition(":")
         address, _, number = rest.rpartition(":")
         networked = kind in _KINDS and kind != "serial"
@@ -81,7 +81,7 @@ def parse_sender(text: str) -> tuple[str, int | None]:
 
 
 class Transport(Protocol):
-    """An open byte stream or datagram socket."""
+    """An open byte stream or datagram socket; see the module."""
 
     @property
     def stream(self) -> bool:
@@ -91,13 +91,13 @@ class Transport(Protocol):
         """File descriptor for poll."""
 
     def read(self) -> bytes:
-        """What has arrived, b"" if nothing; OSError when the other side is gone."""
+        """Bytes that have arrived, b"" for none; OSError if the other side is gone."""
 
     def write(self, data: bytes) -> int:
-        """Send; returns the number of bytes accepted (0 without a peer or room)."""
+        """Send bytes; returns the number accepted (0 without a peer or room)."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the transport."""
 
 
 class UdpTransport:
@@ -105,7 +105,7 @@ class UdpTransport:
     and the last one is answered, until `keep_peer` selects one.
 
     The peer may change its port (after a restart) once it was silent for 3 s. Another host is
-    accepted only after a silence of `follow_hosts_after`; if that is None, never.
+    accepted only after the silence set by `follow_hosts_after`, otherwise never.
     """
 
     stream = False
@@ -133,14 +133,14 @@ class UdpTransport:
 
     @property
     def port(self) -> int:
-        """The local port."""
+        """The local UDP port."""
         return int(self._socket.getsockname()[1])
 
     def fileno(self) -> int:
-        """Descriptor for select."""
+        """Descriptor for poll."""
         return self._socket.fileno()
 
-    def hear_only(self, host: str, port: int | None) -> None:
+    def accept_only(self, host: str, port: int | None) -> None:
         """Accept this sender only. port: None for any port of the host."""
         self._only = (host, port)
 
@@ -156,7 +156,7 @@ class UdpTransport:
             except (BlockingIOError, ConnectionRefusedError):
                 # Refused: an ICMP answer to something sent before the peer listened; UDP goes on.
                 return b""
-            if self._admits(sender):
+            if self._accepts(sender):
                 break
             self.refused += 1
             self.stranger = sender[0]
@@ -173,7 +173,7 @@ class UdpTransport:
             self._remote = self._peer = self._sender
             self._heard_s = time.monotonic()
 
-    def _admits(self, sender: tuple[str, int]) -> bool:
+    def _accepts(self, sender: tuple[str, int]) -> bool:
         if self._only is not None:
             host, port = self._only
             if sender[0] != host or port not in (None, sender[1]):
@@ -212,11 +212,11 @@ class TcpTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def fileno(self) -> int:
-        """Descriptor for select."""
+        """Descriptor for poll."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """What has arrived; ConnectionResetError at the end of the stream."""
+        """Bytes that have arrived, b"" for none; ConnectionResetError at the end of the stream."""
         try:
             data = self._socket.recv(_READ_SIZE)
         except BlockingIOError:
@@ -226,7 +226,7 @@ class TcpTransport:
         return data
 
     def write(self, data: bytes) -> int:
-        """Send what fits."""
+        """Send what fits; returns the number of bytes."""
         try:
             return self._socket.send(data)
         except BlockingIOError:
@@ -251,15 +251,15 @@ class SerialTransport:
         self._port: Any = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
 
     def fileno(self) -> int:
-        """Descriptor for select."""
+        """Descriptor for poll."""
         return int(self._port.fileno())
 
     def read(self) -> bytes:
-        """What has arrived; OSError when the device is gone."""
+        """Bytes that have arrived; OSError if the device is gone."""
         return bytes(self._port.read(max(1, self._port.in_waiting)))
 
     def write(self, data: bytes) -> int:
-        """Send what fits."""
+        """Send what fits; returns the number of bytes."""
         try:
             return os.write(self.fileno(), data)
         except BlockingIOError:
@@ -271,7 +271,7 @@ class SerialTransport:
 
 
 def _accept(endpoint: Endpoint) -> TcpTransport:
-    """Wait a bounded time for one client; TimeoutError (an OSError) if none comes."""
+    """Listen up to 2 s for one client; TimeoutError (an OSError) if none connects."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((endpoint.address, endpoint.number))
@@ -281,7 +281,7 @@ def _accept(endpoint: Endpoint) -> TcpTransport:
 
 
 def open_transport(endpoint: Endpoint) -> Transport:
-    """Open the endpoint; OSError if that fails now and a retry may succeed."""
+    """Open the endpoint; OSError if that fails and a retry may succeed. TCP waits for 2 s."""
     where = (endpoint.address, endpoint.number)
     if endpoint.kind == "udpin":
         return UdpTransport(where, None)

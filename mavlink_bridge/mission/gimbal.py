@@ -38,8 +38,8 @@ class RegionOfInterest:
 
 @dataclass(frozen=True)
 class GimbalTarget:
-    """Camera direction. pitch_deg: above the horizon, None if not commanded; yaw_deg: clockwise
-    from the vehicle's heading, or from north if `from_north`; roi: replaces both.
+    """Commanded camera direction. pitch_deg: above the horizon, None if not commanded; yaw_deg:
+    clockwise from the vehicle's heading, or from north if `from_north`; roi: replaces both.
     """
 
     pitch_deg: float | None = None
@@ -85,7 +85,7 @@ def _roi(item: MissionItem, vehicle: MissionVehicle) -> tuple[GimbalTarget, str]
 def _mount_control(
     item: MissionItem, before: GimbalTarget, vehicle: MissionVehicle
 ) -> tuple[GimbalTarget, str]:
-    """ArduPilot's mission takes the angles whatever the mode, Mission Planner leaves the mode 0."""
+    """DO_MOUNT_CONTROL: ArduPilot uses the angles in any mode; Mission Planner leaves it 0."""
     pitch, _, yaw, *_, mode = item.parameters
     by_angles = mode == mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING or (
         not vehicle.is_px4 and (math.isnan(mode) or mode == 0)
@@ -118,7 +118,7 @@ def _pitch_yaw(
 def _angles(
     before: GimbalTarget, pitch: float, yaw: float, *, from_north: bool
 ) -> tuple[GimbalTarget, str]:
-    """Angles that are not set (NaN) stay as they were."""
+    """The target with these angles (degrees); those that are NaN stay as they were."""
     odd = abs(pitch) > _PITCH_LIMIT_DEG or abs(yaw) > _YAW_LIMIT_DEG
     if odd or math.isinf(pitch) or math.isinf(yaw):
         return GimbalTarget(), f"pitch {pitch:g}, yaw {yaw:g} are no angles in degrees"

@@ -72,12 +72,12 @@ class MissionVehicle:
 
     @property
     def is_multirotor(self) -> bool:
-        """Whether it hovers and has no wings."""
+        """Whether the vehicle hovers and has no wings; False if its kind is unknown."""
         return self.kind in _MULTIROTORS
 
     @property
     def has_wings(self) -> bool:
-        """Whether it is an aeroplane or a VTOL."""
+        """Whether the vehicle is an aeroplane or a VTOL."""
         return self.kind in _WINGED
 
 
@@ -104,19 +104,21 @@ class MissionItem:
 
     @property
     def altitude_m(self) -> float | None:
-        """Altitude; None if 0 or NaN means the present one (ArduCopter's loc_from_cmd)."""
+        """Altitude, m; None if 0 or NaN means the present one (ArduCopter's loc_from_cmd)."""
         altitude = self.parameters[6]
         return None if math.isnan(altitude) or altitude == 0 else altitude
 
     @property
-    def named(self) -> str:
+    def label(self) -> str:
         """MAVLink name and number of the item."""
         return f"{command_name(self.command)} (item {self.number})"
 
 
 @dataclass(frozen=True)
 class LoiterCircle:
-    """radius_m: negative is counter-clockwise; inward: the nose points to the centre."""
+    """A flown circle. radius_m: negative is counter-clockwise; inward: the nose points to the
+    centre.
+    """
 
     radius_m: float
     rounds: int = 1
@@ -131,7 +133,7 @@ class UnreadItem:
     name: str
 
     @property
-    def named(self) -> str:
+    def label(self) -> str:
         """Name and number of the item."""
         return f"{self.name} (item {self.number})"
 

@@ -16,7 +16,7 @@ _FOREVER = -1
 
 
 class Jumps:
-    """Counts jumps. notes: differences from the flight, such as a limited number of repetitions."""
+    """Follows jumps. notes: differences from the flight, such as limited repetitions."""
 
     def __init__(self, items: Sequence[MissionItem | UnreadItem]) -> None:
         self._items = items
@@ -33,20 +33,20 @@ class Jumps:
         self._in_a_row = (commands, jumps + 1 if last == commands else 1)
         target = self._target(item)
         if target is None or self._in_a_row[1] > _MOST_IN_A_ROW:
-            self._note(f"{item.named} leads nowhere: the mission ends there.")
+            self._note(f"{item.label} leads nowhere: the mission ends there.")
             return None
         count, done = item.parameters[1], self._runs.get(index, 0)
         times = int(count) if math.isfinite(count) else 0
         if times == _FOREVER and done:
             self._note(
-                f"{item.named} repeats without end: one round more is judged, and what follows the "
+                f"{item.label} repeats without end: one round more is judged, and what follows the "
                 "jump is never reached."
             )
             return None
         if times != _FOREVER and done >= min(times, _MOST_REPEATS):
             if times > _MOST_REPEATS:
                 self._note(
-                    f"{item.named} repeats {times} times: {_MOST_REPEATS} rounds are counted, all "
+                    f"{item.label} repeats {times} times: {_MOST_REPEATS} rounds are counted, all "
                     "are alike."
                 )
             self._runs[index] = 0  # AP_Mission begins to count again

@@ -1,4 +1,4 @@
-"""Loiter circles as the firmware flies them."""
+"""Computes loiter circles as the firmware flies them."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def circle_of(item: MissionItem, vehicle: MissionVehicle) -> tuple[LoiterCircle 
         usual = _PX4_M if vehicle.is_px4 else _WINGED_M
         radius = _COPTER_M if vehicle.is_multirotor else usual
         notes.append(
-            f"{item.named} gives no radius: judged on the firmware's default circle of "
+            f"{item.label} gives no radius: judged on the firmware's default circle of "
             f"{radius:.0f} m."
         )
     rounds = math.ceil(count) if turns and math.isfinite(count) and count > 0 else 1
     if rounds > _MOST_ROUNDS:
-        notes.append(f"{item.named}: {_MOST_ROUNDS} of its {rounds} rounds are counted.")
+        notes.append(f"{item.label}: {_MOST_ROUNDS} of its {rounds} rounds are counted.")
     elif item.command in (mavlink.MAV_CMD_NAV_LOITER_TIME, mavlink.MAV_CMD_NAV_LOITER_UNLIM):
-        notes.append(f"{item.named}: one round of its circle is judged, all are equal.")
+        notes.append(f"{item.label}: one round of its circle is judged, all are equal.")
     return LoiterCircle(radius, min(rounds, _MOST_ROUNDS), vehicle.is_multirotor), notes

@@ -64,7 +64,7 @@ class MissionPlace:
 
     @property
     def pitch_deg(self) -> float | None:
-        """Gimbal pitch, None if not commanded."""
+        """Gimbal pitch above the horizon, degrees; None if not commanded."""
         return self.gimbal.pitch_deg
 
     @property
@@ -119,7 +119,7 @@ class PlannedMission:
         return bool(self.waypoints) and self.path[-1].name == "home"
 
 
-def fly(
+def planned_path(
     items: Sequence[MissionItem | UnreadItem],
     home: tuple[float, float] | None,
     vehicle: MissionVehicle = UNKNOWN_VEHICLE,
@@ -135,7 +135,7 @@ def fly(
 
 
 class _Flight:
-    """The state of a mission that is followed item by item."""
+    """Follows a mission item by item, and collects the path."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class _Flight:
         self._jumps = Jumps(items)
 
     def run(self) -> None:
-        """From the first item to the end."""
+        """Follow the items from the first to the end."""
         index = commands = 0
         while index < len(self._items):
             item = self._items[index]
@@ -180,7 +180,7 @@ class _Flight:
                 return
 
     def result(self) -> PlannedMission:
-        """What was followed."""
+        """The mission that was followed."""
         path = list(self._path)
         start = self._start()
         if start is not None:
@@ -196,7 +196,7 @@ class _Flight:
         )
 
     def _start(self) -> MissionPlace | None:
-        """Over home, or over the take-off where home is not set."""
+        """Position above home, or above the take-off if home is unknown; None without both."""
         if self._launch is not None:
             return self._launch
         if self._home is None or not self._path:
@@ -206,7 +206,7 @@ class _Flight:
 
     def _take(self, item: MissionItem | UnreadItem) -> None:
         if isinstance(item, UnreadItem):
-            self._leave_out(item.named, "the ground station works it out at the upload", gap=True)
+            self._leave_out(item.label, "the ground station works it out at the upload", gap=True)
             return
         command = item.command
         if command in TAKEOFFS:
@@ -224,23 +224,23 @@ class _Flight:
             self._gimbal, why = gimbal_after(item, self._gimbal, self._vehicle)
             if why:
                 turned = command not in ROI_COMMANDS  # a region turns a vehicle without gimbal
-                self._leave_out(item.named, why, gimbal_only=turned)
+                self._leave_out(item.label, why, gimbal_only=turned)
         elif command in NO_EFFECT or _is_off(item):
             self._no_effect[command_name(command)] = None
         else:
             flies = command <= mavlink.MAV_CMD_NAV_LAST or command in FLY_TOO
             gimbal_only = command in GIMBAL_ONLY
-            self._leave_out(item.named, gap=flies and command not in VIEW, gimbal_only=gimbal_only)
+            self._leave_out(item.label, gap=flies and command not in VIEW, gimbal_only=gimbal_only)
 
     def _leave_out(
-        self, named: str, why: str = "", *, gap: bool = False, gimbal_only: bool = False
+        self, label: str, why: str = "", *, gap: bool = False, gimbal_only: bool = False
     ) -> None:
-        text = f"{named}: {why}" if why else named
+        text = f"{label}: {why}" if why else label
         self._not_judged[NotJudged(text, gimbal_only, gap)] = None
         self._gap |= gap
 
     def _take_off(self, item: MissionItem) -> None:
-        """Straight up; ArduPilot leaves a take-off's coordinates aside, PX4 flies there."""
+        """Climb straight up; ArduPilot ignores a take-off's coordinates, PX4 flies there."""
         altitude = item.altitude_m
         if altitude is not None:
             self._level = (altitude, _above(item))
@@ -286,10 +286,10 @@ class _Flight:
     def _note_place(self, item: MissionItem) -> None:
         _above(item)  # a local frame's coordinates are no latitude and longitude
         if item.command == mavlink.MAV_CMD_NAV_LOITER_UNLIM:
-            self._notes[f"{item.named} holds until the pilot goes on."] = None
+            self._notes[f"{item.label} holds until the pilot goes on."] = None
 
     def _descend(self, item: MissionItem) -> None:
-        """To its coordinates at the height of before, then down; an aeroplane glides there."""
+        """Fly to its coordinates at the present height, then down; an aeroplane glides there."""
         if item.place is None:
             return
         _above(item)
@@ -301,15 +301,15 @@ class _Flight:
 
     def _return(self, item: MissionItem) -> None:
         if self._home is None:
-            self._leave_out(item.named, "the mission has no home")
+            self._leave_out(item.label, "the mission has no home")
             return
         if self._vehicle.has_rally_points:
-            self._leave_out(item.named, "it may return to a rally point")
+            self._leave_out(item.label, "it may return to a rally point")
         self._add("home", item, self._home)
 
 
 def _takes_off_next(items: Sequence[MissionItem | UnreadItem]) -> bool:
-    """Only a take-off goes on after a landing (AP_Mission::is_takeoff_next)."""
+    """Whether a take-off follows: only that continues a landing (AP_Mission::is_takeoff_next)."""
     for item in items:
         if not isinstance(item, MissionItem):
             return False
@@ -321,7 +321,7 @@ def _takes_off_next(items: Sequence[MissionItem | UnreadItem]) -> bool:
 
 
 def _is_off(item: MissionItem) -> bool:
-    """A command whose parameter says that nothing is to be done."""
+    """Whether the command's parameter disables it."""
     mode = item.parameters[0]
     if item.command == mavlink.MAV_CMD_NAV_GUIDED_ENABLE:
         return not mode > 0.5
@@ -331,7 +331,7 @@ def _is_off(item: MissionItem) -> bool:
 
 
 def _speed_after(item: MissionItem, before: float | None, usual: float | None) -> float | None:
-    """Over the ground or through the air; -1 leaves it, -2 is the vehicle's usual one."""
+    """Speed after DO_CHANGE_SPEED, m/s; -1 keeps `before`, -2 is the vehicle's `usual` one."""
     kind, speed = item.parameters[:2]
     if kind not in (mavlink.SPEED_TYPE_AIRSPEED, mavlink.SPEED_TYPE_GROUNDSPEED):
         return before
@@ -343,7 +343,7 @@ def _speed_after(item: MissionItem, before: float | None, usual: float | None) -
 def _above(item: MissionItem) -> HeightAbove:
     if item.frame not in FRAMES:
         raise MissionError(
-            f"{item.named} is in frame {item.frame}; known are {sorted(FRAMES)} (MAV_FRAME): save "
+            f"{item.label} is in frame {item.frame}; known are {sorted(FRAMES)} (MAV_FRAME): save "
             "the mission with global coordinates"
         )
     return FRAMES[item.frame]

@@ -30,8 +30,8 @@ _Self = TypeVar("_Self", bound="VehicleClient")
 class VehicleClient:
     """Finds the autopilot and keeps its link active by heartbeats. A context manager.
 
-    Raises `ConnectionSilentError` if no heartbeat arrives. A subclass receives its messages in
-    `take`, which is called under the lock of `wait_for`.
+    Raises `ConnectionSilentError` if no heartbeat arrives. A subclass receives the autopilot's
+    messages in `take`, which is called under the lock of `wait_for`.
     """
 
     def __init__(self, config: BridgeConfig, name: str, wanted: Collection[int]) -> None:
@@ -92,10 +92,10 @@ class VehicleClient:
     # --- link handler ---------------------------------------------------------------------------
 
     def on_open(self, link: Link) -> None:
-        """Nothing is sent before a heartbeat is received."""
+        """Does nothing: nothing is sent before a heartbeat is received."""
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """The autopilot's heartbeat, or an answer of it."""
+        """Process the autopilot's heartbeat, or pass its other messages to `take`."""
         system = message.get_srcSystem()
         if message.get_type() == "HEARTBEAT":
             # The first one decides: a second vehicle on the link must not be given what was asked
@@ -137,7 +137,7 @@ class DetectedAutopilot:
     firmware: str
 
 
-def meet(config: BridgeConfig) -> DetectedAutopilot:
+def detect_autopilot(config: BridgeConfig) -> DetectedAutopilot:
     """Detect the autopilot at `config.connection`; `ConnectionSilentError` without one."""
     with VehicleClient(config, "meeting", ()) as client:
         number = client.autopilot

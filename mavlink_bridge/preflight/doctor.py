@@ -41,7 +41,9 @@ _PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
 
 @dataclass(frozen=True)
 class DoctorFinding:
-    """Result of one check. fix: parameter value to write, None if none would help."""
+    """Result of one check. required: if it fails, the vehicle is not fit to fly; otherwise advice;
+    fix: parameter value to write, None if none would help; reboot: needed after it.
+    """
 
     name: str
     found: str
@@ -84,7 +86,7 @@ class Diagnosis:
 
 
 def check_parameters(rules: Iterable[ParameterRule], read: Read) -> list[DoctorFinding]:
-    """Compare the flight controller's parameters with each rule. read: returns a parameter."""
+    """Compare parameters with each rule. read: gives a value, None if it does not exist."""
     findings = []
     for rule in rules:
         name, value = rule.names[0], None
@@ -117,7 +119,7 @@ def check_failsafes(config: BridgeConfig, read: Read, *, px4: bool = False) -> l
 
 @dataclass(frozen=True)
 class _Measurement:
-    """What came over the link in so many seconds, and the vehicle at their end."""
+    """Counters before and after `seconds` on the link, and the vehicle at their end."""
 
     state: VehicleState
     before: Figures
@@ -125,8 +127,8 @@ class _Measurement:
     seconds: float
     gimbal: GimbalAttitude | None
 
-    def grown(self, key: str) -> float:
-        """By how much a counter grew."""
+    def increase(self, key: str) -> float:
+        """Increase of a counter."""
         return float(self.after.get(key) or 0) - float(self.before.get(key) or 0)
 
 
@@ -166,7 +168,7 @@ def _measure(bridge: Bridge, gimbal: bool) -> _Measurement:
 
 
 def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[DoctorFinding]:
-    """Who is there, and whether it takes what is to be injected."""
+    """Findings about the vehicle's identity, and whether it accepts the configured message."""
     state, message = measured.state, config.injection.message
     profile = select_profile(state.autopilot, state.version)
     version = "unknown" if state.version is None else ".".join(map(str, state.version))
@@ -215,13 +217,13 @@ def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Doct
 
 
 def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[DoctorFinding]:
-    """Whether what localization needs comes often enough, in time and whole."""
+    """Findings about the streams: rate, delay and losses."""
     source = measured.state.clock_source
     round_trip = float(measured.after["clock_round_trip_ms"] or 0)
-    attitude = measured.grown("rx_ATTITUDE") / measured.seconds
+    attitude = measured.increase("rx_ATTITUDE") / measured.seconds
     wanted = config.attitude_rate_hz * _RATE_SHARE
-    received = measured.grown("fc_messages") + measured.grown("fc_skipped_messages")
-    lost = measured.grown("fc_lost") / max(received, 1.0)
+    received = measured.increase("fc_messages") + measured.increase("fc_skipped_messages")
+    lost = measured.increase("fc_lost") / max(received, 1.0)
     findings = [
         DoctorFinding(
             "clock",
@@ -305,7 +307,7 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
 
 
 def _source_switch_of_px4(config: BridgeConfig) -> list[DoctorFinding]:
-    """PX4 has no source sets: the order to change them is answered UNSUPPORTED in flight."""
+    """Finding for a source switch with PX4, which would answer UNSUPPORTED in flight."""
     if not config.switch.enabled:
         return []
     why = "PX4 has no source sets (SET_EKF_SOURCE_SET): it fuses GNSS and vision together"

@@ -129,7 +129,7 @@ def _listed(all_wanted: tuple[_Wanted, ...], read: Read) -> list[Failsafe]:
 
 
 def _fence(read: Read) -> list[Failsafe]:
-    """Only of a fence that is on: of another it does not matter."""
+    """Findings about the fence; [] if it is off."""
     kind, action = read("FENCE_TYPE"), read("FENCE_ACTION")
     if not read("FENCE_ENABLE") or kind is None or action is None:
         return []

@@ -1,4 +1,4 @@
-"""The mission that the flight controller holds, for checks before a flight.
+"""Downloads the mission from the flight controller, for checks before a flight.
 
 https://mavlink.io/en/services/mission.html
 """
@@ -14,9 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.mission.items import FRAMES
-from mavlink_bridge.mission.path import fly
+from mavlink_bridge.mission.path import planned_path
 from mavlink_bridge.preflight.client import VehicleClient
-from mavlink_bridge.vehicle.mission import MissionWaypoint, item_of, place_of
+from mavlink_bridge.vehicle.mission import MissionWaypoint, mission_item, waypoint_of
 
 _RETRIES = 5
 _ANSWER_S = 1.0
@@ -38,7 +38,7 @@ class MissionDownloader(VehicleClient):
         self._refusal: int | None = None
 
     def download(self) -> list[MissionWaypoint]:
-        """Home and the mission's positions in flight order; else `MissionError`."""
+        """Download home and the mission's positions in flight order; otherwise `MissionError`."""
         self._count, self._refusal = None, None
         self._items.clear()
         self._repeat(
@@ -85,11 +85,11 @@ class MissionDownloader(VehicleClient):
 
 
 def _as_flown(messages: Sequence[Any]) -> list[MissionWaypoint]:
-    """Of MISSION_ITEM_INT messages, the first of which is home. Places in metres are left out."""
-    home = place_of(messages[0]) if messages else None
-    items = [item_of(m) for m in messages[1:] if not _is_local(m)]
+    """Positions in flight order; the first message is home. Local frames are left out."""
+    home = waypoint_of(messages[0]) if messages else None
+    items = [mission_item(m) for m in messages[1:] if not _is_local(m)]
     place = None if home is None else (home.latitude_deg, home.longitude_deg)
-    flown = fly(items, place).path
+    flown = planned_path(items, place).path
     places = [MissionWaypoint(p.item, p.latitude_deg, p.longitude_deg) for p in flown if p.item > 0]
     return places if home is None else [home, *places]
 

@@ -1,4 +1,4 @@
-"""Reading and writing the flight controller's parameters, one by one and by name.
+"""Reads and writes the flight controller's parameters, one by one and by name.
 
 https://mavlink.io/en/services/parameter.html
 """
@@ -104,6 +104,6 @@ class ParameterClient(VehicleClient):
         return bool(self.autopilot == mavlink.MAV_AUTOPILOT_PX4)
 
     def take(self, message: Any) -> None:
-        """PARAM_VALUE."""
+        """Process a PARAM_VALUE."""
         value = decode_value(message.param_value, message.param_type, bytewise=self._bytewise)
         self._values[message.param_id] = (value, message.param_type)

@@ -29,8 +29,8 @@ Read = Callable[[str], float | None]
 class ParameterRule:
     """A parameter's requirement. names: the parameter and its older names, newest first.
 
-    allowed: correct values, the first of which is written; None if `minimum` or `maximum` gives a
-    bound. required: whether a flight fails without it; otherwise it is advice.
+    allowed: correct values, the first of which is written; empty if `minimum` bounds the value or
+    `bits` must be set. required: whether a flight fails without it; otherwise it is advice.
     """
 
     names: tuple[str, ...]
@@ -44,7 +44,7 @@ class ParameterRule:
 
     @property
     def needed(self) -> str:
-        """The allowed values as text."""
+        """The allowed values, the bound or the bits as text."""
         if self.bits:
             return f"bits {self.bits:#x} set"
         if math.isfinite(self.minimum):
@@ -69,7 +69,7 @@ class ParameterRule:
 
 
 def find_source_set(config: BridgeConfig, read: Read) -> int:
-    """The EK3 source set that uses the injected positions, or that should."""
+    """Number (1 to 3) of the EK3 source set that uses the injected positions, or should."""
     if config.switch.enabled:
         return config.switch.vision_set
     if config.injection.message == "external_position_estimate":
@@ -209,9 +209,9 @@ def _gps_input_rules(config: BridgeConfig, number: int) -> list[ParameterRule]:
 
 
 def _horizon_rules(delay_ms: float) -> list[ParameterRule]:
-    """EKF3 sizes its buffer of measurements when it starts, by the delay of the first receiver and
-    of vision. Older positions of another receiver are fused late, by the difference: 1 m behind
-    at 8 m/s and 220 ms. Vision's delay makes room, although no vision message is sent.
+    """Rules for EKF3's buffer. It is sized at the start by the delay of the first receiver and of
+    vision. Older positions of another receiver are fused late, by the difference: 1 m behind at 8
+    m/s and 220 ms. Vision's delay makes room, although no vision message is sent.
     """
     why = "room in the EKF's buffer for a second receiver; or let GPS_INPUT be the first, gps_id 0"
     return [
@@ -301,7 +301,7 @@ def px4_rules(config: BridgeConfig, read: Read) -> list[ParameterRule]:
 
 
 def _agp_rules(read: Read) -> list[ParameterRule]:
-    """The instance that has our sensor's id, or the first; firmware of one instance has no ids."""
+    """Rules for the instance with our sensor's id, or the first; one instance has no ids."""
     why = "bit 0: horizontal position"
     if read("EKF2_AGP0_ID") is None:
         return [ParameterRule(_AGP_CONTROLS, (), why, bits=1)]

@@ -16,17 +16,17 @@ _REPEATS = 3
 _APART_S = 0.3
 
 
-class _KeyGiver(VehicleClient):
-    """Speaks without a signature: the autopilot has no key yet."""
+class _KeySender(VehicleClient):
+    """Sends messages without a signature, because the autopilot has no key yet."""
 
     def __init__(self, config: BridgeConfig) -> None:
         super().__init__(config, "signing", ())
 
     def take(self, message: Any) -> None:
-        """Nothing answers SETUP_SIGNING."""
+        """Does nothing: SETUP_SIGNING is not answered."""
 
-    def give(self, key: bytes) -> None:
-        """The key and the time, a few times: nothing acknowledges them."""
+    def send_key(self, key: bytes) -> None:
+        """Send the key and the time a few times, because nothing acknowledges them."""
         message = mavlink.MAVLink_setup_signing_message(
             self.system, self.component, list(key), signing_timestamp()
         )
@@ -43,13 +43,13 @@ def install_key(connection: str, key_file: Path) -> bool:
     """
     key = load_key(key_file)
     config = BridgeConfig(connection=connection)
-    with _KeyGiver(config) as client:
+    with _KeySender(config) as client:
         if client.armed:
             raise BridgeStateError(f"{connection}: the vehicle is armed; disarm it, then install")
-        client.give(key)
+        client.send_key(key)
     signed = config.model_copy(update={"signing": SigningConfig(key_file=key_file)})
     try:
-        with _KeyGiver(signed):
+        with _KeySender(signed):
             return True
     except ConnectionSilentError:
         return False

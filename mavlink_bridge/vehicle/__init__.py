@@ -1,1 +1,1 @@
-"""The vehicle's telemetry on our clock, and requests to the vehicle."""
+"""The vehicle's telemetry with times on CLOCK_MONOTONIC, and requests to the vehicle."""

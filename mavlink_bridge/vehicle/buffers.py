@@ -1,4 +1,4 @@
-"""Short histories of telemetry with interpolation."""
+"""Histories of telemetry over seconds, interpolated between samples."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_S
 
 
 class TimedValue(Protocol):
-    """A value with a time."""
+    """A value with the time at which it was valid."""
 
     @property
     def time_ns(self) -> int:
-        """On CLOCK_MONOTONIC."""
+        """CLOCK_MONOTONIC, ns."""
 
 
 _Sample = TypeVar("_Sample", bound=TimedValue)
@@ -37,7 +37,7 @@ _Sample = TypeVar("_Sample", bound=TimedValue)
 
 @dataclass(frozen=True)
 class VectorSample:
-    """Numbers reported for a time."""
+    """Numbers that were valid at a time."""
 
     time_ns: int
     values: tuple[float, ...]
@@ -45,11 +45,11 @@ class VectorSample:
 
 @dataclass(frozen=True)
 class GimbalSample:
-    """One gimbal message: attitude to the horizontal frame that points north (earth_frame) or to
-    the nose.
+    """Attitude of the gimbal's housing in one message: to NED, or to the horizontal frame of the
+    vehicle's nose.
 
-    earth_frame: whether yaw counts from true north; otherwise it counts from the vehicle's heading.
-    device: component and gimbal_device_id of the sender.
+    earth_frame: whether yaw counts from true north; otherwise from the vehicle's heading. source:
+    name of the message. device: component and gimbal_device_id of the sender.
     """
 
     time_ns: int
@@ -62,7 +62,7 @@ class GimbalSample:
 def attitude(
     time_ns: int, q: quat.Quaternion, rates: quat.Vector, gyro_heading_rad: float = 0.0
 ) -> Attitude:
-    """Make an `Attitude` from a quaternion (body to NED)."""
+    """Make an `Attitude` from a quaternion (body to NED) and body rates (rad/s)."""
     return Attitude(time_ns, *quat.to_euler(q), q, rates, gyro_heading_rad)
 
 
@@ -73,8 +73,8 @@ def heading_rate(sample: Attitude) -> float:
     return (q * math.sin(sample.roll_rad) + r * math.cos(sample.roll_rad)) / cos_pitch
 
 
-def _around(samples: Sequence[_Sample], time_ns: int) -> tuple[_Sample, _Sample, float]:
-    """The samples before and after, and the share t of the way; time_ns is inside."""
+def _neighbours(samples: Sequence[_Sample], time_ns: int) -> tuple[_Sample, _Sample, float]:
+    """The samples before and after time_ns, which is inside, and its share of the interval."""
     index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
     before, after = samples[max(index - 1, 0)], samples[index]
     span = after.time_ns - before.time_ns
@@ -97,11 +97,11 @@ class VectorBuffer:
             self._samples.append(VectorSample(time_ns, values))
 
     def at(self, time_ns: int) -> tuple[float, ...] | None:
-        """Values at a time, None outside the buffer or inside a gap of more than 0.5 s."""
+        """Values interpolated at a time; None outside the buffer or in a gap of more than 0.5 s."""
         samples = list(self._samples)
         if not samples or not samples[0].time_ns <= time_ns <= samples[-1].time_ns:
             return None
-        before, after, t = _around(samples, time_ns)
+        before, after, t = _neighbours(samples, time_ns)
         if after.time_ns - before.time_ns > MAX_GAP_NS:
             return None
         return self._between(before.values, after.values, t)
@@ -120,7 +120,7 @@ class PlaceBuffer(VectorBuffer):
 
 
 class ZoomBuffer:
-    """Zoom levels (per cent of the range) of the camera that first reported one."""
+    """Zoom levels (0 to 100 %) of the camera component that first reported one."""
 
     def __init__(self) -> None:
         self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
@@ -132,7 +132,7 @@ class ZoomBuffer:
         self._component = None
 
     def add(self, time_ns: int, component: int, level: float) -> None:
-        """Append a level; NaN if the camera does not know it."""
+        """Append a level; NaN: the camera does not know it."""
         if self._component is None:
             self._component = component
         newer = not self._samples or time_ns > self._samples[-1].time_ns
@@ -140,8 +140,8 @@ class ZoomBuffer:
             self._samples.append(VectorSample(time_ns, (level,)))
 
     def at(self, time_ns: int, hold_s: float) -> float | None:
-        """The level at a time, linear between reports. The newest one is valid for hold_s, or while
-        the level changes only until the next report is due.
+        """The level at a time, linear between reports; None if unknown. The newest report is valid
+        for hold_s, but only for 0.5 s while the level changes.
         """
         samples = list(self._samples)
         if not samples or time_ns < samples[0].time_ns:
@@ -152,7 +152,7 @@ class ZoomBuffer:
             held_ns = MAX_GAP_NS if moves else round(1e9 * hold_s)
             level = newest.values[0] if time_ns - newest.time_ns <= held_ns else math.nan
         else:
-            before, after, t = _around(samples, time_ns)
+            before, after, t = _neighbours(samples, time_ns)
             level = before.values[0] + t * (after.values[0] - before.values[0])
             long_ago = after.time_ns - before.time_ns > round(1e9 * hold_s)
             if before.values != after.values and long_ago:
@@ -171,7 +171,7 @@ class AttitudeBuffer:
         self._samples.clear()
 
     def add(self, sample: Attitude) -> None:
-        """Append with its gyro heading; one that is not newer than the newest is dropped."""
+        """Append, with its gyro heading integrated; one that is not newer is dropped."""
         if self._samples:
             last = self._samples[-1]
             dt = (sample.time_ns - last.time_ns) * 1e-9
@@ -185,9 +185,9 @@ class AttitudeBuffer:
         self._samples.append(sample)
 
     def at(self, time_ns: int) -> Attitude | None:
-        """Attitude at a time, None outside the buffer or inside a gap of more than 0.5 s.
+        """Attitude at a time; None outside the buffer or in a gap of more than 0.5 s.
 
-        Up to 0.1 s beyond the newest it is turned on at that one's rates.
+        Up to 0.1 s after the newest sample, that is rotated on at its rates.
         """
         samples = list(self._samples)
         if not samples or time_ns < samples[0].time_ns:
@@ -198,10 +198,10 @@ class AttitudeBuffer:
             if ahead > _MAX_EXTRAPOLATION_NS:
                 return None
             seconds = ahead * 1e-9
-            q = quat.turn(newest.quaternion, newest.rates, seconds)
+            q = quat.rotated(newest.quaternion, newest.rates, seconds)
             heading = newest.gyro_heading_rad + heading_rate(newest) * seconds
             return attitude(time_ns, q, newest.rates, heading)
-        before, after, t = _around(samples, time_ns)
+        before, after, t = _neighbours(samples, time_ns)
         if after.time_ns - before.time_ns > MAX_GAP_NS:
             return None
         q = quat.slerp(before.quaternion, after.quaternion, t)
@@ -235,7 +235,7 @@ class GimbalBuffer:
 
     It uses the first gimbal that sends, as long as it sends, because mixed angles of two gimbals
     are wrong. device: the (component, gimbal_device_id) to use, 0 for any. others: the other
-    gimbals that have sent, eight at most.
+    gimbals that have sent, at most eight.
     """
 
     def __init__(self, device: tuple[int, int] = (0, 0)) -> None:
@@ -253,14 +253,14 @@ class GimbalBuffer:
         self._samples.clear()
 
     def add(self, sample: GimbalSample) -> None:
-        """Append, unless a better source or the selected gimbal reported recently."""
+        """Append, unless a better source (1 s) or the selected gimbal (3 s) has reported lately."""
         if not self._is_wanted(sample.device):
-            self._note(sample.device)
+            self._add_other(sample.device)
             return
         if self._samples:
             newest = self._samples[-1]
             if sample.source == newest.source and sample.device != newest.device:
-                self._note(sample.device)
+                self._add_other(sample.device)
                 if sample.time_ns - newest.time_ns < _GIMBAL_GONE_NS:
                     return
                 self._samples.clear()
@@ -276,7 +276,7 @@ class GimbalBuffer:
                 self._samples.clear()
         self._samples.append(sample)
 
-    def _note(self, device: tuple[int, int]) -> None:
+    def _add_other(self, device: tuple[int, int]) -> None:
         if len(self.others) < _MOST_OTHERS:
             self.others.add(device)
 
@@ -285,14 +285,14 @@ class GimbalBuffer:
         return all(wanted in (0, given) for wanted, given in pairs)
 
     def at(self, time_ns: int) -> GimbalSample | None:
-        """Interpolated attitude; the newest is valid for 0.5 s."""
+        """Attitude interpolated at a time; the newest is valid for 0.5 s. None if unknown."""
         samples = list(self._samples)
         if not samples or time_ns < samples[0].time_ns:
             return None
         newest = samples[-1]
         if time_ns >= newest.time_ns:
             return newest if time_ns - newest.time_ns <= MAX_GAP_NS else None
-        before, after, t = _around(samples, time_ns)
+        before, after, t = _neighbours(samples, time_ns)
         if after.time_ns - before.time_ns > 2 * MAX_GAP_NS:
             return None
         q = quat.slerp(before.quaternion, after.quaternion, t)

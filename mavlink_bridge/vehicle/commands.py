@@ -12,13 +12,13 @@ _PARAMETERS = 7
 
 
 class Commander:
-    """Sends commands from our component id."""
+    """Sends commands to the autopilot from our component id."""
 
     def __init__(self, component: int) -> None:
         self._component = component
 
     def send(self, link: Link, command: int, *parameters: float) -> None:
-        """Send COMMAND_LONG (76) to the autopilot; missing parameters are 0."""
+        """Send COMMAND_LONG (76) with these parameters 1 to 7; missing ones are 0."""
         padded = [*parameters, *([0.0] * (_PARAMETERS - len(parameters)))]
         message = mavlink.MAVLink_command_long_message(
             link.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded
@@ -26,7 +26,7 @@ class Commander:
         link.send(message, self._component)
 
     def send_int(self, link: Link, command: int, frame: int, place: tuple[int, int, float]) -> None:
-        """Send COMMAND_INT (75); place: latitude, longitude (1e-7 degrees), altitude."""
+        """Send COMMAND_INT (75); place: latitude, longitude (1e-7 degrees), altitude (m)."""
         message = mavlink.MAVLink_command_int_message(
             link.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, frame, command, 0, 0, 0, 0, 0, 0, *place
         )
@@ -43,6 +43,6 @@ class Commander:
         )
 
 
-def accepted(ack: Any) -> bool:
+def is_accepted(ack: Any) -> bool:
     """Whether a COMMAND_ACK says that the command was or is being executed."""
     return ack.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)

@@ -35,42 +35,45 @@ _HEARD = frozenset(
 
 
 class _Speaker:
-    """The handler of one link: sends the alert once it knows the system id, then sets `told`."""
+    """Handler of one link: sends the alert once it knows the system id, then sets `sent`. hears:
+    whether the autopilot is on the link.
+    """
 
     def __init__(self, message: Any, component: int, system: int | None, *, hears: bool) -> None:
-        self.told = threading.Event()
+        self.sent = threading.Event()
         self._message, self._component = message, component
         self._system, self._hears = system, hears
         self._opened_ns = 0
 
     def on_open(self, link: Link) -> None:
-        """From now on the autopilot is waited for."""
+        """Start to wait for the autopilot's message."""
         self._opened_ns = monotonic_ns()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """The autopilot's message: its system is ours."""
+        """Send the alert with the autopilot's system id."""
         if message.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1:
             link.keep_peer()
-            self._say(link, self._system or message.get_srcSystem())
+            self._send(link, self._system or message.get_srcSystem())
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Where nobody speaks, or nobody needs to, it is said as the configured system."""
+        """Without an autopilot on the link, or after 0.4 s: send by the configured system id."""
         waited = self._opened_ns and now_ns - self._opened_ns > _PATIENCE_NS
         if self._opened_ns and (waited or not self._hears):
-            self._say(link, self._system or _FIRST_GUESS)
+            self._send(link, self._system or _FIRST_GUESS)
         return now_ns + _TICK_NS
 
-    def _say(self, link: Link, system: int) -> None:
-        if not self.told.is_set():
+    def _send(self, link: Link, system: int) -> None:
+        if not self.sent.is_set():
             link.system_id = system
             link.send(self._message, self._component)
-            self.told.set()
+            self.sent.set()
 
 
 def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float = 0.8) -> bool:
-    """Send an alert on every link of the bridge. True if at least one opened within `timeout_s`
-    (for all links together); whether anybody received it is unknown. For the supervisor.
-    `SigningKeyError` for an unusable key file.
+    """Send an alert on every link of the bridge, for the supervisor after the flight process died.
+
+    True if it was sent on at least one within `timeout_s` (for all links together); whether anybody
+    received it is unknown. `SigningKeyError` for an unusable key file.
     """
     message = status_text(alert)
     spoken = []
@@ -83,10 +86,10 @@ def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float =
         link.start()
         spoken.append((speaker, link))
     end_ns = monotonic_ns() + int(timeout_s * 1e9)
-    told = [s.told.wait(max(end_ns - monotonic_ns(), 0) * 1e-9) for s, _ in spoken]
+    sent = [s.sent.wait(max(end_ns - monotonic_ns(), 0) * 1e-9) for s, _ in spoken]
     for _, link in spoken:
         link.stop()
-    return any(told)
+    return any(sent)
 
 
 def _link(connection: str, signing: SigningConfig | None, speaker: _Speaker) -> Link:

@@ -27,15 +27,15 @@ _TRIES = 5
 
 @dataclass(frozen=True)
 class MissionWaypoint:
-    """A position of the mission. number: of the item; 0 is home in ArduPilot."""
+    """A position of the mission. number: of the mission item; 0 is home in ArduPilot."""
 
     number: int
     latitude_deg: float
     longitude_deg: float
 
 
-def place_of(item: Any) -> MissionWaypoint | None:
-    """Position of a MISSION_ITEM_INT; None for other commands and if the item means the present
+def waypoint_of(item: Any) -> MissionWaypoint | None:
+    """Position of a MISSION_ITEM_INT; None for an item without one, or if it means the present
     position. `MissionError` for impossible coordinates.
     """
     flown = item.seq == 0 or item.command in FLOWN_TO
@@ -49,7 +49,7 @@ def place_of(item: Any) -> MissionWaypoint | None:
     return MissionWaypoint(item.seq, item.x * 1e-7, item.y * 1e-7)
 
 
-def item_of(message: Any) -> MissionItem:
+def mission_item(message: Any) -> MissionItem:
     """Convert a MISSION_ITEM_INT to a `MissionItem` (degrees instead of 1e-7 degrees)."""
     x, y = float(message.x), float(message.y)
     if (message.x, message.y) in _HERE:
@@ -65,8 +65,8 @@ class MissionWatch:
 
     ArduPilot does not report changes of the mission. So the number of items is requested every ten
     seconds. The whole mission is read again when this number, the mode or the armed state changes.
-    One request is under way at a time. Runs in the link's thread; `waypoints` and `wanted` may be
-    used from any thread.
+    One request is under way at a time. Runs in the link's thread; any thread may set `wanted` (a
+    display needs the mission) and read `waypoints`.
     """
 
     def __init__(self, component: int) -> None:
@@ -82,12 +82,12 @@ class MissionWatch:
         self._due_ns = 0
 
     def reset(self) -> None:
-        """Another vehicle, or a reboot: forget the mission."""
+        """Read the mission again, because the vehicle rebooted or is another."""
         self._known = self._reading = self._item = None
         self._due_ns = self._tries = 0
 
     def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Send the request that is due."""
+        """Send the request that is due, if any; called at each tick of the link."""
         if not self.wanted:
             return
         flown_as = (state.armed, state.custom_mode)
@@ -113,14 +113,14 @@ class MissionWatch:
             return
         kind = message.get_type()
         if kind == "MISSION_COUNT" and self._item is None:
-            self._counted(link, message, now_ns)
+            self._on_count(link, message, now_ns)
         elif kind == "MISSION_ITEM_INT" and message.seq == self._item and self._reading is not None:
-            self._take(link, message, now_ns)
+            self._add_item(link, message, now_ns)
         elif kind == "MISSION_ACK":  # refused: a station is loading another one just now
             self._reading = self._item = None
             self._due_ns = now_ns + _COUNT_EVERY_NS
 
-    def _counted(self, link: Link, message: Any, now_ns: int) -> None:
+    def _on_count(self, link: Link, message: Any, now_ns: int) -> None:
         found = int(message.count)
         if found == self._known or found > _MOST:
             self._due_ns = now_ns + _COUNT_EVERY_NS
@@ -132,10 +132,10 @@ class MissionWatch:
         else:
             self._ask(link, now_ns)
 
-    def _take(self, link: Link, message: Any, now_ns: int) -> None:
+    def _add_item(self, link: Link, message: Any, now_ns: int) -> None:
         assert self._reading is not None
         try:
-            place = place_of(message)
+            place = waypoint_of(message)
         except MissionError:  # the doctor names it
             place = None
         if place is not None:

@@ -1,4 +1,4 @@
-"""The EKF origin and the firmwares' flat-earth conversions.
+"""The EKF origin, and the firmwares' flat-earth conversions.
 
 Positions are sent as NED metres from the EKF origin. The flight controller converts them back by
 its own approximation, so the same one must be used here.
@@ -87,15 +87,15 @@ def ned_from_origin(
     altitude_amsl_m: float,
     projection: Projection = "ardupilot",
 ) -> tuple[float, float, float]:
-    """NED metres from the EKF origin."""
+    """North, east, down from the EKF origin, metres."""
     north, east = north_east(
         origin.latitude_deg, origin.longitude_deg, latitude_deg, longitude_deg, projection
     )
     return north, east, origin.altitude_amsl_m - altitude_amsl_m
 
 
-def _is_place(read: Origin) -> bool:
-    """Not 0, 0, which firmwares send before they have an origin, and somewhere on Earth."""
+def _is_plausible(read: Origin) -> bool:
+    """Whether it is an origin on Earth, and not 0, 0, which firmwares send before they have one."""
     if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
         return False
     if not abs(read.altitude_amsl_m) <= _HIGHEST_M:
@@ -124,7 +124,7 @@ class OriginKeeper:
         """How far off the origin said last was, if it was refused; None: it was not."""
 
     def reset(self) -> None:
-        """The flight controller rebooted, or may have while the link was lost: ask again."""
+        """Forget the origin and ask again: the flight controller rebooted, or may have."""
         self.origin, self._asked, self._told, self._next_ns = None, 0, False, 0
         self.moved_m = None
 
@@ -136,7 +136,7 @@ class OriginKeeper:
         """
         read = Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
         self.moved_m = None
-        if not _is_place(read) or read == self.origin:
+        if not _is_plausible(read) or read == self.origin:
             return None
         moved = self.origin is not None
         if self.origin is not None and armed:
@@ -158,7 +158,9 @@ class OriginKeeper:
         return alert(AlertId.ORIGIN_KNOWN)
 
     def tick(self, now_ns: int, system_id: int, ask: Callable[[int], None]) -> Any | None:
-        """Request the origin by `ask(49)`; returns SET_GPS_GLOBAL_ORIGIN if it is due."""
+        """Request the origin by `ask(49)`. Returns SET_GPS_GLOBAL_ORIGIN if it is due: after three
+        requests without an origin, if one is configured.
+        """
         if now_ns < self._next_ns:
             return None
         if self.origin is not None:

@@ -1,4 +1,4 @@
-"""Requests, reads and, if the vehicle has none, sets the EKF origin over the link."""
+"""Requests and reads the EKF origin over the link, and sets it if the vehicle has none."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class OriginExchange:
             self._notifier.report(news)
 
     def forget(self) -> None:
-        """Drop the origin, because it may have changed; nothing relative to it is sent."""
+        """Forget the origin, which may have changed; nothing relative to it is sent."""
         self._keeper.reset()
         self._tracker.set_origin(None)
 

@@ -1,4 +1,4 @@
-"""Reports that the flight controller is found, lost or back, once for all links."""
+"""Reports once for all links that the flight controller is found, lost or back."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NEWS = {
 class VehicleWatch:
     """Reports found and lost vehicles. Every link calls `check` at each tick.
 
-    report: reports an alert to the operator. first: called after the first of these alerts. clock:
+    report: sends an alert to the operator. first: called after the first of these alerts. clock:
     CLOCK_MONOTONIC, ns.
     """
 
@@ -40,7 +40,7 @@ class VehicleWatch:
         self._known = "nothing"
 
     def check(self, state: VehicleState) -> None:
-        """Report changes since the last call."""
+        """Report whether the vehicle was found, lost or is back, or silent from the start."""
         now_ns = self._clock()
         with self._lock:
             before, self._begun_ns = self._known, self._begun_ns or now_ns
@@ -58,14 +58,14 @@ class VehicleWatch:
 
 
 class DuplicateSystemIdMonitor:
-    """Detects two vehicles with the same ids on one link: the boot time decreases repeatedly."""
+    """Detects two vehicles with the same ids on one link: their boot times alternate."""
 
     def __init__(self) -> None:
         self._begun_ns = 0
         self._count = 0
 
-    def two(self, now_ns: int, ran_back: int) -> bool:
-        """Whether there are two. ran_back: how often the boot time has decreased so far."""
+    def is_duplicate(self, now_ns: int, ran_back: int) -> bool:
+        """Whether it decreased 40 times in 5 s. ran_back: how often it has decreased so far."""
         many = ran_back - self._count >= _TWIN_SWITCHES
         if many or now_ns - self._begun_ns >= _TWIN_WINDOW_NS:
             self._begun_ns, self._count = now_ns, ran_back

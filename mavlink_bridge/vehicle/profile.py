@@ -23,11 +23,12 @@ class FirmwareProfile:
     """How one firmware interprets the injected messages.
 
     covariance: how it turns the message's diagonal into an error (see `covariance_entry`).
-    max_delay_ms: age beyond which a measurement cannot be fused any more.
-    messages: the injection messages that it accepts. odometry_frame: MAV_FRAME that it accepts for
-    positions. least_lag: whether its delay parameter is the smallest lag of the last 100 messages;
-    it then dates the other messages by their timestamps (ArduPilot's AP_HAL JitterCorrection).
-    position_delta: whether it keeps a relative position with VISION_POSITION_DELTA alone.
+    max_delay_ms: age beyond which a measurement cannot be fused any more. messages: the injection
+    messages that it accepts. odometry_frame: MAV_FRAME that it accepts for positions. least_lag:
+    whether its delay parameter is the smallest lag of the last 100 messages; it then dates the
+    other messages by their timestamps (ArduPilot's AP_HAL JitterCorrection). position_delta:
+    whether it keeps a relative position with VISION_POSITION_DELTA alone. known: False for the
+    profile of an unknown firmware.
     """
 
     name: str
@@ -107,7 +108,7 @@ def decode_version(flight_sw_version: int) -> Version:
 
 
 def select_profile(autopilot: str, version: Version | None) -> FirmwareProfile:
-    """The profile of a firmware; `GENERIC` (``known`` is False) for an unknown one."""
+    """The profile of `autopilot_name` and version (None: unknown); `GENERIC` for an unknown one."""
     if autopilot == "ardupilot":
         if version is None or (4, 5, 0) <= version < (4, 8, 0):
             return ARDUPILOT
@@ -118,7 +119,7 @@ def select_profile(autopilot: str, version: Version | None) -> FirmwareProfile:
 
 
 def covariance_entry(error: float, formula: CovarianceFormula) -> float:
-    """Diagonal entry that the firmware reads as the 1-sigma error `error`.
+    """Diagonal entry that the firmware reads as the 1-sigma error `error` (m or rad).
 
     cbrt: ``error = cbrt(3 c^2)`` (ArduPilot 4.5-4.7, GCS_Common.cpp). sqrt: ``error = sqrt(3 c)``
     (pull request 32084). variance: ``c = error^2``, as MAVLink defines it (PX4).

@@ -64,32 +64,31 @@ def gimbal_in_earth_frame(flags: int) -> bool:
 
 
 class Arming:
-    """Armed state by the heartbeats. turns: number of changes between consecutive heartbeats."""
+    """Armed state by the heartbeats. changes: how often consecutive heartbeats differed."""
 
     def __init__(self) -> None:
-        self.turns = 0
-        self._said = self._armed = False
+        self.changes = 0
+        self._flag = self._armed = False
         self._armed_ns = 0  # when it last said so
 
-    def heard(self, said: bool, time_ns: int) -> bool:
+    def update(self, flag: bool, time_ns: int) -> bool:
         """Process a heartbeat's armed flag; returns the state. The state becomes disarmed only
-        after `_DISARMED_NS` without an armed heartbeat, so that a forged heartbeat unlocks nothing
-        in flight.
+        after 3 s without an armed heartbeat, so that a forged heartbeat unlocks nothing in flight.
         """
-        self.turns += said != self._said
-        self._said = said
-        if said:
+        self.changes += flag != self._flag
+        self._flag = flag
+        if flag:
             self._armed_ns = time_ns
-        self._armed = said or (self._armed and time_ns - self._armed_ns < _DISARMED_NS)
+        self._armed = flag or (self._armed and time_ns - self._armed_ns < _DISARMED_NS)
         return self._armed
 
 
 class VehicleReadings:
-    """Newest values and interpolation buffers of the telemetry; the tracker's lock guards it.
+    """Newest values and interpolation buffers of the telemetry; guarded by the tracker's lock.
 
-    globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED position from the origin.
-    gimbal: component and device whose angles are used, 0 for any. impostors: number of messages
-    with the vehicle's ids that state another firmware or vehicle type.
+    globals: the EKF's latitude, longitude (degrees), altitude AMSL. locals: its NED position from
+    the origin. gimbal: component and device whose angles are used, 0 for any. impostors: number of
+    messages with the vehicle's ids that state another firmware or vehicle type.
 
     Above 200 lines: one short method for each of its messages.
     """
@@ -107,16 +106,16 @@ class VehicleReadings:
         self.impostors = 0
         self._ranger: int | None = None  # id of the sensor whose distances count
 
-    def take(self, message: Any, time_ns: int) -> None:
-        """Process one of MESSAGES_IN. Raises ValueError for impossible values."""
+    def update(self, message: Any, time_ns: int) -> None:
+        """Process one of MESSAGES_IN, valid at time_ns. Raises ValueError for impossible values."""
         _HANDLERS[message.get_type()](self, message, time_ns)
 
     def set_origin(self, origin: Origin | None) -> None:
-        """Set the EKF origin."""
+        """Set the EKF origin in the state; None: unknown."""
         self.state = replace(self.state, origin=origin)
 
     def forget(self) -> None:
-        """Drop the origin and all data with time stamps from before a reboot."""
+        """Drop the origin, the version and all samples from before a reboot."""
         for buffer in (
             self.attitudes,
             self.gimbals,
@@ -137,7 +136,7 @@ class VehicleReadings:
             return
         self._check_make(autopilot_name(m.autopilot), time_ns)
         self.heartbeat_ns = time_ns
-        armed = self.arming.heard(bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), time_ns)
+        armed = self.arming.update(bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), time_ns)
         autopilot = autopilot_name(m.autopilot)
         self.state = replace(
             self.state,
@@ -160,9 +159,9 @@ class VehicleReadings:
         self.state = replace(self.state, version=version, profile=name)
 
     def _check_make(self, autopilot: str, time_ns: int) -> None:
-        """What is sent depends on the make: who is heard keeps it, whoever else says another."""
-        heard = self.heartbeat_ns is not None and time_ns - self.heartbeat_ns < _GONE_NS
-        if heard and autopilot != self.state.autopilot:
+        """ValueError for another make of autopilot while the first is heard."""
+        update = self.heartbeat_ns is not None and time_ns - self.heartbeat_ns < _GONE_NS
+        if update and autopilot != self.state.autopilot:
             self.impostors += 1
             raise ValueError(f"{autopilot}: an autopilot of another make")
 
@@ -307,7 +306,7 @@ class VehicleReadings:
 
 
 def boot_time_ns(message: Any) -> int | None:
-    """The sender's boot time in a message; None if it has none."""
+    """The sender's time since boot in a message, ns; None if the message has none."""
     boot_ms = getattr(message, "time_boot_ms", None)
     if boot_ms is not None:
         return int(boot_ms) * 1_000_000
@@ -317,7 +316,7 @@ def boot_time_ns(message: Any) -> int | None:
 
 
 def _known(value: float) -> float | None:
-    """A field's value, None where it is not finite: the estimator does not say."""
+    """The value; None if it is not finite, because the estimator does not know it."""
     return value if math.isfinite(value) else None
 
 

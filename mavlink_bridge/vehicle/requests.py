@@ -15,7 +15,7 @@ _VERSION_EVERY_NS = 1_000_000_000
 
 
 class VehicleRequests:
-    """Sends requests and repeats them; one thread."""
+    """Sends requests and repeats them until they are answered; one thread."""
 
     def __init__(self, config: BridgeConfig, commander: Commander) -> None:
         self.streams = StreamKeeper()
@@ -25,13 +25,13 @@ class VehicleRequests:
         self._next_version_ns = 0
 
     def reset(self) -> None:
-        """The link was opened or the vehicle is back: request everything again."""
+        """Request everything again, because the link was opened or the vehicle is back."""
         self.streams.reset()
         self.mission.reset()
         self._next_version_ns = 0
 
     def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Request what is missing."""
+        """Request the mission, the streams and the version that are missing."""
         self.mission.tick(link, state, now_ns)
         for stream in self.streams.due(wanted_streams(self._config, state.autopilot), now_ns):
             interval_us = round(1e6 / stream.rate_hz)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class VehicleSensorErrors:
-    """One standard deviation along an axis."""
+    """One standard deviation of each sensor, along an axis."""
 
     gnss_m: float = 2.5  # of a receiver that does not say (u-blox CEP in the open)
     gnss_least_m: float = 1.0  # of one that claims less
@@ -21,7 +21,7 @@ class VehicleSensorErrors:
     gyro_drift_radps: float = math.radians(0.25)
 
     def gnss_sigma_m(self, claimed_m: float | None, most_m: float) -> float:
-        """GNSS sigma (m) of a stated accuracy, at most most_m."""
+        """GNSS sigma (m) of a stated accuracy (None: not stated), from 1 m to most_m."""
         said = self.gnss_m if claimed_m is None else claimed_m
         return min(max(said, self.gnss_least_m), most_m)
 

@@ -17,10 +17,10 @@ _OPTIONAL_EVERY = 30  # looks, a minute: an autopilot that boots hears no questi
 
 @dataclass(frozen=True)
 class Stream:
-    """A message to be streamed. optional: the firmware may not have it; it is then requested
-    rarely.
+    """A message to be streamed. optional: the firmware may not have the message; it is then
+    requested rarely.
 
-    unless: not asked for while that message comes.
+    unless: name of a message; while that is streamed, this one is not requested.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Stream:
 
 
 def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
-    """The streams that a configuration needs from a firmware."""
+    """The streams that a configuration needs. autopilot: as `autopilot_name`."""
     estimator = "ESTIMATOR_STATUS" if autopilot == "px4" else "EKF_STATUS_REPORT"
     streams = [
         Stream("ATTITUDE", config.attitude_rate_hz),
@@ -60,7 +60,7 @@ def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
 
 
 class StreamKeeper:
-    """Finds streams that have not started or have stopped."""
+    """Finds streams that have not started or have stopped. counts: messages received, by name."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -69,37 +69,39 @@ class StreamKeeper:
         self._next_ns = 0
 
     def reset(self) -> None:
-        """The flight controller rebooted or the link was reopened."""
+        """Forget all, because the flight controller rebooted or the link was reopened."""
         self._seen_ns.clear()
         self._attempts.clear()
         self._next_ns = 0
 
-    def seen(self, name: str, time_ns: int) -> None:
-        """A message arrived."""
+    def on_message(self, name: str, time_ns: int) -> None:
+        """Count a message of that name."""
         self._seen_ns[name] = time_ns
         self.counts[name] += 1
 
     def due(self, streams: tuple[Stream, ...], now_ns: int) -> list[Stream]:
-        """The streams to request now."""
+        """The streams to request now: at most every 2 s, those silent for 3 s."""
         if now_ns < self._next_ns:
             return []
         self._next_ns = now_ns + _CHECK_EVERY_NS
         return [stream for stream in streams if self._ask(stream, now_ns)]
 
-    def _flows(self, name: str, now_ns: int) -> bool:
+    def _is_streaming(self, name: str, now_ns: int) -> bool:
         return now_ns - self._seen_ns.get(name, -_SILENT_NS) < _SILENT_NS
 
     def _ask(self, stream: Stream, now_ns: int) -> bool:
         attempts = self._attempts.get(stream.name, 0)
-        if self._flows(stream.name, now_ns):
+        if self._is_streaming(stream.name, now_ns):
             # Some stream at a default rate until they are asked once.
             self._attempts[stream.name] = max(attempts, 1)
             return attempts == 0
-        if stream.unless and (self._flows(stream.unless, now_ns) or not self._tried(stream.unless)):
+        if stream.unless and (
+            self._is_streaming(stream.unless, now_ns) or not self._was_requested(stream.unless)
+        ):
             return False
         self._attempts[stream.name] = attempts + 1
         known = not stream.optional or stream.name in self._seen_ns
         return known or attempts < _OPTIONAL_ATTEMPTS or attempts % _OPTIONAL_EVERY == 0
 
-    def _tried(self, name: str) -> bool:
+    def _was_requested(self, name: str) -> bool:
         return self._attempts.get(name, 0) > _OPTIONAL_ATTEMPTS

@@ -42,7 +42,7 @@ class TimeSync:
         self._asking_ns = self._turn_ns = 0
 
     def reset(self) -> None:
-        """The link was opened: ignore answers to earlier requests."""
+        """Ignore answers to earlier requests, because the link was opened."""
         self._next_ns = 0
         self._sent.clear()
 
@@ -58,7 +58,7 @@ class TimeSync:
         return sent_ns is not None and self._tracker.timesync(message.tc1, sent_ns, time_ns)
 
     def tick(self, link: Link, now_ns: int) -> None:
-        """Send the request that is due. Not called without a heartbeat of the vehicle."""
+        """Send the request that is due; called only while the vehicle's heartbeat is received."""
         if now_ns - self._turn_ns > _PERIOD_NS:
             self._asking_ns = now_ns  # after a silence, for which nobody owes an answer
         self._turn_ns = now_ns
@@ -77,6 +77,6 @@ class TimeSync:
             problem = alert(AlertId.TIMESYNC_UNANSWERED) if is_silent else None
             self._notifier.notify("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
 
-    def waiting(self) -> dict[str, int]:
-        """Number of unanswered requests."""
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of unanswered requests, as the length of a queue."""
         return {"timesync": len(self._sent)}

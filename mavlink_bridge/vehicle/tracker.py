@@ -1,4 +1,4 @@
-"""Tracks the vehicle's telemetry on our clock: state, attitude and gimbal, with interpolation."""
+"""Tracks the vehicle's telemetry on CLOCK_MONOTONIC: state, attitude and gimbal, interpolated."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ _OLD_NS = 2_000_000_000
 class VehicleTracker:
     """Processes one vehicle's messages. `handle` runs in the link's thread; other methods in any.
 
+    system_id: of the vehicle, None: the first heard. mount: quaternion, camera to gimbal or body.
     gimbal: component and gimbal_device_id whose angles are used, 0 for any.
     """
 
@@ -51,7 +52,7 @@ class VehicleTracker:
         self.ignored = 0
 
     def snapshot(self, now_ns: int) -> VehicleState:
-        """The state at a time."""
+        """The newest state; `connected` if a heartbeat came in the 3 s before now_ns."""
         with self._lock:
             heartbeat_ns = self._readings.heartbeat_ns
             age_ns = None if heartbeat_ns is None else now_ns - heartbeat_ns
@@ -76,12 +77,12 @@ class VehicleTracker:
             return self._readings.impostors
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a time."""
+        """The vehicle's attitude at a time; None if unknown."""
         with self._lock:
             return self._readings.attitudes.at(time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time: gimbal (or body, if fixed) and mounting."""
+        """The camera's attitude to NED at a time, by gimbal (or body) and mounting; or None."""
         with self._lock:
             body = self._readings.attitudes.at(time_ns)
             sample = None if self._fixed else self._readings.gimbals.at(time_ns)
@@ -106,12 +107,12 @@ class VehicleTracker:
             return self._readings.zooms.at(time_ns, hold_s)
 
     def global_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's (latitude, longitude in degrees, altitude AMSL) at a time."""
+        """The EKF's (latitude, longitude in degrees, altitude AMSL in m) at a time; or None."""
         with self._lock:
             return self._readings.globals.at(time_ns)
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's NED position from its origin at a time."""
+        """The EKF's NED position from its origin at a time, m; None if unknown."""
         with self._lock:
             return self._readings.locals.at(time_ns)
 
@@ -121,12 +122,12 @@ class VehicleTracker:
             return self._readings.inertial.since(time_ns)
 
     def set_origin(self, origin: Origin | None) -> None:
-        """Set the EKF origin."""
+        """Set the EKF origin in the state; None: unknown."""
         with self._lock:
             self._readings.set_origin(origin)
 
     def accepts(self, message: Any) -> bool:
-        """Whether it is from the vehicle's autopilot; the first heartbeat selects it."""
+        """Whether a message is from the vehicle, which the first heartbeat selects."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         state = self._readings.state
         if state.system_id is not None:
@@ -137,14 +138,14 @@ class VehicleTracker:
         return is_autopilot(message) and self._wanted_id in (None, system)
 
     def handle(self, message: Any, received_ns: int) -> bool:
-        """Process one accepted message; True if it shows that the flight controller rebooted."""
+        """Process an accepted message; True if it shows that the flight controller rebooted."""
         rebooted = False
         stamp_ns = received_ns
         boot_ns = boot_time_ns(message)
         if boot_ns is not None and message.get_srcComponent() == self._readings.state.component_id:
             rebooted = self.clock.observe(boot_ns, received_ns)
             stamp_ns = self.clock.to_monotonic(boot_ns, received_ns)
-            if self.clock.doubts:
+            if self.clock.is_stamp_doubtful:
                 stamp_ns = received_ns - 2 * _OLD_NS  # of which time it is, nobody knows
         if rebooted:
             self._forget()
@@ -155,7 +156,7 @@ class VehicleTracker:
                 self.ignored += known
                 return rebooted
             try:
-                self._readings.take(message, stamp_ns)
+                self._readings.update(message, stamp_ns)
             except ValueError:  # no measurement, or no rotation: estimators start up like that
                 self.ignored += 1
         return rebooted
@@ -168,6 +169,6 @@ class VehicleTracker:
         return rebooted
 
     def _forget(self) -> None:
-        """What was dated by the clock before a reboot, and the origin, are void."""
+        """Drop everything that was dated by the clock before a reboot, and the origin."""
         with self._lock:
             self._readings.forget()

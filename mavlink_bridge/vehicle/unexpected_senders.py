@@ -21,7 +21,7 @@ _LIES = 3  # of TIMESYNC, which is asked once a second
 
 
 class UnexpectedSenderMonitor:
-    """Reports each once; one thread."""
+    """Checks for other senders and reports each kind once; one thread."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class UnexpectedSenderMonitor:
         self._lies = (0, 0)  # of TIMESYNC likewise
 
     def on_message(self, link: Link, message: Any) -> None:
-        """Process a message that is not the vehicle's; only heartbeats identify the sender."""
+        """Process a message that is not the vehicle's; only its heartbeats are used."""
         if message.get_type() != "HEARTBEAT" or not link.system_id:
             return
         system, component = message.get_srcSystem(), message.get_srcComponent()
@@ -56,7 +56,7 @@ class UnexpectedSenderMonitor:
             tell("others", alert(AlertId.AUTOPILOT_IGNORED, system=system, used=used))
 
     def check(self, link: Link, now_ns: int) -> None:
-        """Detect other hosts, and two vehicles with the same ids."""
+        """Detect other hosts and gimbals, false clocks, forged arming, duplicate ids."""
         if link.stranger:
             ignored = alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
             self._notifier.notify("foreign", ignored)
@@ -68,7 +68,7 @@ class UnexpectedSenderMonitor:
         self._check_arming(link, now_ns)
         clock = self._tracker.clock
         self._check_answers(clock.contradictions, now_ns)
-        ran_back = self._twins.two(now_ns, clock.strays + clock.reboots)
+        ran_back = self._twins.is_duplicate(now_ns, clock.strays + clock.reboots)
         if ran_back or self._tracker.impostors:
             twins = alert(AlertId.DUPLICATE_SYSTEM_ID, system=link.system_id)
             self._notifier.notify("twins", twins)
@@ -84,7 +84,7 @@ class UnexpectedSenderMonitor:
     def _check_arming(self, link: Link, now_ns: int) -> None:
         """Heartbeats that alternate between armed and disarmed are forged."""
         turns, since_ns = self._turns
-        now = self._tracker.arming.turns
+        now = self._tracker.arming.changes
         if now - turns >= _TURNS:
             forged = alert(AlertId.ARMING_ALTERNATES, system=link.system_id)
             self._notifier.notify("arming", forged)

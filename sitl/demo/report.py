@@ -15,7 +15,7 @@ from rich.table import Table
 from companion.config import CompanionConfig, load_config
 from companion.errors import ReportError
 from companion.offline.tables import Columns, read_columns
-from companion.reporting.verdicts import advice, compared
+from companion.reporting.verdicts import advice, value_and_limit
 from companion.versions import made_by
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
@@ -266,7 +266,7 @@ def _verdict(report: FlightReport) -> Table:
     for column in ("criterion", "found", "needed", ""):
         table.add_column(column, justify="left" if column in ("criterion", "") else "right")
     for c in report.criteria:
-        value, needed = compared(c.value, c.limit, c.unit, at_least=c.at_least)
+        value, needed = value_and_limit(c.value, c.limit, c.unit, at_least=c.at_least)
         mark = "[green]ok" if c.ok else "[red]missed"
         table.add_row(c.name, value, needed, mark)
     return table

@@ -11,7 +11,7 @@ import numpy as np
 from companion.errors import MissionFileError
 from companion.planning import mission as saved
 from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
-from companion.preflight.coverage import covered
+from companion.preflight.coverage import is_covered
 from companion.settings_file import SettingsError, validated
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.cache.cache import TileCache
@@ -85,7 +85,7 @@ def read_mission(path: Path) -> PlannedMission:
 def _require_covered(cache: TileCache, home: LocalFrame, scenario: Scenario) -> None:
     map_from_home = cache.frame.ecef_from_enu.inverse @ home.ecef_from_enu
     corners = [(leg.east_m, leg.north_m, 0.0) for leg in scenario.legs]
-    inside = covered(cache, map_from_home.apply(np.array(corners))[:, :2])
+    inside = is_covered(cache, map_from_home.apply(np.array(corners))[:, :2])
     if not inside.all():
         beside = ", ".join(str(k + 1) for k in np.flatnonzero(~inside))
         raise ScenarioError(f"waypoints {beside} are not over the map {cache.path}")

@@ -15,7 +15,7 @@ import pytest
 
 from companion.config import PriorConfig, RecordConfig, TargetConfig
 from companion.conversions import CameraExtrinsics
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.flight.last_fix import FixMemory
 from companion.flight.recorder import RecordKeeper
 from companion.supervision.pulse import Pulse
@@ -60,12 +60,12 @@ def ends(stop: Callable[[], Any]) -> bool:
 def test_a_thread_that_hangs_is_named_and_one_that_ends_is_not(hang, caplog, monkeypatch):
     hanging = threading.Thread(target=lambda: hang.over.wait(120.0), name="stuck", daemon=True)
     hanging.start()
-    assert not joined(hanging)
+    assert not wait_for_end(hanging)
     assert "the thread stuck does not end" in caplog.text
     caplog.clear()
     hang.over.set()
     monkeypatch.setattr("companion.ending._PATIENCE_S", 60.0)
-    assert joined(hanging)
+    assert wait_for_end(hanging)
     assert not caplog.text
 
 

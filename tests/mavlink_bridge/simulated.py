@@ -231,10 +231,10 @@ class Flight:
         for decoded in self.reader.feed(self.mangle(frame)):
             self.end.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]
 
-    def waiting(self) -> dict[str, int]:
+    def queue_lengths(self) -> dict[str, int]:
         """Lengths of everything that could grow."""
         return {
-            **self.end.waiting(),
+            **self.end.queue_lengths(),
             "bytes": self.reader.waiting,
             "sequences": self.reader.sources,
         }

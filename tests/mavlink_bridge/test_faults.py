@@ -42,7 +42,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     flight.north_m, flight.ekf_north_m, flight.reset_count = 25.0, 25.0, 1
     flight.run(200.0)
     lost_ns = flight.now_ns
-    assert max(flight.waiting().values()) <= 256
+    assert max(flight.queue_lengths().values()) <= 256
     flight.link.open = True
     flight.run(10.0)
     after = flight.vision(lost_ns)
@@ -55,7 +55,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     assert flight.end.counters["reboots"] == 0
     # Only what is fresh: nothing that waited during the loss.
     assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
-    assert max(flight.waiting().values()) <= 256
+    assert max(flight.queue_lengths().values()) <= 256
     flight.reboot()
     flight.run(10.0)
     assert not flight.told(AlertId.TIMESYNC_UNANSWERED)  # a link that was gone owes no answers
@@ -263,7 +263,7 @@ def test_damaged_frames_on_the_flight_controllers_link(monkeypatch, seed):
     assert not flight.told(AlertId.DUPLICATE_SYSTEM_ID)
     assert {m.reset_counter for _, m in flight.vision()} == {0}
     assert len(flight.vision(flight.now_ns - 60 * SECOND)) > 550
-    assert max(flight.waiting().values()) < 1024
+    assert max(flight.queue_lengths().values()) < 1024
 
 
 def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
@@ -297,7 +297,7 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight,
         if i % 40 == 0:
             flight.run(0.05)
             ground.on_tick(link, flight.now_ns)  # type: ignore[arg-type]
-    assert max(flight.waiting().values()) < 1024
+    assert max(flight.queue_lengths().values()) < 1024
     # Even a lying autopilot is believed again once it speaks the truth.
     flight.reboot()
     flight.run(30.0)
@@ -390,7 +390,7 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
     """A hundred targets at once, and a ground station that orders without end."""
     for i in range(100):
         report = TargetReport(flight.now_ns, *HOME, 500.0, target_id=i, pixel=(0.5, 0.5))
-        flight.end.components.show(report)
+        flight.end.components.queue_item(report)
     told: dict[int, int] = {}
     begun_ns = flight.now_ns
     flight.run(1.0)
@@ -457,9 +457,9 @@ def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int
 
 def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> None:
     hour = 3600 * SECOND
-    flight.end.components.show(TargetReport(flight.now_ns + hour, *HOME, 500.0))
+    flight.end.components.queue_item(TargetReport(flight.now_ns + hour, *HOME, 500.0))
     flight.run(1.0)
-    assert flight.waiting()["targets"] == 0
+    assert flight.queue_lengths()["targets"] == 0
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
 
 

@@ -107,7 +107,7 @@ def test_the_aircraft_is_sent_once_a_second_and_only_where_it_is_wanted():
         ):
             cot = CursorOnTarget(config, CAMERA, UTC)
             for k in range(15):  # three seconds at 5 Hz
-                cot.look(view(time_ns=SECOND + k * SECOND // 5))
+                cot.report_view(view(time_ns=SECOND + k * SECOND // 5))
             cot.send(TargetReport(SECOND, 47.0, 8.0, 450.0, target_id=3))
             cot.close()
             got = [etree.fromstring(listener.recv(65536)).get("uid") for _ in range(expected + 1)]
@@ -214,7 +214,7 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
         assert sleep_until(lambda: bool(station.listen()), 30.0)  # its link knows whose it is
         bridge.report_alert(alert(AlertId.FC_LOST))
         bridge.report_alert(alert(AlertId.FC_BACK))
-        bridge.tell_figures({"VPS_SIGNAL": 2.0, "VPS_AGE": 0.25})
+        bridge.send_named_values({"VPS_SIGNAL": 2.0, "VPS_AGE": 0.25})
 
         def figures():
             named = [m for m in station.listen() if m.get_type() == "NAMED_VALUE_FLOAT"]
@@ -224,7 +224,7 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
         assert figures() == {("VPS_SIGNAL", 191): 2.0, ("VPS_AGE", 191): 0.25}
         assert station.shown() == ([text(alert(AlertId.FC_LOST))] if as_autopilot else [])
         with pytest.raises(ValueError, match="10 characters"):
-            bridge.tell_figures({"VPS_SIGNALS": 1.0})
+            bridge.send_named_values({"VPS_SIGNALS": 1.0})
     station.socket.close()
 
 

@@ -250,7 +250,7 @@ def test_a_flood_is_told_in_a_few_lines_and_nothing_grows(monkeypatch, attack, m
         if turn % 5 == 0:
             flight.run(0.07)
     assert len(told(flight)) <= most, told(flight)
-    assert max(flight.waiting().values()) <= 256
+    assert max(flight.queue_lengths().values()) <= 256
     assert len(flight.shared.tracker.other_gimbals) <= 8
 
 
@@ -311,7 +311,7 @@ def test_what_asks_for_an_answer_without_end_gets_few(flight: Flight, attack: At
     for turn in range(300):
         attack(flight, turn)
     assert len(flight.link.sent) - before <= 5
-    assert max(flight.waiting().values()) <= 100
+    assert max(flight.queue_lengths().values()) <= 100
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def test_a_signed_stamp_of_another_age_does_not_run_ours_over(stamp: int) -> Non
 
 def test_a_click_never_has_a_detected_targets_number() -> None:
     numbers, clicks = TargetNumbers(), clicked_numbers()
-    detected = {numbers.of(f"car {n}") for n in range(1500)}
+    detected = {numbers.number_of(f"car {n}") for n in range(1500)}
     assert detected.isdisjoint(next(clicks) for _ in range(3000))
 
 
@@ -359,7 +359,7 @@ def test_a_gate_that_chatters_ends_as_the_channel_stands(monkeypatch: pytest.Mon
     enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
     for turn in range(101):
         pulses = [0, 65535, 1, 1900][turn % 4]
-        enable.channels([pulses] * 18)
+        enable.on_rc_channels([pulses] * 18)
         enable.command(mavlink.MAV_CMD_USER_1, (math.nan, math.inf, 0.5, -1.0)[turn % 4])
     assert enable.open
 

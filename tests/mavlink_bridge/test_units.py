@@ -198,7 +198,7 @@ def test_what_is_read_is_in_the_units_of_the_definition() -> None:
 def test_old_gimbal_angles_are_in_the_units_of_the_definition(name, angles):
     readings = VehicleReadings()
     for message, time_ns in sent(name, dict(zip(angles, (-45.0, 5.0, 30.0), strict=True))):
-        readings.take(message, time_ns)
+        readings.update(message, time_ns)
     sample = readings.gimbals.at(1001 * 10**6)
     assert sample is not None
     roll, pitch, yaw = np.degrees(quat.to_euler(sample.quaternion))

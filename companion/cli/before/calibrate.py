@@ -36,8 +36,8 @@ def flight_command(
     from companion.calibrate.flight import calibrate
     from companion.calibrate.proposal import (
         blind_spots,
-        changes,
         require_flown_with,
+        setting_changes,
         write_changed,
     )
     from companion.offline.record import load_record
@@ -48,14 +48,14 @@ def flight_command(
     loaded = load_record(record, 0.0, tlog, map_cache)
     with show_count(Console(stderr=True), "pictures") as count:
         found = calibrate(loaded, frames, count)
-    wanted = changes(loaded.config, found)
+    wanted = setting_changes(loaded.config, found)
     console = Console()
     console.print(_numbers(found))
     blind = blind_spots(found)
     console.print("What this flight cannot tell:" if blind else "This flight tells all of it.")
     for line in blind:
         console.print(f"  {escape(line)}", soft_wrap=True, highlight=False)
-    doubt = loaded.tables.flown.doubt(TileCache.open(loaded.config.map))
+    doubt = loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map))
     for note in (*found.notes, *filter(None, (doubt,))):
         console.print(escape(note), style="yellow", soft_wrap=True)
     console.print(

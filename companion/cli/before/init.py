@@ -66,12 +66,12 @@ def init_command(
     if out.exists() and not overwrite:
         raise ConfigError(f"{out}: is there already; --overwrite replaces it")
     notes: list[str] = []
-    settings = _map_settings(map_cache or _asked_map(), notes)
-    feed = source or _asked("video source", "--source", "udp://0.0.0.0:5600")
-    wire = connection or _asked("autopilot", "--connection", "serial:/dev/ttyTHS1:921600")
-    mounted = mount or _asked("camera mount (gimbal, fixed)", "--mount", "gimbal")
+    settings = _map_settings(map_cache or _ask_map(), notes)
+    feed = source or _ask("video source", "--source", "udp://0.0.0.0:5600")
+    wire = connection or _ask("autopilot", "--connection", "serial:/dev/ttyTHS1:921600")
+    mounted = mount or _ask("camera mount (gimbal, fixed)", "--mount", "gimbal")
     if camera is None and fov is None:
-        fov = _asked("horizontal field of view, degrees", "--camera or --fov", _DEFAULT_FOV_DEG)
+        fov = _ask("horizontal field of view, degrees", "--camera or --fov", _DEFAULT_FOV_DEG)
     size = None
     if listen:
         with show_work(Console(stderr=True), f"waiting for a picture of {redacted(feed)}"):
@@ -97,8 +97,8 @@ def init_command(
     )
 
 
-def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
-    """The operator's answer; ConfigError without a terminal."""
+def _ask(what: str, option: str, default: _Answer | None = None) -> _Answer:
+    """Ask the operator for `what`; ConfigError without a terminal, which names the option."""
     try:
         answer: _Answer = typer.prompt(what, default=default)
     except typer.Abort as error:
@@ -109,8 +109,8 @@ def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
     return answer
 
 
-def _asked_map() -> Path | None:
-    """The operator's answer; None if there is no map yet, or no terminal."""
+def _ask_map() -> Path | None:
+    """Ask for the map's folder; None if there is no map yet, or no terminal."""
     try:
         answer = typer.prompt("map: folder of the tile cache (Enter: none yet)", default="",
                               show_default=False)  # fmt: skip
@@ -128,7 +128,7 @@ def _map_settings(cache: Path | None, notes: list[str]) -> dict[str, Any]:
     """
     place = cache or _NO_MAP
     if cache is not None and cache.exists():
-        return {"map": str(place.resolve()), "map_sha256": _pinned(cache)}
+        return {"map": str(place.resolve()), "map_sha256": _map_hash(cache)}
     notes.append(
         f"NO MAP YET, nothing flies without one: {place} is not there; `companion map fetch` or "
         f"`companion map build` --out {place}, then map_sha256 from `companion map verify {place}`"
@@ -136,8 +136,8 @@ def _map_settings(cache: Path | None, notes: list[str]) -> dict[str, Any]:
     return {"map": str(place.resolve())}
 
 
-def _pinned(map_cache: Path) -> str:
-    """The map's hash; MapCacheError where there is none."""
+def _map_hash(map_cache: Path) -> str:
+    """Hash of the map; MapCacheError if there is no map."""
     from companion.preflight.map_pin import map_hash
     from localizer.map.cache.cache import TileCache
 
@@ -179,11 +179,11 @@ def _model(
 
 
 def _with_vehicle(config: CompanionConfig, notes: list[str]) -> CompanionConfig:
-    """With the system id of the autopilot that answers."""
-    from mavlink_bridge.preflight.client import meet
+    """The settings with the system id of the autopilot that answers; notes, if none does."""
+    from mavlink_bridge.preflight.client import detect_autopilot
 
     try:
-        met = meet(config.bridge)
+        met = detect_autopilot(config.bridge)
     except BridgeError as error:
         notes.append(f"no vehicle was heard ({error})")
         return config

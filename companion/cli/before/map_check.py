@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.terminal.steps import show_work
-from companion.writing import made_folder
+from companion.writing import make_folder
 
 _SPEED_M_S = 10.0
 _COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
@@ -49,7 +49,7 @@ def check_command(
         camera = working_camera(deployment.camera.model.camera(), deployment.localizer.width)
         pixel_rad, half_view_deg = 1 / camera.fx, camera.horizontal_fov_deg / 2
     opened = TileCache.open(cache)
-    made_folder(out, "--out")
+    make_folder(out, "--out")
     with show_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
         made = check_map(opened, MapUse(height, pixel_rad, half_view_deg))
     for name, rgb in made.pictures.items():

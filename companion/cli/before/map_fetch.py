@@ -39,7 +39,7 @@ HeightProperty = Annotated[
 
 @dataclass(frozen=True)
 class _Part:
-    """One of the two rasters."""
+    """One of the two rasters (imagery or heights) with its download."""
 
     source: CatalogueSource
     plan: FetchPlan
@@ -125,7 +125,7 @@ def fetch_command(
     for part in parts:
         _fetched(console, part, area)
     if buildings is not None:
-        parts[1] = _raised(console, parts[1], buildings)
+        parts[1] = _raise_buildings(console, parts[1], buildings)
     _built(console, parts, out, overwrite, workers)
     if not keep:
         shutil.rmtree(work, ignore_errors=True)
@@ -165,7 +165,7 @@ def sources_command(
 
 
 def _print_source(console: Console, source: CatalogueSource) -> None:
-    """Print the name first and uncut, so that it can be copied; long lines continue below."""
+    """Print a source. The name comes first and uncut, to be copied; long lines continue below."""
     head = f"{source.name}  ({source.country}, {source.role}, {source.resolution_m:g} m)"
     console.print(head, style="bold", markup=False, highlight=False, soft_wrap=True)
     for what, text in (
@@ -257,7 +257,7 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
     from localizer.map.fetch.fetch import fetch
 
     what = f"fetching {part.source.name}"
-    with _told_count(what) as progress:
+    with _counted_text(what) as progress:
         known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
     console.print(
         f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
@@ -267,7 +267,7 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
 
 
 @contextmanager
-def _told_count(what: str) -> Iterator[Callable[[int, int], None]]:
+def _counted_text(what: str) -> Iterator[Callable[[int, int], None]]:
     try:
         with show_count(Console(stderr=True), what) as progress:
             yield progress
@@ -276,8 +276,8 @@ def _told_count(what: str) -> Iterator[Callable[[int, int], None]]:
         raise
 
 
-def _raised(console: Console, part: _Part, footprints: Footprints) -> _Part:
-    """The terrain with buildings, and the source with its attribution."""
+def _raise_buildings(console: Console, part: _Part, footprints: Footprints) -> _Part:
+    """The terrain with buildings raised on it, as a source with both attributions."""
     from localizer.map.footprints.raise_buildings import raise_buildings
 
     out = part.out.with_name("raised.tif")

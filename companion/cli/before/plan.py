@@ -16,7 +16,7 @@ from rich.table import Table
 
 from companion.config import load_config
 from companion.terminal.steps import show_count, show_work
-from companion.writing import made_folder
+from companion.writing import make_folder
 
 
 def plan_command(
@@ -70,7 +70,7 @@ def plan_command(
     planned = read_mission(mission)
     cache = TileCache.open(map_cache or deployment.map)
     frames = None if flown is None else check.recorded_frames(flown, cache)
-    made_folder(out, "--out")
+    make_folder(out, "--out")
     question = replace(
         Question(mission, conditions, MissionLimits(sigma)),
         spacing_m=spacing, speed_m_s=speed, pitch_deg=pitch, seek=alternatives,

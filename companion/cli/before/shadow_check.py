@@ -70,7 +70,7 @@ def shadow_check_command(
         else:
             deployment = told.model_copy(update={"map": map_cache})
         playing = show_count(console, "playing the flight, s", begins=COMPILES)
-        with playing as count, _quiet("mavlink_bridge.status"):
+        with playing as count, _without_warnings("mavlink_bridge.status"):
             found = shadow_check(
                 flight, video, deployment, rate_hz, lambda s, total: count(round(s), round(total))
             )
@@ -83,8 +83,8 @@ def shadow_check_command(
 
 
 @contextmanager
-def _quiet(name: str) -> Iterator[None]:
-    """Without that logger's warnings: what the operator is told stands in the table."""
+def _without_warnings(name: str) -> Iterator[None]:
+    """Suppress a logger's warnings, because the table holds what the operator is told."""
     logger = logging.getLogger(name)
     before = logger.level
     logger.setLevel(logging.ERROR)

@@ -14,7 +14,7 @@ from rich.markup import escape
 from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, show_steps
-from companion.writing import made_folder, refuse_input
+from companion.writing import make_folder, refuse_input
 
 if TYPE_CHECKING:
     from companion.recorded.flight import RecordedFlight
@@ -55,22 +55,22 @@ def try_command(
 
     for name in ("report.html", "trial.json", "frames.csv", "deployment.yaml"):
         refuse_input(report / name, "--report", footage, places, log, camera)
-    made_folder(report, "--report")
+    make_folder(report, "--report")
     refuse_edited(report / "deployment.yaml")
     console = Console(stderr=True)
     options = FootageOptions(report, frames, places, log, camera, fov, mount_pitch)
     with show_count(console, "reading footage") as count:
         flight = read_footage(footage, options, count)
     if map_cache is None:
-        _tell_map(flight)
+        _print_map(flight)
         raise typer.Exit(1)
     _try(flight, map_cache, report, width, searches)
 
 
-def _tell_map(flight: RecordedFlight) -> None:
-    from companion.trial.wanted_map import flat_ground, wanted_map
+def _print_map(flight: RecordedFlight) -> None:
+    from companion.trial.wanted_map import flat_map_advice, wanted_map
 
-    _tell_notes(flight, flight.notes)
+    _print_notes(flight, flight.notes)
     wanted = wanted_map(flight)
     out = Console()
     out.print(
@@ -78,12 +78,12 @@ def _tell_map(flight: RecordedFlight) -> None:
         f"{wanted.sentence}.",
         soft_wrap=True, highlight=False,
     )  # fmt: skip
-    for line in (f"Where open data exist: {wanted.command('area')}", flat_ground(flight)):
+    for line in (f"Where open data exist: {wanted.command('area')}", flat_map_advice(flight)):
         if line:
             out.print(line, soft_wrap=True, highlight=False)
 
 
-def _tell_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
+def _print_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
     for note in (f"camera by {flight.camera.source}", *notes):
         Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
 
@@ -91,7 +91,7 @@ def _tell_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
 def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, searches: int) -> None:
     from companion.trial.deployment import write_trial_deployment
     from companion.trial.page import write_trial
-    from companion.trial.result import judge
+    from companion.trial.result import trial_verdict
     from companion.trial.run import TrialOptions, run_trial
     from localizer.map.cache.cache import TileCache
 
@@ -102,8 +102,8 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
         return show_count(console, what, begins=COMPILES if what == "localizing" else "begun")
 
     trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
-    judgement = judge(trial)
-    _tell_notes(flight, trial.notes)
+    judgement = trial_verdict(trial)
+    _print_notes(flight, trial.notes)
     with show_steps(console) as say:
         page = write_trial(report, trial, judgement, map_cache, say)
     deployment = write_trial_deployment(report / "deployment.yaml", trial, map_cache)

@@ -1,4 +1,4 @@
-"""What a YOLO network's output says: boxes, by the three layouts in which such networks come.
+"""Decodes a YOLO network's output to boxes, by the three layouts in which such networks come.
 
 | layout | shape | a row |
 |---|---|---|
@@ -26,7 +26,7 @@ _MOST = 64  # boxes of a picture
 
 @dataclass(frozen=True)
 class Box:
-    """A detected object. left to bottom: pixels of the network's input."""
+    """A detected object. left to bottom: pixels of the network's input; label: class number."""
 
     left: float
     top: float
@@ -66,7 +66,7 @@ def layout_of(
 
 
 def decode(output: NDArray[np.float32], layout: Layout, threshold: float) -> list[Box]:
-    """Boxes with at least that score, best first, after non-maximum suppression."""
+    """Boxes of at least the score `threshold`, best first, after non-maximum suppression."""
     rows = output[0].T if layout == "v8" else output[0]
     if layout == "end2end":
         corners, scores, labels = rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64)

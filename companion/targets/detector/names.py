@@ -23,7 +23,7 @@ _FAR = 1e6
 
 @dataclass(frozen=True)
 class LocatedBox:
-    """A box on the ground. label: its class; place: (3,) m, world axes."""
+    """A box on the ground. label: name of its class; place: (3,) m, world axes."""
 
     label: str
     place: Array
@@ -39,7 +39,7 @@ class _Thing:
     sightings: int = 1
 
     def cost(self, sight: LocatedBox, time_ns: int) -> float:
-        """Metres beside where it should be over what is allowed; above 1: it is another."""
+        """Distance from the expected position over the allowed one; above 1: another object."""
         if sight.label != self.label:
             return _FAR
         dt = (time_ns - self.time_ns) * 1e-9
@@ -50,8 +50,8 @@ class _Thing:
             reach = _NEAR_M + _CHANGES_MPS2 * dt * max(dt, 1.0)
         return float(np.linalg.norm((sight.place - expected)[:2])) / reach
 
-    def seen(self, sight: LocatedBox, time_ns: int) -> None:
-        """Take over a new place."""
+    def update(self, sight: LocatedBox, time_ns: int) -> None:
+        """Update position and velocity with a box of this object."""
         dt = max((time_ns - self.time_ns) * 1e-9, 1e-3)
         fresh = (sight.place - self.place) / dt
         old = self.velocity
@@ -61,15 +61,15 @@ class _Thing:
 
 
 class ObjectNames:
-    """Gives each detected object a name: ``car 1``, ``car 2``. Not thread-safe."""
+    """Names each object, over all frames: ``car 1``, ``car 2``. Not thread-safe."""
 
     def __init__(self) -> None:
         self._things: list[_Thing] = []
         self._count: dict[str, int] = {}
 
     def name(self, sights: list[LocatedBox], time_ns: int) -> list[str | None]:
-        """A name for each box of one frame; None for an object seen for the first time, which may
-        be a false detection.
+        """A name for each box of the frame exposed at time_ns; None for an object seen for the
+        first time, which may be a false detection.
         """
         self._things = [t for t in self._things if time_ns - t.time_ns <= _KEPT_NS]
         names: list[str | None] = [None] * len(sights)
@@ -80,7 +80,7 @@ class ObjectNames:
                 if costs[row, column] > 1.0:
                     continue
                 thing = self._things[row]
-                thing.seen(sights[column], time_ns)
+                thing.update(sights[column], time_ns)
                 taken.add(int(column))
                 names[column] = thing.name if thing.sightings >= _SEEN else None
         for k, sight in enumerate(sights):

@@ -22,7 +22,7 @@ _PADDING = 114  # grey, as these networks are trained
 
 
 class DetectorNetwork:
-    """Loads a model and runs it. Not thread-safe. Raises `DetectorError`."""
+    """Loads a model and runs it. Not thread-safe. `DetectorError`. labels: name of each class."""
 
     def __init__(self, config: DetectorConfig) -> None:
         self._threshold = config.threshold
@@ -61,14 +61,14 @@ class DetectorNetwork:
         ]
 
     def name_of(self, label: int) -> str:
-        """The network's name of a class."""
+        """The network's name of the class with that number; "class N" if unknown."""
         return self.labels.get(label, f"class {label}")
 
     def _run(self, blob: Float32) -> Float32:
         return np.asarray(self._session.run(None, {self._input: blob})[0], dtype=np.float32)
 
     def _find_layout(self, config: DetectorConfig) -> Layout:
-        """By a picture of nothing: a network's shapes may be symbols until it has run."""
+        """Found by running a black image: a network's shapes may be symbols until it has run."""
         try:
             shape = self._run(np.zeros((1, 3, *self._size[::-1]), np.float32)).shape
         except Exception as error:  # onnxruntime has many of its own
@@ -91,7 +91,7 @@ def _session(model: Path, options: ort.SessionOptions) -> ort.InferenceSession:
 
 
 def _labels(config: DetectorConfig, session: ort.InferenceSession) -> dict[int, str]:
-    """Names by class: the deployment's, else those that Ultralytics' exporter writes."""
+    """Names by class number: the deployment's, else those that Ultralytics' exporter writes."""
     if config.labels:
         return dict(enumerate(config.labels))
     told = session.get_modelmeta().custom_metadata_map.get("names", "")
@@ -108,7 +108,7 @@ def _is_name(label: str) -> bool:
 
 
 def _wanted(config: DetectorConfig, labels: dict[int, str]) -> frozenset[int] | None:
-    """The classes that are reported; None: all."""
+    """Numbers of the classes that are reported; None: all."""
     if not config.classes:
         return None
     unknown = [name for name in config.classes if name not in labels.values()]
@@ -122,7 +122,7 @@ def _wanted(config: DetectorConfig, labels: dict[int, str]) -> frozenset[int] | 
 
 
 def _letterboxed(image: Image, size: tuple[int, int]) -> tuple[Float32, float, tuple[float, float]]:
-    """The picture in the middle of the network's, (1, 3, H, W) in 0 to 1; its scale and corner."""
+    """The image scaled into the network's, (1, 3, H, W) in 0 to 1; scale and left, top, pixels."""
     h, w = image.shape[:2]
     scale = min(size[0] / w, size[1] / h)
     new = (max(round(w * scale), 1), max(round(h * scale), 1))

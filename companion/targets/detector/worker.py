@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.config import DetectorConfig
-from companion.ending import joined
+from companion.ending import wait_for_end
 from companion.targets.detections import DETECTED, Detection
 from companion.targets.detector.boxes import Box
 from companion.targets.detector.names import LocatedBox, ObjectNames
@@ -37,9 +37,10 @@ _MOST_AWAY_M = 5000.0
 class BoxDetector:
     """Detects objects in the camera's frames and passes them on as detections.
 
-    on_detection: takes each detection; must not block. report: reports an alert to the operator. A
-    model that cannot be loaded, or fails three times in a row, ends the detector; the flight
-    continues. looked, seen, failed: numbers of frames, boxes and errors.
+    cast: intersects rays with the map. on_detection: receives each detection; must not block.
+    report: sends an alert to the operator. A model that cannot be loaded, or fails three times in a
+    row, ends the detector; the flight continues. looked, seen, failed: numbers of frames, boxes and
+    errors.
     """
 
     def __init__(
@@ -72,15 +73,15 @@ class BoxDetector:
         self._stopping.set()
         with self._condition:
             self._condition.notify()
-        joined(self._thread)
+        wait_for_end(self._thread)
 
     def add_frame(self, frame: Frame) -> None:
-        """Offer a frame. Never blocks."""
+        """Keep a frame until its estimate arrives. Never blocks."""
         with self._condition:
             self._frames.append(frame)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Offer a pose; only accepted ones count. Never blocks."""
+        """Add a frame's pose; only accepted ones are used. Never blocks."""
         if estimate.accepted:
             with self._condition:
                 self._estimates.append(estimate)
@@ -99,7 +100,7 @@ class BoxDetector:
                 continue
             begun = time.monotonic()
             try:
-                self._look(network, *pair)
+                self._process(network, *pair)
                 self._in_a_row = 0
             except Exception as error:
                 self.failed += 1
@@ -121,7 +122,7 @@ class BoxDetector:
         self._report(alert(AlertId.DETECTOR_OFF))
 
     def _newest_pair(self) -> tuple[Frame, PoseEstimate] | None:
-        """The newest picture with its pose that was not looked at yet; waits for half a second."""
+        """Newest unprocessed frame with its pose; None after waiting half a second."""
         with self._condition:
             pair = self._pair()
             if pair is None:
@@ -138,12 +139,12 @@ class BoxDetector:
                     return frame, estimate
         return None
 
-    def _look(self, network: DetectorNetwork, frame: Frame, estimate: PoseEstimate) -> None:
+    def _process(self, network: DetectorNetwork, frame: Frame, estimate: PoseEstimate) -> None:
         self._looked_ns = estimate.exposure_time_ns
         boxes = network.detect(frame.image)
         self.looked += 1
         placed = [
-            (box, place) for box in boxes if (place := self._place(box, estimate)) is not None
+            (box, place) for box in boxes if (place := self._locate(box, estimate)) is not None
         ]
         sights = [LocatedBox(network.name_of(box.label), place) for box, place in placed]
         names = self._names.name(sights, estimate.exposure_time_ns)
@@ -154,7 +155,7 @@ class BoxDetector:
                 told = Detection(f"{DETECTED}{name}", estimate.exposure_time_ns, u, v)
                 self._on_detection(told)
 
-    def _place(self, box: Box, estimate: PoseEstimate) -> np.ndarray | None:
+    def _locate(self, box: Box, estimate: PoseEstimate) -> np.ndarray | None:
         u, v = _middle(box)
         if not (0.0 <= u <= estimate.camera.width and 0.0 <= v <= estimate.camera.height):
             return None

@@ -65,8 +65,8 @@ def taken() -> BoardViews:
     views = BoardViews(TRUE.width, TRUE.height)
     for place, tilt in POSES:
         picture = shown(TRUE, place, tilt)
-        views.take(picture)
-        views.take(picture)  # held still
+        views.add_image(picture)
+        views.add_image(picture)  # held still
     return views
 
 
@@ -85,7 +85,7 @@ def test_the_lens_is_found_within_its_sigmas(taken: BoardViews):
 def test_what_is_missing_is_said_and_nothing_at_the_end(taken: BoardViews):
     few = BoardViews(TRUE.width, TRUE.height)
     for _ in range(2):
-        few.take(shown(TRUE, (0, 0, 13), (0, 0)))
+        few.add_image(shown(TRUE, (0, 0, 13), (0, 0)))
     told = " ".join(few.missing())
     assert "turned left" in told
     assert "top, left edge" in told
@@ -95,11 +95,11 @@ def test_what_is_missing_is_said_and_nothing_at_the_end(taken: BoardViews):
 
 def test_a_board_that_moves_or_was_seen_is_not_taken():
     views = BoardViews(TRUE.width, TRUE.height)
-    assert views.take(np.full((480, 640, 3), 90, np.uint8)).startswith("no board")
-    assert views.take(shown(TRUE, (0, 0, 13), (0, 0))) == "hold it still"
-    assert views.take(shown(TRUE, (0.4, 0, 13), (0, 0))) == "hold it still"
-    assert views.take(shown(TRUE, (0.4, 0, 13), (0, 0))) == "taken"
-    assert views.take(shown(TRUE, (0.4, 0, 13), (0, 0))).startswith("like one")
+    assert views.add_image(np.full((480, 640, 3), 90, np.uint8)).startswith("no board")
+    assert views.add_image(shown(TRUE, (0, 0, 13), (0, 0))) == "hold it still"
+    assert views.add_image(shown(TRUE, (0.4, 0, 13), (0, 0))) == "hold it still"
+    assert views.add_image(shown(TRUE, (0.4, 0, 13), (0, 0))) == "taken"
+    assert views.add_image(shown(TRUE, (0.4, 0, 13), (0, 0))).startswith("like one")
     with pytest.raises(RecordError, match="1 usable views"):
         solve_lens(views.views, 640, 480)
 

@@ -16,10 +16,10 @@ from companion.calibrate.flight import CalibrationResult
 from companion.calibrate.pictures import Parts
 from companion.calibrate.proposal import (
     SettingChange,
+    apply_changes,
     blind_spots,
-    changed,
-    changes,
     require_flown_with,
+    setting_changes,
     write_changed,
 )
 from companion.calibrate.solve import solve
@@ -134,7 +134,7 @@ def deployment(folder: Path) -> Path:
 def test_the_deployment_is_changed_and_the_old_one_kept(rich: CalibrationResult, tmp_path: Path):
     path = deployment(tmp_path)
     before = path.read_text()
-    wanted = changes(load_config(path), rich)
+    wanted = setting_changes(load_config(path), rich)
     kept = write_changed(path, wanted, "calibrated")
     assert kept.read_text() == before
     after = load_config(path)
@@ -143,7 +143,7 @@ def test_the_deployment_is_changed_and_the_old_one_kept(rich: CalibrationResult,
     assert after.bridge.camera.mount_pitch_deg == pytest.approx(-1.5, abs=0.2)
     assert after.camera.calibrated is not None
     dated = after.camera.model_copy(update={"calibrated": None})
-    assert after.model_copy(update={"camera": dated}) == changed(load_config(kept), wanted)
+    assert after.model_copy(update={"camera": dated}) == apply_changes(load_config(kept), wanted)
     assert write_changed(path, wanted, "again") != kept
     json.dumps({".".join(c.key): [c.before, c.after] for c in wanted})
 
@@ -169,7 +169,7 @@ def test_what_makes_no_deployment_is_not_written(tmp_path: Path):
 
 def test_another_flights_deployment_is_not_written_over(rich: CalibrationResult, tmp_path: Path):
     path = deployment(tmp_path)
-    wanted = changes(load_config(path), rich)
+    wanted = setting_changes(load_config(path), rich)
     require_flown_with(path, wanted)
     write_changed(path, wanted, "calibrated")
     require_flown_with(path, wanted)  # the same flight again

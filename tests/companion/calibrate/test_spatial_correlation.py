@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibrate.spatial_correlation import ImageNormalEquations, pictures_part
+from companion.calibrate.spatial_correlation import ImageNormalEquations, images_covariance
 from localizer.geometry.pose import Array
 
 PICTURES, PLACES = 240, 24
@@ -21,7 +21,7 @@ def larger(pulls: Array, grounds: Array) -> float:
     )  # fmt: skip
     gain = np.zeros((1, 1 + 6 * K))
     gain[0, 0] = 1.0 / K
-    alone, factor = pictures_part(gain, 1, normals, grounds)
+    alone, factor = images_covariance(gain, 1, normals, grounds)
     assert alone[0, 0] == pytest.approx(1.0 / K)
     return float(factor[0])
 

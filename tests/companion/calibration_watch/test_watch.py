@@ -112,7 +112,7 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
     class Doubted(Flown):
         def _sighting(self, at_s: float) -> CalibrationObservation:
             if at_s == 20.0:
-                self.watch.doubt_stamps(20_000_000_000)
+                self.watch.suspect_timestamps(20_000_000_000)
             return super()._sighting(at_s)
 
     flown = Doubted(Wrong(late_s=late_s, late_from_s=20.0), square(60.0, climb_s=0.0), lost).fly()
@@ -233,7 +233,7 @@ def test_pictures_that_come_again_are_forgotten() -> None:
             if at_s < 40.0:
                 return super()._sighting(at_s)
             if at_s >= 43.5:
-                self.watch.distrust(40_000_000_000)
+                self.watch.exclude_since(40_000_000_000)
             shown = super()._sighting(35.0 + at_s % 5.0)
             return replace(shown, time_ns=round(at_s * 1e9))
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.errors import ConfigError, ReportError
-from companion.writing import made_folder
+from companion.writing import make_folder
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.link import sleep_until
 
@@ -137,7 +137,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path, monkeypat
     assert "file" in str(result.exception)
     assert "\n" not in str(result.exception)
     with pytest.raises(ReportError, match=r"--report .*is a file; give a folder"):
-        made_folder(tmp_path / "file", "--report")
+        make_folder(tmp_path / "file", "--report")
 
 
 def test_an_interrupt_during_the_imports_ends_it_without_a_word():

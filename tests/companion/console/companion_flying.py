@@ -16,7 +16,7 @@ import numpy as np
 from companion.config import TargetConfig
 from companion.live.orders import OrderContext, Orders
 from companion.live.publisher import Publisher
-from companion.live.shown import Instruments, Shown
+from companion.live.shown import ConsoleData, Instruments
 from companion.targets.clicks import ClickPolicy
 from companion.targets.reporter import TargetReporter
 from localizer.geometry.camera import Camera
@@ -78,7 +78,7 @@ class Flight:
             lambda: self.mission,
         )  # fmt: skip
         about = {"mode": "inject", "delay_ms": 220.0, "alert_limit_m": 10.0, "record": None}
-        self.shown = Shown(self.cache.frame, 48.0, instruments, about)
+        self.shown = ConsoleData(self.cache.frame, 48.0, instruments, about)
         self.origin = origin
         self.reporter = TargetReporter(
             TargetConfig(), MapSurface(self.cache).cast, self._located, self.shown.forget_target

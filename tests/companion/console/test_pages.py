@@ -33,7 +33,7 @@ class Fed:
     def feed(self, number):
         head = {"kind": "frame", "exposure_ns": number, "recorded": True, "image": [16, 16],
                 "camera": CAMERA.to_dict()}  # fmt: skip
-        self.newest.take(Message(head, np.zeros((16, 16, 3), np.uint8).tobytes()))
+        self.newest.add(Message(head, np.zeros((16, 16, 3), np.uint8).tobytes()))
         event, self._event = self._event, asyncio.Event()
         event.set()
 

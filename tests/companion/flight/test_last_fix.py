@@ -15,7 +15,7 @@ import pytest
 from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
 from companion.flight.last_fix import FixMemory, LastFix, read_last_fix
-from companion.flight.priors import local_about
+from companion.flight.priors import local_near
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate
@@ -68,7 +68,7 @@ def test_a_picture_that_is_newer_than_the_ekf_report_can_be_placed(tmp_path, ahe
     autopilot: Any = SimpleNamespace(state=lambda: state, local_at=lambda _: None)
     path = kept(tmp_path)
     about = FixMemory(
-        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda t: local_about(autopilot, t)
+        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda t: local_near(autopilot, t)
     )
     prior = about.prior(103 * SECOND + round(ahead_s * SECOND))
     assert (prior is not None) is usable

@@ -12,7 +12,7 @@ import pytest
 
 from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
-from companion.flight.priors import AutopilotPose, PositionBelief
+from companion.flight.priors import AutopilotPose, PositionQualityMonitor
 from localizer.geometry.geo import Geodetic, LocalFrame
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 
@@ -29,7 +29,7 @@ def with_gnss(at_s: float, accuracy_m: float = 1.0) -> VehicleState:
 
 
 def test_a_receiver_that_doubts_itself_is_believed_less() -> None:
-    belief = PositionBelief(PriorConfig()).at(with_gnss(10, accuracy_m=30.0), 10 * SECOND)
+    belief = PositionQualityMonitor(PriorConfig()).at(with_gnss(10, accuracy_m=30.0), 10 * SECOND)
     assert belief.sigma_m == pytest.approx(30.0)
 
 
@@ -48,17 +48,17 @@ def test_a_fix_that_never_went_to_the_ekf_holds_it_nowhere() -> None:
 
 def test_an_ekf_without_a_position_knows_nothing() -> None:
     blind = replace(FLYING, ekf_flags=1)  # EKF_ATTITUDE alone
-    assert PositionBelief(PriorConfig()).at(blind, 10 * SECOND).sigma_m is None
+    assert PositionQualityMonitor(PriorConfig()).at(blind, 10 * SECOND).sigma_m is None
 
 
 def test_a_position_of_unknown_origin_is_tried_but_no_evidence() -> None:
-    belief = PositionBelief(PriorConfig()).at(FLYING, 10 * SECOND)
+    belief = PositionQualityMonitor(PriorConfig()).at(FLYING, 10 * SECOND)
     assert belief.sigma_m == pytest.approx(25.0)
     assert not belief.independent
 
 
 def test_a_glitching_gnss_is_not_healthy() -> None:
-    beliefs = PositionBelief(PriorConfig())
+    beliefs = PositionQualityMonitor(PriorConfig())
     state = replace(with_gnss(10), ekf_flags=8 | 16 | 32768)
     assert not beliefs.at(state, 10 * SECOND).independent
 

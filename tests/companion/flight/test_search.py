@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from companion.flight.search import PlaceSearch, place_on_map
+from companion.flight.search import PlaceSearch, enu_on_map
 from localizer.config import LocalizerConfig
 from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
@@ -29,10 +29,10 @@ def _beside(cache, east):
 
 def test_a_hint_on_the_map_or_that_reaches_it_is_taken(cache):
     half = float((cache.index.box_max[0] - cache.index.box_min[0])[0]) / 2
-    at = place_on_map(cache, *_beside(cache, 20.0), 10.0)
+    at = enu_on_map(cache, *_beside(cache, 20.0), 10.0)
     middle = (cache.index.box_min[0] + cache.index.box_max[0]) / 2
     assert at == pytest.approx((middle[0] + 20.0, middle[1]), abs=0.1)
-    assert place_on_map(cache, *_beside(cache, half + 50.0), 100.0) is not None
+    assert enu_on_map(cache, *_beside(cache, half + 50.0), 100.0) is not None
     told = []
     search = PlaceSearch(cache, LocalizerConfig(), None, lambda *event: told.append(event))
     assert search.hint_at(PlaceHint(*_beside(cache, 20.0), 40.0))
@@ -45,7 +45,7 @@ def test_another_country_and_the_far_side_of_the_earth_are_refused(cache):
     told = []
     search = PlaceSearch(cache, LocalizerConfig(), None, lambda *event: told.append(event))
     for place in far:
-        assert place_on_map(cache, *place, 300.0) is None
+        assert enu_on_map(cache, *place, 300.0) is None
         assert not search.hint_at(PlaceHint(*place, 100.0))
     assert not search.hint_at(PlaceHint(-latitude, longitude - 180.0, 20_000.0))
     assert told == []

@@ -307,7 +307,7 @@ def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock:
     assert integrity_monitor.check(FIX) is None
     assert bridge.said == [FAILED]
     assert integrity_monitor.reason == FAILED
-    assert (integrity_monitor.level, integrity_monitor.standing()) == (None, {})
+    assert (integrity_monitor.level, integrity_monitor.active_values()) == (None, {})
     clock.now_ns += second(10.0)
     integrity_monitor.check(FIX)
     assert len(bridge.said) == 2

@@ -20,7 +20,7 @@ from companion.live.orders import OrderContext, OrderError, Orders
 from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
 from companion.live.publisher import Publisher
 from companion.live.shared import SharedMemoryReader
-from companion.live.shown import Instruments, Shown
+from companion.live.shown import ConsoleData, Instruments
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import Frame
@@ -40,7 +40,7 @@ def _shown():
         lambda: ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),)),
         lambda: LoopVerdict(False, alert(AlertId.EKF_NO_SOURCE), None), lambda: False,
     )  # fmt: skip
-    return Shown(FRAME, 48.0, instruments, {"mode": "shadow"})
+    return ConsoleData(FRAME, 48.0, instruments, {"mode": "shadow"})
 
 
 class Ship:
@@ -296,7 +296,7 @@ def test_events_are_told_once():
 def test_an_order_that_makes_no_sense_is_refused(order):
     ship = Ship()
     with pytest.raises(OrderError):
-        Orders(True, ship.helm).take(order)
+        Orders(True, ship.helm).execute(order)
     assert (ship.said, ship.tracked, ship.hints) == ([], [], [])
 
 
@@ -315,9 +315,9 @@ def test_a_click_into_a_picture_that_is_not_of_now_is_refused(order, away_s):
     ship, now_ns = Ship(), time.monotonic_ns()
     told = away_s if isinstance(away_s, str | bool) else now_ns + away_s * 1e9
     with pytest.raises(OrderError, match=r"click into a newer one|exposure_ns"):
-        Orders(True, ship.helm).take({**order, "exposure_ns": told})
+        Orders(True, ship.helm).execute({**order, "exposure_ns": told})
     assert ship.tracked == []
-    Orders(True, ship.helm).take({"do": "stop", "exposure_ns": told})  # targets end all the same
+    Orders(True, ship.helm).execute({"do": "stop", "exposure_ns": told})  # targets end all the same
     assert len(ship.tracked) == 1
 
 
@@ -325,7 +325,7 @@ def test_a_click_into_a_picture_that_is_not_of_now_is_refused(order, away_s):
 def test_a_click_bears_the_time_of_its_picture(away_s):
     ship, now_ns = Ship(), time.monotonic_ns()
     told = None if away_s is None else now_ns + round(away_s * 1e9)
-    Orders(True, ship.helm).take({"do": "target", "x": 0.5, "y": 0.5, "exposure_ns": told})
+    Orders(True, ship.helm).execute({"do": "target", "x": 0.5, "y": 0.5, "exposure_ns": told})
     (request,) = ship.tracked
     assert now_ns - 9.1e9 < request.time_ns <= time.monotonic_ns()
     if away_s is not None and away_s < 0:
@@ -343,7 +343,7 @@ def test_a_click_bears_the_time_of_its_picture(away_s):
 )  # fmt: skip
 def test_every_order_is_told_to_the_operator(order, told):
     ship = Ship()
-    Orders(True, ship.helm).take(order)
+    Orders(True, ship.helm).execute(order)
     assert ship.said == [told]
     assert {t.asked_by for t in ship.tracked} <= {"console"}  # so is the target called
 
@@ -351,15 +351,15 @@ def test_every_order_is_told_to_the_operator(order, told):
 def test_without_control_and_beyond_the_rate_nothing_is_done():
     ship = Ship()
     with pytest.raises(OrderError, match="only reads"):
-        Orders(False, ship.helm).take({"do": "stop"})
+        Orders(False, ship.helm).execute({"do": "stop"})
     now = [0.0]
     orders = Orders(True, ship.helm, lambda: now[0])
     for _ in range(10):
-        orders.take({"do": "stop"})
+        orders.execute({"do": "stop"})
     with pytest.raises(OrderError, match="more than 10"):
-        orders.take({"do": "stop"})
+        orders.execute({"do": "stop"})
     now[0] = 6.0
-    orders.take({"do": "stop"})
+    orders.execute({"do": "stop"})
     assert len(ship.tracked) == 11
     assert issubclass(OrderError, CompanionError)
 

@@ -187,14 +187,14 @@ def test_a_map_that_was_built_again_about_another_origin_is_refused(record):
     """All places of the record lay beside it by the same way, and nobody was told."""
     loaded = load_record(record)
     flown = TileCache.open(loaded.config.map)
-    loaded.tables.flown.require_frame(flown)
-    assert not loaded.tables.flown.doubt(flown)
+    loaded.tables.flown_map.require_frame(flown)
+    assert not loaded.tables.flown_map.mismatch(flown)
     origin = replace(
         flown.manifest.origin, longitude_deg=flown.manifest.origin.longitude_deg + 1e-4
     )
     again = TileCache(flown.path, flown.manifest.model_copy(update={"origin": origin}), flown.index)
     with pytest.raises(RecordError, match=r"another origin .* 8 m away: was it built again"):
-        loaded.tables.flown.require_frame(again)
+        loaded.tables.flown_map.require_frame(again)
 
 
 def test_a_map_that_was_built_again_about_the_same_origin_is_doubted(record, tmp_path):
@@ -209,16 +209,17 @@ def test_a_map_that_was_built_again_about_the_same_origin_is_doubted(record, tmp
         flown.manifest.model_copy(update={"gsd_m": 9.0}).model_dump_json()
     )
     built = TileCache.open(again)
-    loaded.tables.flown.require_frame(built)
-    assert "not the map that was flown over: was it built again" in loaded.tables.flown.doubt(built)
-    assert not replace(loaded.tables.flown, sha256=None).doubt(built)  # an older record
+    loaded.tables.flown_map.require_frame(built)
+    mismatch = loaded.tables.flown_map.mismatch(built)
+    assert "not the map that was flown over: was it built again" in mismatch
+    assert not replace(loaded.tables.flown_map, sha256=None).mismatch(built)  # an older record
     tables = read_record(record)
-    with map_pictures(again, flown=tables.flown) as pictures:
+    with map_pictures(again, flown=tables.flown_map) as pictures:
         assert any("built again" in note for note in pictures.notes)
-    with map_pictures(loaded.config.map, flown=tables.flown) as pictures:
+    with map_pictures(loaded.config.map, flown=tables.flown_map) as pictures:
         assert pictures.notes == []
-    assert tables.flown.point is not None
-    moved = replace(tables.flown, point=tables.flown.point + 5.0)
+    assert tables.flown_map.point is not None
+    moved = replace(tables.flown_map, point=tables.flown_map.point + 5.0)
     with map_pictures(loaded.config.map, flown=moved) as pictures:
         assert pictures.cache is None
         assert any("another origin" in note for note in pictures.notes)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import MissionFileError
 from companion.geometry import Mount
-from companion.planning.alternatives import changes
+from companion.planning.alternatives import alternatives_at
 from companion.planning.flown import flown_legs, flown_words
 from companion.planning.mission import HeightAbove, read_mission
 from companion.planning.verdicts import (
@@ -350,9 +350,9 @@ def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg):
 
 def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
     worst = SampleVerdict(leg.samples[0], forecast(risk=0.9), Reason.WEAK)
-    assert any("gimbal" in c.words for c in changes(worst, fixed=False))
-    assert not any("gimbal" in c.words for c in changes(worst, fixed=True))
-    assert any("higher" in c.words for c in changes(worst, fixed=True))
+    assert any("gimbal" in c.words for c in alternatives_at(worst, fixed=False))
+    assert not any("gimbal" in c.words for c in alternatives_at(worst, fixed=True))
+    assert any("higher" in c.words for c in alternatives_at(worst, fixed=True))
 
 
 def run(*arguments):

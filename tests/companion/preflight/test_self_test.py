@@ -22,7 +22,7 @@ def switch_interval():
 
 def test_a_flight_over_the_made_map_is_timed(tmp_path, switch_interval):
     config = LocalizerConfig(width=64, threads=1)
-    pose, frame = self_test.made_view(self_test.made_map(tmp_path), config)
+    pose, frame = self_test.render_view(self_test.generate_map(tmp_path), config)
     (row,) = bench.bench(tmp_path / "map", pose, frame.camera, config, (60,), 0.25)
     assert row.offered_hz == 60
     assert 0 < row.answered_hz < 200

@@ -15,7 +15,7 @@ from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
 from companion.settings_file import settings
 from companion.setup.reference import reference
-from companion.setup.write import differing
+from companion.setup.write import differing_settings
 from localizer.errors import MapCacheError
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
@@ -58,7 +58,7 @@ def test_only_what_differs_is_kept_and_nothing_is_lost():
         "console": {"listen": "127.0.0.1:8081"},
     }
     config = parse_config(given, "test")
-    kept = differing(config)
+    kept = differing_settings(config)
     assert set(paths(kept)) == {
         "map", "camera.source", *(f"camera.model.{k}" for k in MODEL),
         "bridge.injection.rate_hz", "localizer.calibration.stamp_ms", "console.listen",
@@ -68,7 +68,7 @@ def test_only_what_differs_is_kept_and_nothing_is_lost():
 
 def test_the_reference_is_a_valid_deployment_of_true_defaults():
     config = parse_config(yaml.safe_load(reference()), "reference")
-    own = set(paths(differing(config)))
+    own = set(paths(differing_settings(config)))
     assert own == {"map", "camera.source", *(f"camera.model.{k}" for k in (
         "width", "height", "fx", "fy", "cx", "cy"))}  # fmt: skip
     text = reference()
@@ -82,7 +82,7 @@ def test_the_reference_is_a_valid_deployment_of_true_defaults():
 
 
 def test_the_shipped_deployment_file_differs_from_the_defaults_in_its_examples_only():
-    shipped = set(paths(differing(load_config(DEPLOYMENT))))
+    shipped = set(paths(differing_settings(load_config(DEPLOYMENT))))
     assert {p for p in shipped if not p.startswith("camera.model.")} == EXAMPLES
 
 

@@ -17,7 +17,7 @@ from companion.sources.datagrams import (
     VideoDatagrams,
     parse_sender,
 )
-from companion.sources.rtp import RtpPictures, kind_of
+from companion.sources.rtp import RtpDepacketizer, video_format
 
 S = 1_000_000_000
 TS = (b"\x47" + bytes(187)) * 7
@@ -26,44 +26,44 @@ CAMERA, AGAIN, STRANGER = ("10.0.0.2", 4000), ("10.0.0.2", 4001), ("10.0.0.9", 4
 
 def test_the_first_sender_of_video_is_followed_and_no_other() -> None:
     lock = SenderLock(None, S)
-    assert lock.admits(CAMERA, TS, 0)
-    lock.prove()
-    assert not lock.admits(STRANGER, TS, 1)
-    assert not lock.admits(STRANGER, TS, 10**6 * S), "not after any silence"
-    assert lock.admits(CAMERA, TS, 10**6 * S)
+    assert lock.accepts(CAMERA, TS, 0)
+    lock.confirm_sender()
+    assert not lock.accepts(STRANGER, TS, 1)
+    assert not lock.accepts(STRANGER, TS, 10**6 * S), "not after any silence"
+    assert lock.accepts(CAMERA, TS, 10**6 * S)
 
 
 def test_a_camera_that_restarts_may_speak_from_another_port_once_the_old_one_is_silent() -> None:
     lock = SenderLock(None, S)
-    assert lock.admits(CAMERA, TS, 0)
-    lock.prove()
-    assert not lock.admits(AGAIN, TS, S // 2), "two at once on one host would be mixed"
-    assert lock.admits(AGAIN, TS, S)
-    assert not lock.admits(CAMERA, TS, S + 1)
+    assert lock.accepts(CAMERA, TS, 0)
+    lock.confirm_sender()
+    assert not lock.accepts(AGAIN, TS, S // 2), "two at once on one host would be mixed"
+    assert lock.accepts(AGAIN, TS, S)
+    assert not lock.accepts(CAMERA, TS, S + 1)
 
 
 def test_a_stray_packet_does_not_lock_the_camera_out() -> None:
     lock = SenderLock(None, S)
-    assert not lock.admits(STRANGER, b"GET / HTTP/1.1", 0)
-    assert lock.admits(STRANGER, TS, 0), "it looks like video but no picture comes of it"
-    assert not lock.admits(CAMERA, TS, 2 * S)
-    assert lock.admits(CAMERA, TS, 6 * S)
-    lock.prove()
-    assert not lock.admits(STRANGER, TS, 60 * S)
+    assert not lock.accepts(STRANGER, b"GET / HTTP/1.1", 0)
+    assert lock.accepts(STRANGER, TS, 0), "it looks like video but no picture comes of it"
+    assert not lock.accepts(CAMERA, TS, 2 * S)
+    assert lock.accepts(CAMERA, TS, 6 * S)
+    lock.confirm_sender()
+    assert not lock.accepts(STRANGER, TS, 60 * S)
 
 
 def test_video_is_recognised_where_a_datagram_begins_inside_a_packet() -> None:
-    assert SenderLock(None, S).admits(CAMERA, TS[100:], 0)
-    assert not SenderLock(None, S).admits(CAMERA, bytes(1316), 0)
+    assert SenderLock(None, S).accepts(CAMERA, TS[100:], 0)
+    assert not SenderLock(None, S).accepts(CAMERA, bytes(1316), 0)
 
 
 @pytest.mark.parametrize(("only", "taken"), [("10.0.0.2", True), ("10.0.0.2:4000", False)])
 def test_a_configured_sender_is_the_only_one(only: str, taken: bool) -> None:
     lock = SenderLock(only, S)
-    assert not lock.admits(STRANGER, TS, 0)
-    assert lock.admits(CAMERA, TS, 0)
-    assert not lock.admits(STRANGER, TS, 60 * S)
-    assert lock.admits(AGAIN, TS, 60 * S) is taken
+    assert not lock.accepts(STRANGER, TS, 0)
+    assert lock.accepts(CAMERA, TS, 0)
+    assert not lock.accepts(STRANGER, TS, 60 * S)
+    assert lock.accepts(AGAIN, TS, 60 * S) is taken
 
 
 @pytest.mark.parametrize("text", ["camera", "10.0.0.2:0", "10.0.0.2:x", "10.0.0:1", ""])
@@ -134,7 +134,7 @@ def test_packets_of_a_second_sender_never_reach_the_decoder(sockets: Sockets) ->
     own, other = TS, TS.replace(b"\0", b"\1")
     camera.send(own)
     assert feed.read(65536) == own
-    feed.prove()
+    feed.confirm_sender()
     for _ in range(5):
         stranger.send(other)
         camera.send(own)
@@ -149,7 +149,7 @@ def test_the_sender_is_kept_over_a_reconnection_and_old_packets_are_not(sockets:
     camera, stranger = sockets.sender("127.0.0.1"), sockets.sender("127.0.0.2")
     camera.send(TS)
     assert feed.read(65536) == TS
-    feed.prove()
+    feed.confirm_sender()
     camera.send(TS[188:])
     stranger.send(TS)
     feed.begin(30.0)
@@ -177,7 +177,10 @@ def test_only_the_named_interface_is_bound(sockets: Sockets) -> None:
 
 def test_a_multicast_group_is_joined_on_the_interface() -> None:
     address = UdpAddress("239.255.42.42", 0, "127.0.0.1")
-    with address.bound() as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    with (
+        address.open_socket() as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         sender.sendto(TS, ("239.255.42.42", receiver.getsockname()[1]))
         receiver.settimeout(30.0)
@@ -204,8 +207,8 @@ KINDS = [
 
 @pytest.mark.parametrize(("data", "kind"), KINDS)
 def test_what_a_feed_is_of_is_seen_by_a_datagram(data: bytes, kind: str) -> None:
-    assert kind_of(data) == kind
-    assert SenderLock(None, S).admits(CAMERA, data, 0)
+    assert video_format(data) == kind
+    assert SenderLock(None, S).accepts(CAMERA, data, 0)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +257,7 @@ def pictures(ivf: bytes) -> list[tuple[int, bytes]]:
 
 def test_rtp_packets_become_pictures_with_their_times() -> None:
     """Units alone, several in one packet, one in three; times that wrap; a packet that is lost."""
-    made = RtpPictures("h264")
+    made = RtpDepacketizer("h264")
     start, first = b"\0\0\0\1", (1 << 32) - 1500
     packets = [
         rtp(65534, first, b"\x78\0\2\x67\x42\0\3\x68\xce\x3c", last=False),
@@ -267,7 +270,7 @@ def test_rtp_packets_become_pictures_with_their_times() -> None:
         rtp(6, 7500, b"\x41gg", last=False),  # without a mark: the next picture's time ends it
         rtp(7, 10500, b"\x41hh", last=True),
     ]
-    found = pictures(b"".join(map(made.take, packets)))
+    found = pictures(b"".join(map(made.add_packet, packets)))
     assert found == [
         (0, start + b"\x67\x42" + start + b"\x68\xce\x3c" + start + b"\x65AABBCC"),
         (3000, start + b"\x41dd"), (9000, start + b"\x41gg"), (12000, start + b"\x41hh"),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.sources.zoom import FocalCorrection, ZoomedFrames, ZoomTable, longer
+from companion.sources.zoom import FocalCorrection, ZoomedFrames, ZoomTable, with_focal_factor
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -42,7 +42,7 @@ def _pose(time_ns: int, height_m: float) -> Pose:
 
 def test_on_rendered_pictures_it_finds_the_lens(small_assets: FlightAssets) -> None:
     """1 % longer than the table has it: 0.9 m at 90 m above ground."""
-    true = longer(CAMERA, 1.01)
+    true = with_focal_factor(CAMERA, 1.01)
     height_m = 90.0 + float(small_assets.world.ground_height(0.0, 0.0))
     end_ns = (COUNT + 2) * PERIOD_NS
     track = PoseTrack([(t, _pose(t, height_m)) for t in range(0, end_ns, 20_000_000)])
@@ -121,7 +121,7 @@ def test_another_zoom_has_another_error() -> None:
         sure.learn(math.log(1.008), 0.003)
     lens.level, lens.truth = 50.0, 0.996
     assert lens.see(60) == pytest.approx(0.996, abs=0.0015)
-    sure.moved(0.4)
+    sure.zoom_changed(0.4)
     before = sure.value
     sure.learn(before + 0.01, 0.003)
     anew.learn(0.01, 0.003)

@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from companion.sources.references import Damage, References
+from companion.sources.references import DamageTracker, ReferenceTracker
 from localizer.types import Image
 
 _SIZE = (160, 120)
@@ -46,7 +46,7 @@ def _without(packets: list[bytes], *lost: int) -> list[tuple[int, bytes]]:
 
 
 def _broken(packets: list[tuple[int, bytes]], step_ns: int = _SECOND_NS // 10) -> list[int]:
-    follows = References()
+    follows = ReferenceTracker()
     return [i for i, packet in packets if follows.is_broken(packet, i * step_ns)]
 
 
@@ -98,8 +98,8 @@ def test_no_false_alarm_on_a_whole_stream(options: dict[str, str]) -> None:
 
 
 def _damaged(packets: list[tuple[int, bytes]]) -> list[int]:
-    """The pictures that `Damage` withholds, by their packets."""
-    decoder, damage = av.CodecContext.create("h264", "r"), Damage()
+    """The pictures that `DamageTracker` withholds, by their packets."""
+    decoder, damage = av.CodecContext.create("h264", "r"), DamageTracker()
     decoder.thread_count = 1
     found = []
     for i, packet in packets:
@@ -107,7 +107,7 @@ def _damaged(packets: list[tuple[int, bytes]]) -> list[int]:
         try:
             pictures = decoder.decode(av.Packet(packet))
         except av.error.InvalidDataError:
-            damage.undecodable(now_ns)
+            damage.add_undecodable(now_ns)
             continue
         for p in pictures:
             clean = bool(p.key_frame)

@@ -80,12 +80,12 @@ def test_a_zoom_that_is_not_known_gives_no_frame_and_is_told(level: float | None
     """Once in ten seconds, and again when it comes again."""
     zoom = Zoom(level)
     for second in range(25):
-        zoom.frames.before(pytest.fail)(frame(second * SECOND))
+        zoom.frames.zoom_filter(pytest.fail)(frame(second * SECOND))
     assert len(zoom.told) == 3
     assert zoom.frames.unknown == 25
     zoom.level = 0.0
     taken: list[Frame] = []
-    zoom.frames.before(taken.append)(frame(26 * SECOND))
+    zoom.frames.zoom_filter(taken.append)(frame(26 * SECOND))
     assert [f.exposure_time_ns for f in taken] == [26 * SECOND]
     zoom.level = level
     assert zoom.frames(frame(27 * SECOND)) is None

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.sources.zoom import longer
+from companion.sources.zoom import with_focal_factor
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.pose import Pose, so3_exp
@@ -49,7 +49,7 @@ class Flight:
 
     def frame(self, k: int, factor: float) -> Frame:
         """The k-th picture, of a lens so many times longer."""
-        lens = longer(LENS, factor)
+        lens = with_focal_factor(LENS, factor)
         camera = WorldCamera(self._renderer, lens, Appearance(), self._options)
         seen = camera.expose(k * PERIOD_NS, self._track)
         assert seen is not None

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
-from companion.supervision.kept_settings import keep, settings_of
+from companion.supervision.kept_settings import keep_settings, settings_of
 from companion.supervision.processes import FlightProcess
 
 MODEL = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
@@ -36,7 +36,7 @@ def kept() -> Iterator[Callable[[CompanionConfig], int]]:
     descriptors: list[int] = []
 
     def made(config: CompanionConfig) -> int:
-        descriptors.append(keep(config))
+        descriptors.append(keep_settings(config))
         return descriptors[-1]
 
     yield made

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from companion.config import CompanionConfig, parse_config
-from companion.supervision.restart import without_lost_disks, written_to
+from companion.supervision.restart import without_lost_disks, write_problem
 
 MODEL = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
 CAMERA = {"model": MODEL, "source": "udp://x:1"}
@@ -87,4 +87,4 @@ def test_a_full_or_failing_disk_is_the_recorders_to_tell(tmp_path, monkeypatch, 
         raise OSError(number, "as it is")
 
     monkeypatch.setattr("tempfile.mkstemp", full)
-    assert bool(written_to(tmp_path)) is told
+    assert bool(write_problem(tmp_path)) is told

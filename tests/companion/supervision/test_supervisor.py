@@ -18,7 +18,7 @@ import pytest
 
 from companion.supervision.processes import ENDING, Beat, FlightProcess
 from companion.supervision.service_manager import ServiceManager
-from companion.supervision.supervisor import RestartPolicy, Supervisor, described, mark_dead
+from companion.supervision.supervisor import RestartPolicy, Supervisor, exit_code_text, mark_dead
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
@@ -411,7 +411,7 @@ def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("code", "said"), [(-9, "SIGKILL"), (1, "exit 1"), (-200, "signal 200")])
 def test_codes_in_words(code: int, said: str) -> None:
-    assert described(code) == said
+    assert exit_code_text(code) == said
 
 
 @pytest.mark.parametrize("flight", ["flight", "[21] field *"])

@@ -110,8 +110,8 @@ class Watcher(Operator):
             told = Pose(so3_exp(off[3:]) @ true.rotation, true.translation + off[:3])
             seen = scene.estimate(told, self.time_ms * MS, sigma=0.05, camera=CAMERA)
             self.clicks.add_estimate(seen)
-            self.population.look(seen, self._pictures.of(true, time_s))
-            self.population.hold(seen)
+            self.population.add_image(seen, self._pictures.of(true, time_s))
+            self.population.predict(seen)
             self.time_ms += 100
         self.now_ms = self.time_ms - 100
 
@@ -329,8 +329,8 @@ def _flown(follower, monkeypatch, frames, at=(0.5, 0.3)):
         for _ in range(frames):
             seen = scene.estimate(scene.pose_at(watcher.time_ms / 1e3), watcher.time_ms * MS)
             watcher.clicks.add_estimate(seen)
-            watcher.population.look(seen, gray)
-            watcher.population.hold(seen)
+            watcher.population.add_image(seen, gray)
+            watcher.population.predict(seen)
             watcher.time_ms += 100
         watcher.now_ms = watcher.time_ms - 100
 

@@ -71,7 +71,7 @@ def errors(holed, velocity, say=lambda *_: None):
         assert at is not None
         u, v = at + noise.normal(scale=0.7, size=2)
         before = len(told)
-        population.see(Detection("car", estimate.exposure_time_ns, u, v), estimate)
+        population.add_detection(Detection("car", estimate.exposure_time_ns, u, v), estimate)
         for target in told[before:]:
             off = float(np.linalg.norm((target.fix.position_world - true)[:2]))
             found.append((k, off, float(np.sqrt(np.trace(target.fix.covariance[:2, :2])))))

@@ -49,7 +49,7 @@ class Operator:
             seen = estimate(self._flown(self.time_ms / 1e3), self.time_ms * MS, state)
             self.clicks.add_estimate(seen)
             if state is TrackingState.TRACKING:
-                self.population.hold(seen)
+                self.population.predict(seen)
             self.time_ms += FRAME_MS
         self.now_ms = self.time_ms - FRAME_MS
 
@@ -214,7 +214,7 @@ def test_stop_ends_clicked_targets_and_no_detected_one():
     operator = Operator()
     operator.fly(10)
     operator.clicks_at(0.25, 0.5)
-    operator.population.see(
+    operator.population.add_detection(
         Detection("car", 0, 320.0, 240.0), estimate(pose_at(0.9), operator.now_ms * MS)
     )
     operator.stops()

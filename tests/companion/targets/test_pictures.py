@@ -20,7 +20,7 @@ def test_what_is_dropped_makes_room():
     for k in range(5):
         pictures.append(bytes([k]) * 10)
     assert [item[0] for item in pictures] == [1, 2, 3, 4]
-    pictures.keep(lambda item: item[0] >= 3)
+    pictures.retain(lambda item: item[0] >= 3)
     assert (len(pictures), pictures.nbytes) == (2, 20)
     pictures.append(b"\x09" * 100)  # alone above what is allowed: the newest three stay
     assert [item[0] for item in pictures] == [3, 4, 9]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.recorded.footage import FootageOptions, read_footage
-from companion.trial.result import judge
+from companion.trial.result import trial_verdict
 from companion.trial.run import TrialOptions, run_trial
 from localizer.geometry.camera import Camera
 from localizer.geometry.posefile import read_poses, world_from_camera
@@ -54,7 +54,7 @@ def test_the_gimbals_bias_of_photos_without_gimbal_angles(real_data, tmp_path):
     ]
     assert np.median(off) < 2.0
     assert any("exactly zero" in note for note in trial.notes)
-    assert judge(trial).kind in ("works", "works partly")
+    assert trial_verdict(trial).kind in ("works", "works partly")
 
 
 @pytest.mark.long
@@ -77,7 +77,7 @@ def test_photos_without_tags_beside_a_file_of_places(real_data, tmp_path):
     off = [one.pose.distance_to(rows[one.name])[0] for one in trial.second if one.accepted]
     assert len(off) >= 0.7 * _FEW
     assert np.percentile(off, 90) < 1.5
-    assert judge(trial).kind in ("works", "works partly")
+    assert trial_verdict(trial).kind in ("works", "works partly")
 
 
 def _tried(*arguments):
@@ -106,8 +106,8 @@ def test_pictures_beside_a_real_log_and_calibration(real_data, tmp_path):
 @pytest.mark.parametrize("clip", ["aphill_klv_10s.ts", "aphill_short.ts"])
 def test_a_real_clip_with_metadata(real_data, tmp_path, clip):
     told = _tried(real_data("clips") / clip, "--frames", 5, "--report", tmp_path)
-    frames, placed = _numbers(r"(\d+) frames, (\d+) with a position", told)
-    assert frames == placed > 1
+    frames, localize_from_telemetry = _numbers(r"(\d+) frames, (\d+) with a position", told)
+    assert frames == localize_from_telemetry > 1
     south, north, west = _numbers(r"latitude (\S+) to (\S+), longitude (\S+) to", told)
     assert 38.0 < south < north < 38.3
     assert -77.5 < west < -77.2

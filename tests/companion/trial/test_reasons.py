@@ -21,7 +21,7 @@ from companion.recorded.flight import (
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, Ground, priors_of
 from companion.trial.reasons import map_reason, reasons
-from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, because, judge
+from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, main_reason, trial_verdict
 from companion.trial.wanted_map import wanted_map
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -158,7 +158,7 @@ def test_a_flat_map_is_named_with_what_to_use_instead(cache):
     flight = _flight(cache.frame, [(0.0, 0.0)], ())
     flat = "the map is flat without buildings and trees; use a surface model, which has them"
     trial = Trial(flight, (), (), (), {}, None, {0: "blurred", 1: flat, 2: flat}, ())
-    assert because(trial).endswith(flat)
+    assert main_reason(trial).endswith(flat)
     why = map_reason(MapKind("flat", 6.0, 0.5))
     assert why == flat
 
@@ -175,8 +175,8 @@ def test_too_few_frames_give_no_verdict(cache, count, accepted, kind):
     flight = _flight(cache.frame, [(0.0, 0.0)] * count, ())
     done = (Localized("a", None, accepted=accepted),) * count
     trial = Trial(flight, priors_of(flight, cache).priors, done, done, {}, None, {}, ())
-    assert judge(trial).kind == kind
-    assert judge(trial).exit_code == (0 if kind == WORKS else 1)
+    assert trial_verdict(trial).kind == kind
+    assert trial_verdict(trial).exit_code == (0 if kind == WORKS else 1)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer, Localized, height_bands, likely_height
 from companion.trial.priors import Ground, priors_of
 from companion.trial.result import Trial
-from companion.trial.run import localize_each, placed, spread
+from companion.trial.run import evenly_spread, localize_each, localize_from_telemetry
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -172,7 +172,7 @@ def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(
         write_photo(tmp_path / f"{k:02d}.jpg", xmp, exif={_FOCAL_35: 24})
     flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
     loader = _Finds(found)
-    kept, known, first = placed(flight, priors_of(flight, cache), loader, _silent)
+    kept, known, first = localize_from_telemetry(flight, priors_of(flight, cache), loader, _silent)
     names = [int(frame.name[:2]) for frame in kept.frames]
     assert [k for k in names if not k % 2] == list(range(0, 90, 2))  # their heading is known
     odd = [k for k in names if k % 2]
@@ -188,7 +188,7 @@ def test_of_many_photos_that_need_a_search_a_sample_stands_for_all(
 
 
 def test_searches_end_where_none_of_the_first_finds_anything():
-    chosen = spread(range(100), 20)
+    chosen = evenly_spread(range(100), 20)
 
     def count(found, searched=chosen):
         return len(localize_each(chosen, searched, lambda k: Localized(str(k), None, accepted=k in

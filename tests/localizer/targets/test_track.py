@@ -100,7 +100,7 @@ def _roof_beyond_bound(map_sigma_m, roof_m=8.0):
 def test_a_roof_that_a_terrain_map_lacks_is_within_the_claimed_error():
     """A fixed target of a flight over a satellite mosaic was 13 m off at a claimed 0.5 m."""
     kind = MapKind("terrain", UNKNOWN_HEIGHT_SIGMA_M["terrain"], 0.4)
-    fixes, beyond = _roof_beyond_bound(TargetConfig().over(kind).map_sigma_m)
+    fixes, beyond = _roof_beyond_bound(TargetConfig().for_map(kind).map_sigma_m)
     assert fixes >= 20
     assert beyond == 0
     fixes, beyond = _roof_beyond_bound(TargetConfig().map_sigma_m)

@@ -20,7 +20,7 @@ def told(message: Any, profile: FirmwareProfile) -> set[AlertId]:
     notifier: Any = SimpleNamespace(notify=told.__setitem__)
     unused: Any = None
     warnings = FixWarnings(shared, unused, notifier)
-    warnings.firmware(VehicleState(connected=True, version=(1, 0, 0)), profile)
+    warnings.check_firmware(VehicleState(connected=True, version=(1, 0, 0)), profile)
     return {problem.id for problem in told.values() if problem is not None}
 
 

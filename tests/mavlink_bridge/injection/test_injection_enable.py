@@ -26,7 +26,7 @@ def channels(pulse: int, count: int = 18) -> tuple[int, ...]:
 def test_channel_is_followed_and_each_change_is_told_once() -> None:
     it, told = enable()
     for pulse in (1100, 1100, 1900, 1900, 1100, 1100):
-        it.channels(channels(pulse))
+        it.on_rc_channels(channels(pulse))
     assert told == [
         alert(of, by=RcChannel(9)) for of in (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
     ]
@@ -35,21 +35,21 @@ def test_channel_is_followed_and_each_change_is_told_once() -> None:
 def test_a_pulse_at_the_threshold_does_not_flutter() -> None:
     it, told = enable(inject_above_us=1700)
     for pulse in (1690, 1705, 1690, 1702, 1655):
-        it.channels(channels(pulse))
+        it.on_rc_channels(channels(pulse))
     assert told == [alert(AlertId.INJECTION_ON, by=RcChannel(9))]
-    it.channels(channels(1640))
+    it.on_rc_channels(channels(1640))
     assert not it.open
 
 
 def test_the_newest_word_counts() -> None:
     it, _ = enable()
     assert it.command(COMMAND, 1.0) == mavlink.MAV_RESULT_ACCEPTED
-    it.channels(channels(1100))  # the first look at a switch that is off is no word
+    it.on_rc_channels(channels(1100))  # the first look at a switch that is off is no word
     assert it.open
-    it.channels(channels(1900))
+    it.on_rc_channels(channels(1900))
     assert it.command(COMMAND, 0.0) == mavlink.MAV_RESULT_ACCEPTED
-    it.channels(channels(1900))  # still on, not moved
+    it.on_rc_channels(channels(1900))  # still on, not moved
     assert not it.open
-    it.channels(channels(1100))
-    it.channels(channels(1900))
+    it.on_rc_channels(channels(1100))
+    it.on_rc_channels(channels(1900))
     assert it.open

@@ -509,7 +509,7 @@ def deltas(
             }
             it.submit(fix(t - late, north, yaw_rad=yaw, **how), t)
         assert it.step(t, vehicle) is None
-        if (delta := it.motion.take()) is not None:
+        if (delta := it.motion.take_message()) is not None:
             sent.append((t, delta))
     return sent
 

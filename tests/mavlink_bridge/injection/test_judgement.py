@@ -136,7 +136,7 @@ def looped(
     check = ClosedLoopCheck(message)
     for i in range(int(hz * 8)):
         now = int(i * SECOND / hz)
-        check.sent(now - 100 * MS, now, 0.0, 0.0, 0.5)
+        check.add_sent(now - 100 * MS, now, 0.0, 0.0, 0.5)
     local = None if ekf_north is None else (ekf_north, 0.0, -60.0)
     return check.verdict(8 * SECOND, vehicle(**options), lambda _: local)
 
@@ -170,7 +170,7 @@ def test_reason_in_one_line(options: dict[str, Any], reason: AlertId) -> None:
 def test_no_verdict_before_it_has_settled_or_after_sending_ended() -> None:
     check = ClosedLoopCheck("odometry")
     for i in range(20):
-        check.sent(i * 100 * MS, i * 100 * MS, 0.0, 0.0, 0.5)
+        check.add_sent(i * 100 * MS, i * 100 * MS, 0.0, 0.0, 0.5)
     assert check.verdict(2 * SECOND, vehicle(), lambda _: (0.0, 0.0, 0.0)) is None
     assert check.verdict(60 * SECOND, vehicle(), lambda _: (0.0, 0.0, 0.0)) is None
 
@@ -183,9 +183,9 @@ def test_a_jump_after_one_that_was_given_up_is_repeated_again() -> None:
         nonlocal now, counter
         for _ in range(int(seconds * 10)):
             now += 100 * MS
-            check.sent(now - 100 * MS, now, 0.0, 0.0, 0.5, counter)
+            check.add_sent(now - 100 * MS, now, 0.0, 0.0, 0.5, counter)
             check.verdict(now, vehicle(), lambda _: (off, 0.0, -60.0))
-            if check.jump_missed():
+            if check.is_jump_missed():
                 repeats.append(now)
                 counter += 1
 
@@ -346,7 +346,7 @@ def returned(
             local_velocity_ned=(speed if ekf_speed is None else ekf_speed, 0.0, 0.0),
         )
         seen = position(now - 100 * MS, speed * (t - 0.1) + float(rng.normal(0, 0.3)), speed=speed)
-        check.look(state, seen, now)
+        check.update(state, seen, now)
     return check
 
 

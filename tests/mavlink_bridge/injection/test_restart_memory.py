@@ -42,7 +42,7 @@ gates = [
     for file in files
 ]
 gates[0].command(31010, 1.0)
-gates[1].channels([1900] * 18)
+gates[1].on_rc_channels([1900] * 18)
 while not all(file.exists() for file in files):
     time.sleep(0.01)
 print("open", flush=True)
@@ -86,7 +86,7 @@ def test_a_killed_process_leaves_the_gate_open(left_open: dict[str, Path], by: s
     enable, told = restarted(path)
     assert enable.open
     assert told == [alert(AlertId.INJECTION_RESTORED, seconds=pytest.approx(4.0, abs=0.6))]
-    enable.channels(LOW)
+    enable.on_rc_channels(LOW)
     # The switch was turned off meanwhile; a low channel says nothing against a command.
     assert enable.open is (by == "command")
     enable.stop()
@@ -102,7 +102,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
     memory = InjectionEnableMemory(
         RestartMemory(path, lambda: wall[0], lambda: clock[0], "this run")
     )
-    memory.opened(by_channel=True)
+    memory.store_enabled(by_channel=True)
     while not path.exists():
         pass
     left = path.read_text()
@@ -159,7 +159,7 @@ def test_a_no_go_is_of_the_map_that_was_seen(tmp_path: Path, flown: str, kept: b
     """The map was exchanged for the right one, and ten minutes long nothing was injected."""
     path = tmp_path / "no-go.json"
     killed = ShadowFailureMemory(RestartMemory(path, about="map a"))
-    killed.note(True)
+    killed.store(True)
     while not path.exists():
         pass
     left = path.read_text()
@@ -204,7 +204,7 @@ def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(tmp_path, m
 
     monkeypatch.setattr(os, "fsync", ordered_to_end)
     memory = InjectionEnableMemory(RestartMemory(path))
-    memory.opened(by_channel=False)
+    memory.store_enabled(by_channel=False)
     assert ends.wait(20.0)
     memory.stop()
     assert not path.exists()

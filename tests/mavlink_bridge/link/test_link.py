@@ -209,7 +209,7 @@ def test_where_it_is_allowed_another_host_takes_over_after_silence(speakers: Spe
 
 
 def test_a_configured_sender_is_heard_from_the_start_and_nobody_else(speakers: Speakers) -> None:
-    speakers.ours.hear_only("127.0.0.1", None)
+    speakers.ours.accept_only("127.0.0.1", None)
     assert not speakers.is_heard(speakers.stranger)
     assert speakers.is_heard(speakers.vehicle)
 
@@ -312,7 +312,7 @@ def test_peer_that_does_not_read_costs_messages_not_memory_or_time(start):
             time.sleep(0.002)
         assert time.monotonic() - begun < 60.0  # a send that blocked once would never end
         assert sleep_until(lambda: link.counters.tx_dropped > 1000, 30.0)
-        assert link.waiting()["unsent"] < 128 * 1024
+        assert link.queue_lengths()["unsent"] < 128 * 1024
         deaf.close()
 
 
@@ -467,7 +467,7 @@ def test_streams_are_asked_once_while_they_flow_and_again_when_they_stop() -> No
     keeper, config = StreamKeeper(), BridgeConfig()
     assert "ATTITUDE" in names(keeper, config, 10.0)
     for t in range(11, 20):
-        keeper.seen("ATTITUDE", t * SECOND)
+        keeper.on_message("ATTITUDE", t * SECOND)
         assert "ATTITUDE" not in names(keeper, config, t + 0.5)
     assert "ATTITUDE" in names(keeper, config, 25.0)
 
@@ -481,7 +481,7 @@ def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() ->
     assert sum(old in a for a in asked) == 2
     flowing = StreamKeeper()
     for t in range(10, 30):
-        flowing.seen(new, t * SECOND)
+        flowing.on_message(new, t * SECOND)
         assert old not in names(flowing, config, t + 0.1)
 
 

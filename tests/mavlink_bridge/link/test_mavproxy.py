@@ -97,7 +97,7 @@ def _converse(bridge: Bridge, console: Console) -> None:
     wanted = ("name : VPS_SIGNAL, value : 2.0", "CAMERA_TRACKING_GEO_STATUS", TEXT)
 
     def told() -> bool:
-        bridge.tell_figures({"VPS_SIGNAL": 2.0})
+        bridge.send_named_values({"VPS_SIGNAL": 2.0})
         bridge.report_alert(ALERT)
         bridge.report(TargetReport(time.monotonic_ns(), 47.398, 8.546, 535.3, h_accuracy_m=2.0))
         console.ask("status NAMED_VALUE_FLOAT*")

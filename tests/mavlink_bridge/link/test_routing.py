@@ -122,8 +122,10 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     def report() -> bool:
         now = time.monotonic_ns()
         bridge.report(TargetReport(now, 47.398, 8.546, 535.3, h_accuracy_m=2.0))
-        bridge.look(CameraView(now, 47.3975, 8.5455, 635.3, (0.8, 0.0, -0.6, 0.0), 47.399, 8.547))
-        bridge.tell_figures({"VPS_SIGNAL": 2.0})
+        bridge.report_view(
+            CameraView(now, 47.3975, 8.5455, 635.3, (0.8, 0.0, -0.6, 0.0), 47.399, 8.547)
+        )
+        bridge.send_named_values({"VPS_SIGNAL": 2.0})
         return bool(all(station.heard[k] for k in PROMISED) and camera.camera_list().cameras)
 
     assert sleep_until(report, 30.0, step_s=0.2), station.heard

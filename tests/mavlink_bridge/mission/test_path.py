@@ -16,7 +16,7 @@ from mavlink_bridge.mission.items import (
     MissionVehicle,
     UnreadItem,
 )
-from mavlink_bridge.mission.path import PlannedMission, fly
+from mavlink_bridge.mission.path import PlannedMission, planned_path
 
 NAN = math.nan
 HOME = (47.2, 8.2)
@@ -43,7 +43,7 @@ def to(place, up, command=16, *parameters):
 
 
 def flown(*rows, home=HOME, vehicle=COPTER, **more) -> PlannedMission:
-    return fly(items(*rows), home, vehicle, **more)
+    return planned_path(items(*rows), home, vehicle, **more)
 
 
 def names(mission):
@@ -251,6 +251,6 @@ def test_places_that_are_none_are_named():
     with pytest.raises(MissionError, match=r"waypoint 1 is no place: item 2 lies at 95, 8"):
         flown(TAKEOFF, to((95, 8), 50))
     with pytest.raises(MissionError, match=r"MAV_CMD_NAV_WAYPOINT \(item 1\) is in frame 1"):
-        fly(items(to(A, 50), frame=mavlink.MAV_FRAME_LOCAL_NED), HOME)
+        planned_path(items(to(A, 50), frame=mavlink.MAV_FRAME_LOCAL_NED), HOME)
     with pytest.raises(MissionError, match="its altitude is inf"):
         flown(to(A, math.inf))

@@ -69,7 +69,7 @@ def test_the_handlers_clock_goes_on_while_the_transport_is_closed(monkeypatch):
         link.send(HEARTBEAT, 191)
     link.start()
     link.stop()
-    assert link.waiting()["outbox"] == 0
+    assert link.queue_lengths()["outbox"] == 0
     waits = [b - a for a, b in itertools.pairwise(attempts)]
     assert max(waits) == pytest.approx(5.0, abs=0.01)  # a tick at each attempt only would leave it
     assert max(b - a for a, b in itertools.pairwise(ticks.times)) <= 0.21

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.sources.zoom import ZoomTable, longer
+from companion.sources.zoom import ZoomTable, with_focal_factor
 from localizer.geometry.camera import Camera
 from sitl.camera.zoom import Zooming, ZoomLens, level_of
 from sitl.suite.loop.case import load_loop_cases
@@ -31,7 +31,7 @@ def test_what_it_shows_lies_where_the_longer_camera_has_it(factor: float) -> Non
     ray = CAMERA.rays([int(pixel[0]) + 0.5, int(pixel[1]) + 0.5])
     lens = ZoomLens(CAMERA)
     lens.set(Zooming(1.0, factor, 0, 10))
-    wanted, _ = longer(CAMERA, factor).project(ray)
+    wanted, _ = with_focal_factor(CAMERA, factor).project(ray)
     assert dot_at(lens.apply(image, 20)) == pytest.approx(tuple(wanted), abs=0.3)
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from companion.reporting.verdicts import advice, compared
+from companion.reporting.verdicts import advice, value_and_limit
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
 from sitl.demo.criteria import ComputingRates, FlightFigures, check_criteria, headline
@@ -61,7 +61,7 @@ def test_what_was_won_is_said_first_and_with_its_figures():
     ],
 )
 def test_what_was_missed_is_seen_in_its_digits(value, limit, at_least, shown):
-    found, needed = compared(value, limit, "m", at_least=at_least)
+    found, needed = value_and_limit(value, limit, "m", at_least=at_least)
     assert found == shown
     assert needed == f"{'>=' if at_least else '<='} {limit:g} m"
 
