@@ -28,8 +28,7 @@ such as `bridge.origin` are keys of the deployment file; limits without a key ar
 |---|---|
 | fix | a position from vision. Injection sends it to the autopilot: in mode inject after the \
 shadow check (see *Not ready*), in mode rc after the pilot's order. In mode shadow none is sent |
-| fixes continue | this alert does not stop fixes; another alert can. A row that names no effect \
-has none on fixes |
+| fixes continue | this alert does not stop fixes; another alert can |
 | no fixes | vision makes no fix, so none is sent, until the alert ends |
 | output held; hold | fixes are made, but none is sent, until the alert ends |
 | exclude and reset | as *hold*; the first fix afterwards also increments `reset_counter`, which \
@@ -57,21 +56,23 @@ ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
 **Not sent:** the EKF receives no position; the alert says why. In mode shadow it says why none
 could be sent.
 
+**Effect:** a row that names no effect on fixes has none.
+
 **Not ready:** such an alert says why the shadow check has not passed. Until it passes, injection
 does not start, with three exceptions: `bridge.injection.force`; the pilot (mode rc); no GNSS, if
 the check has not failed (`injection_unchecked`). The first two also override *inhibit*. The check
-compares the fixes of the last two minutes with the EKF's position on GNSS. An alert is sent as a
-text only in mode inject, if fixes are made but injection has not started for 10 s. It ends when 50
-or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid pass*: the
-check passed at most 10 min ago, and at most 30 s before the last compared fix.
+compares the fixes of the last two minutes with the EKF's position on GNSS. Such an alert is sent
+as a text only in mode inject, if fixes are made but injection has not started for 10 s. It ends
+when 50 or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid
+pass*: the check passed at most 10 min ago, and at most 30 s before the last compared fix.
 
 **Fixes and EKF:** `fix_rate_low` to `ekf_rejects_fixes` need 3 s or more of sent fixes. Only the
 first of these six whose condition holds is active.
 
 **Repeats and ends:** statuses of localization are assessed once a second; the same one is sent at
 most every 10 s. The end of a check of positions is sent as `cleared: NAME`, that of some others as
-the text in brackets. The next status, for example `localization tracking`, shows the end of the
-rest.
+the text in brackets. Other alerts have no such text: the next status, for example `localization
+tracking`, shows their end.
 """
 _TABLE = """
 ## {}

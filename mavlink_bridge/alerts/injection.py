@@ -27,11 +27,12 @@ INJECTION: tuple[AlertSpec, ...] = (
               "the first fix", "vision has not found a position", _TAKE_OVER,
               lead=_NOT_SENT),
     condition(A.NO_FRESH_FIX, WARNING, "no fresh fix", {},
-              "for 1 s nothing could be sent: the newest fix that passed the checks is older than "
-              "`bridge.injection.delay_ms` + 0.5 s, or twice the usual interval has passed "
-              "without one",
+              "nothing was sent for 1 s, because the newest fix that passed the checks is older "
+              "than `bridge.injection.delay_ms` + 0.5 s, or because no fix has passed for twice "
+              "the usual interval between fixes",
               "a fix passes the checks",
-              "vision makes no fix, or an *output held* alert is active",
+              "vision makes no fix, an *output held* alert is active, or fixes are dropped "
+              "(`fixes_not_checked`)",
               "if an *output held* alert is active, act on it; otherwise take over",
               lead=_NOT_SENT),
     condition(A.LINK_FULL, WARNING, "the link takes no more", {},
@@ -202,7 +203,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "a fix has both",
               f"{_SENT}, but a wrong yaw would not be detected; with message odometry, missing "
               "attitude stops them (`no_attitude`); an active `yaw_mismatch` stays active",
-              "check the rates of ATTITUDE and of the gimbal's messages",
+              f"{_LANDMARKS}; after landing check the rates of ATTITUDE and of the gimbal's "
+              "messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
               "with message gps_input: the companion's clock is before 2023", "the "

@@ -12,7 +12,7 @@ _CALIBRATE = "before the next flight run `companion calibrate flight` on this fl
 _TAKE_OVER = "take over; if it lasts without good GNSS, land"
 _SENT = "fixes continue"
 _WIDER = "fixes continue, with a larger covariance"
-_LAND = "if it lasts without good GNSS, land in ALT_HOLD or STABILIZE"
+_LAND = "if it lasts without good GNSS, take over and land"
 _OR_GNSS = "select the GNSS source set if GNSS is good"
 
 INTEGRITY: tuple[AlertSpec, ...] = (
@@ -147,15 +147,18 @@ INTEGRITY: tuple[AlertSpec, ...] = (
 )  # fmt: skip
 MONITOR: tuple[AlertSpec, ...] = (
     AlertSpec(A.MONITOR_FAILED, ERROR, "integrity monitor failed", "integrity monitor failed", {},
-              "a check raises an exception, or the monitor's thread does not run for 2 s",
+              "a check fails by a fault in the program, or the monitor's thread does not run for "
+              "2 s",
               "all checks run again for 3 s",
               "no position is sent while the thread does not run, or after ten failed runs in a "
               "row (1 s); a shorter failure drops at most one fix",
               _TAKE_OVER, action=OutputAction.HOLD, clear_s=3.0,
               repeat_s=10.0),
     AlertSpec(A.FIXES_NOT_CHECKED, ERROR, "fix checks failed", "fix dropped: its checks failed", {},
-              "the checks of a fix raise an exception", "the checks run for 3 s",
-              "each fix whose checks fail is dropped; fixes whose checks run are sent", _LAND,
+              "the comparison of a fix with the map's offset fails by a fault in the program (a "
+              "fault of the other checks raises `monitor_failed`)", "no such fault for 3 s",
+              "the fix is dropped; other fixes are checked and sent as usual",
+              "if `no_fresh_fix` follows, take over; after landing read the log",
               clear_s=3.0, repeat_s=10.0),
     AlertSpec(A.COMPONENT_STALLED, WARNING, "component stalled",
               "{component} stalled {seconds:.0f} s", {"seconds": "s", "component": "name"},

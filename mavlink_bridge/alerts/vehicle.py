@@ -123,7 +123,10 @@ VEHICLE: tuple[AlertSpec, ...] = (
     event(A.SOURCE_SET_UNKNOWN, WARNING, "EKF source set not known: met in flight", {},
           "ArduPilot is armed already at its first heartbeat, for example after a crash of the "
           "companion",
-          "which source set the EKF uses is not known", _SET),
+          "until ArduPilot reports its set or accepts a command to select one, the program does "
+          "not return to good GNSS (`return_to_gnss`); with `bridge.switch.enabled` it still "
+          "selects vision if GNSS fails, and GNSS if vision ends",
+          "select the set that you want with the RC switch; ArduPilot's report makes it known"),
     event(A.SOURCE_SET_SELECTED, WARNING, "EKF source set {source_set}: {cause}",
           {"source_set": "", "cause": (GnssProblem, ReturnCause), "metres": "m"},
           "`bridge.switch.enabled`: the companion sends the command to select this set. To the "
@@ -136,8 +139,9 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "compare the position with landmarks"),
     event(A.SOURCE_SET_REFUSED, WARNING, "source switch refused", {},
           "the autopilot refuses the command to select a source set",
-          "the EKF stays on its set; the command is repeated every second while its cause lasts",
-          "select the source set yourself"),
+          "the EKF stays on its set; while the cause lasts, the command is repeated every second, "
+          "and this text after each refusal",
+          "select the set that `source_set_selected` named"),
     condition(A.SOURCE_SET_HELD, WARNING, "no switch: {cause}, {why}",
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
               "`bridge.switch.enabled`: GNSS is lost, glitches or is far from vision for 1.5 s, "
@@ -148,10 +152,12 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "vision; *set N chosen*: the pilot selected it",
               "decide by landmarks which source is right, and select it"),
     event(A.LOOK_AT_REFUSED, WARNING, "look-at refused: {why}", {"why": LookAtRefusal},
-          "a command to point the gimbal cannot be carried out", "the gimbal does not move",
+          "a command to point the gimbal cannot be carried out",
+          "the command changes nothing: if the gimbal follows an earlier target, it goes on",
           "correct what the text names"),
     event(A.LOOK_AT_NO_TARGET, WARNING, "look-at refused: no target {number}", {"number": ""},
-          "a command points the gimbal at a target that does not exist", "the gimbal does not move",
+          "a command points the gimbal at a target that does not exist",
+          "the command changes nothing: if the gimbal follows an earlier target, it goes on",
           "give the number of an existing target"),
     event(A.LOOK_AT_UNANSWERED, WARNING, "autopilot does not answer look-at", {},
           "the autopilot does not answer the gimbal command for 3 s", "the gimbal may not move",
