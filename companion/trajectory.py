@@ -73,7 +73,9 @@ class TrajectoryFiles:
 
 
 def write_trajectory(folder: Path, poses: Iterable[StampedPose], frame: LocalFrame) -> None:
-    """Write the files of a complete trajectory (`TrajectoryFiles`)."""
+    """Write the files of a complete trajectory (`TrajectoryFiles`) into an existing folder; files
+    of that name are replaced. frame: of the poses. `PoseFileError` for a pose without a time.
+    """
     files = TrajectoryFiles(folder, frame)
     with contextlib.closing(files):
         for pose in poses:

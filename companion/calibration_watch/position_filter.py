@@ -96,7 +96,10 @@ class PositionFilter:
         known: AutopilotObservation,
         climb_mps: float,
     ) -> None:
-        """Add an observation at `place` (2,), north and east, m. climb_mps: climb rate."""
+        """Correct the state, predicted to the observation's time, by one observation.
+
+        place: (2,) of the vehicle by vision, north and east, m from a fixed point; climb_mps: up.
+        """
         axis = seen.ned_from_camera[:, 2]
         behind = seen.depth_m * axis  # by which a share of 1 would put the camera back
         # Heights first: they tell a lens from a lag, which is all horizontal.

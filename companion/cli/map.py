@@ -270,9 +270,9 @@ def info(
         table.add_row(str(level.level), str(level.tiles), *(f"{x:.2f}" for x in row))
     Console().print(table)
     _print_warnings(m.warnings)
-    for file, written in ((geojson, as_geojson), (kml, as_kml)):
+    for file, written, option in ((geojson, as_geojson, "--geojson"), (kml, as_kml, "--kml")):
         if file is not None:
-            with writing(file, "--out"):
+            with writing(file, option):
                 file.write_text(written(m, opened.path.name), encoding="utf-8")
 
 

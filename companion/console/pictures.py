@@ -52,7 +52,9 @@ class OverlayFrame:
 
 
 def unpack(message: Message) -> OverlayFrame:
-    """Unpack the arrays of a frame's message."""
+    """A frame's message as arrays, which are read-only views of its body. The camera is resized to
+    the image. ValueError if the body is too short.
+    """
     head, body = message.head, message.body
     width, height = head["image"]
     camera = Camera.from_dict(head["camera"]).resized(width, height)

@@ -69,7 +69,9 @@ class FrameTimes:
         """Does nothing; part of `PacketTap`."""
 
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """Store a frame's presentation time (s) and exposure time. Never blocks."""
+        """Store a frame's presentation time (s) and exposure time (CLOCK_MONOTONIC). Pass on the
+        detections that waited for it, in the caller's thread.
+        """
         with self._lock:
             self._by_pts[pts] = exposure_time_ns
             if len(self._by_pts) > _KEPT:

@@ -102,7 +102,9 @@ def start_session(
 
 
 def available_providers() -> list[str]:
-    """Full names of the usable execution providers on this computer."""
+    """Full names of the providers that this onnxruntime was built with, whether or not they start
+    here, and OpenVINO if `is_worthwhile`. Loads CUDA's packages.
+    """
     names = ort.get_available_providers()
     if _CUDA in names:
         load_cuda_packages()

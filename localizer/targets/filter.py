@@ -62,7 +62,7 @@ class TargetFilter:
 
     @property
     def velocity_covariance(self) -> Array | None:
-        """Covariance (3, 3) m²/s² of `velocity`; None without one."""
+        """Covariance (3, 3) m²/s² of `velocity`, by the most probable track; None without it."""
         if self.velocity is None:
             return None
         covariance: Array = self._tracks[0].covariance[3:, 3:].copy()

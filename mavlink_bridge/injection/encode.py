@@ -88,8 +88,9 @@ def pose_covariance(
 ) -> list[float]:
     """The 21 entries of VISION_POSITION_ESTIMATE and ODOMETRY for an NED covariance P (3, 3), m².
 
-    ArduPilot reads one error from the three position entries, so all three hold the worst
-    horizontal sigma; PX4 reads variances.
+    ArduPilot computes one position error from three entries, so each of them is the entry that it
+    reads as the worst horizontal sigma (`covariance_entry`); the height's sigma is not sent. PX4
+    gets variances and covariances. The angles' entries follow from `attitude_sigma_rad`.
     """
     entries = [0.0] * 21
     if formula == "variance":

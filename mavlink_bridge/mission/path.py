@@ -113,11 +113,6 @@ class PlannedMission:
         """Start of the path, above home or the take-off; None if unknown."""
         return self.path[0] if self.path and self.path[0].item == 0 else None
 
-    @property
-    def returns(self) -> bool:
-        """Whether the mission ends with a return to home."""
-        return bool(self.waypoints) and self.path[-1].name == "home"
-
 
 def planned_path(
     items: Sequence[MissionItem | UnreadItem],

@@ -100,10 +100,6 @@ class Pilot:
             self.link.sleep(1.0)
         self.link.wait(lambda: self.record.armed, _SHOWN_S, "the armed heartbeat")
 
-    def disarm(self, *, force: bool = False) -> None:
-        """Disarm; `force` also in flight."""
-        self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196.0 if force else 0.0)
-
     def reboot(self) -> None:
         """Reboot the disarmed autopilot; the caller then needs a new connection."""
         self.link.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)

@@ -72,7 +72,8 @@ class Guidance:
 
     def fly(self, target: Vector) -> None:
         """Follow a straight leg to `target`, NED metres. The leg starts at the present set point,
-        or at the vehicle if that set point is 20 m away or more.
+        or at the vehicle if that set point is 20 m away or more. Nothing changes if the present leg
+        ends at `target`. The heading turns to the leg's if WP_YAW_BEHAVIOR wants it.
         """
         old, here = self.set_point, self.estimator.position
         if old is not None and old.end == target:

@@ -81,17 +81,24 @@ class LoopCompanion:
 
     def kill(self) -> None:
         """SIGKILL to the flight process. With a supervisor, which starts a new one, the call does
-        not wait; without, it waits until the process has ended.
+        not wait; without, it waits until the process has ended. `FlightError` if a supervised
+        process has not reported its pid yet.
         """
         if self._supervised:
-            os.kill(self.health().pid, signal.SIGKILL)
+            os.kill(self._flight_pid(), signal.SIGKILL)
         elif self._process is not None:
             self._process.send_signal(signal.SIGKILL)
             self._process.wait()
 
     def hang(self) -> None:
-        """SIGSTOP to the flight process, so that it hangs."""
-        os.kill(self.health().pid, signal.SIGSTOP)
+        """SIGSTOP to the flight process, so that it hangs. `FlightError` as for `kill`."""
+        os.kill(self._flight_pid(), signal.SIGSTOP)
+
+    def _flight_pid(self) -> int:
+        pid = self.health().pid
+        if pid <= 0:  # signals to 0 reach the caller's own process group
+            raise FlightError(f"no health report states the flight process: see {self._out}")
+        return pid
 
     def require(self) -> None:
         """Raise `FlightError` if the started process has ended; nothing before `start`."""

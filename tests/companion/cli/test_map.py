@@ -141,6 +141,8 @@ def test_info_says_where_the_map_is_and_writes_its_outline(cache, tmp_path):
     assert result.exit_code == 0
     assert "47.19" in result.output
     assert "EGM96 there: 47.75" in result.output
+    refused = run("info", cache.path, "--kml", "/dev/full")
+    assert "--kml" in str(refused.exception)
     (feature,) = json.loads(geojson.read_text())["features"]
     ring = np.array(feature["geometry"]["coordinates"][0])
     assert ring[0].tolist() == ring[-1].tolist()
