@@ -77,7 +77,9 @@ def main() -> None:
     parser.add_argument("--rate", type=number(1, 60), default=30.0, help="frames/s to record")
     parser.add_argument("--widths", type=whole(64, 2048), nargs="+", default=[320, 640], help="px")
     parser.add_argument("--cores", type=whole(1, 256), nargs="+", default=[1, 2], help="each")
-    parser.add_argument("--shift", type=number(0, 100), help="of references, px; none: the default")
+    parser.add_argument(
+        "--shift", type=number(0, 100), help="reference_shift_px of `run`; none: the default"
+    )
     parser.add_argument("--frames", type=whole(60, 10_000), default=300, help="at most")
     parser.add_argument("--json", type=output, help="every figure")
     args = parser.parse_args()

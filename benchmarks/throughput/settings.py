@@ -37,7 +37,7 @@ def one_setting(
     found: list[dict[str, object]] = []
     config = LocalizerConfig(width=width, threads=cores, renderer="numba", device="cpu")
     if shift_px is not None:
-        config = config.model_copy(update={"reference_shift": shift_px / width})
+        config = config.model_copy(update={"reference_shift_px": shift_px})
     for how, in_flight in OFFERED.items():
         stack = MapStack(map_cache, config)
         try:
@@ -52,7 +52,7 @@ def one_setting(
                 "cores": cores,
                 "offered": how,
                 "share_percent": share,
-                "reference_shift_px": config.reference_shift * width,
+                "reference_shift_px": config.reference_shift_px,
                 **figures,
             }
         )

@@ -348,11 +348,11 @@ class Localizer:
     def reference_for(
         self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
     ) -> ReferenceBundle:
-        """The last reference while it is usable (`reference_shift`), otherwise a new one."""
+        """The last reference while it is usable (`reference_shift_px`), otherwise a new one."""
         track_status = self.tracker.track_status
         holds = track_status.state is TrackingState.TRACKING and track_status.rejected_in_row == 0
         steady = holds and not self._is_loading()
-        shift_px = self._config.reference_shift * self.camera.width
+        shift_px = self._config.reference_shift_px
         pose, time_ns = prior.world_from_camera, prior.time_ns
         interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
         if last is None or not steady or shift_px == 0:

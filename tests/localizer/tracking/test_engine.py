@@ -103,7 +103,7 @@ def _localizer(renderer=None, optimizer=None) -> Localizer:
         optimizer or FakeOptimizer(),  # type: ignore[arg-type]
         CAMERA,
         # The fake optimizer registers to the map alone; each frame has its own reference.
-        LocalizerConfig(odometry=None, reference_shift=0),
+        LocalizerConfig(odometry=None, reference_shift_px=0),
     )
 
 

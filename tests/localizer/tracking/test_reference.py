@@ -131,7 +131,7 @@ class _Flight:
     def __init__(self, step_m: float, shift_px: float = 8.0) -> None:
         self.renderer, self.optimizer, self.step_m = _Renderer(), _Optimizer(), step_m
         self.loading = False
-        config = LocalizerConfig(odometry=None, reference_shift=shift_px / CAMERA.width)
+        config = LocalizerConfig(odometry=None, reference_shift_px=shift_px)
         self.localizer = Localizer(
             self.renderer, _Extractor(), self.optimizer,  # type: ignore[arg-type]
             CAMERA, config, is_loading=lambda: self.loading,
