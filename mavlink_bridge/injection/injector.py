@@ -240,7 +240,8 @@ class Injector:
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
-            if fix.position_withheld or fix.horizontal_sigma_m > self._config.max_sigma_m:
+            uncertain = fix.by_odometry and fix.horizontal_sigma_m > self._config.max_sigma_m
+            if fix.position_withheld or uncertain:
                 self.motion.add(fix, now_ns, context)
             if fix.position_withheld:
                 continue

@@ -87,7 +87,7 @@ def _has_area(mesh: SourceMesh) -> bool:
 
 def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
     """The materials of an OBJ's libraries by name, and its flaws as sentences: missing textures,
-    libraries or materials, faces without a picture.
+    libraries or materials, faces without a texture.
     """
     libraries = [p for p in files_beside(path) if p.suffix.lower() == ".mtl" and p.is_file()]
     found = [m for library in libraries for m in read_mtl(library, path.parent)]
