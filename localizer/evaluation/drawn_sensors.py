@@ -23,7 +23,8 @@ from localizer.types import PosePrior
 class DrawnSensors:
     """Errors of the simulated sensors. tilt_sigma_deg: of roll and pitch, per axis; height_sigma_m:
     of the height; None: not measured. by_frame: independent errors for each frame, as for photos;
-    otherwise constant, as a gimbal's and barometer's in a flight.
+    otherwise constant, as a gimbal's and barometer's in a flight. truth, index: a frame's true pose
+    world_from_camera, and its number.
     """
 
     tilt_sigma_deg: float | None = None

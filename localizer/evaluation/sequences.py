@@ -128,9 +128,10 @@ def evaluate(
 
     mode ``first``: only the first frame has a prior, as in the paper; ``each``: every frame starts
     from its own perturbed true pose. passes: number of renderings and registrations of a frame that
-    starts from a perturbed prior, each from the last result. find: gives a prior at the start and
-    when the camera is lost, instead of the perturbed true pose. A frame outside the map or with an
-    unusable image counts as not localized; `OutsideMapError` or `SequenceError` if all frames are.
+    starts from a perturbed prior, each from the last result. progress: called with the index of
+    each frame that is done. find: gives a prior at the start and when the camera is lost, instead
+    of the perturbed true pose. A frame outside the map or with an unusable image counts as not
+    localized; `OutsideMapError` or `SequenceError` if all frames are.
     """
 
     def begin(frame: Frame, index: int) -> bool:

@@ -81,7 +81,7 @@ class TargetFilter:
 
     def update(self, sighting: TargetSighting) -> TargetFix | None:
         """Fuse an observation of at least one surface, later than the last one; None for one that
-        fits no track. The third of those in a row restarts the filter: its surfaces become the
+        fits no track. The third of those in a row gives a fix again: its surfaces become the
         tracks.
         """
         tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]

@@ -78,7 +78,9 @@ class ImportRules:
         return {name: getattr(self, name) for name in limit_names()}
 
     def require(self, name: str, amount: float, where: object) -> None:
-        """`MapSourceError` if a source exceeds a limit."""
+        """`MapSourceError` if `amount` exceeds the limit `name`. where: the source, for the
+        error.
+        """
         limit = getattr(self, name)
         if amount > limit:
             counts = next(f.metadata["counts"] for f in fields(self) if f.name == name)
