@@ -58,9 +58,7 @@ class DrawnSensors:
         )
 
     def auxiliary(self, sequence: Sequence) -> AuxiliarySensors:
-        """The drawn data in the form that a localizer needs, at the frames' exposure times; None at
-        other times.
-        """
+        """The drawn data for a localizer, at the frames' exposure times; None at other times."""
         index = {time_ns: k for k, time_ns in enumerate(sequence.times_ns)}
 
         def rotation_at(time_ns: int) -> Array | None:

@@ -43,9 +43,7 @@ class Sequence:
     is_timed: bool = True
 
     def frame(self, index: int) -> Frame:
-        """Decode one frame. `SequenceError` if its image cannot be read or has not the camera's
-        size.
-        """
+        """Decode one frame. `SequenceError` if it cannot be read or has not the camera's size."""
         rgb = read_rgb(self.images[index])
         if rgb.shape[:2] != (self.camera.height, self.camera.width):
             raise SequenceError(

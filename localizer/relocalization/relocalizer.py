@@ -138,9 +138,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> list[VerifiedCandidate]:
-        """The registered candidates, best first; the best is refined to the end. Empty if
-        cancelled.
-        """
+        """The registered candidates, best first and refined to the end; empty if cancelled."""
         full, small = self._sights(query)
         return Confirmation(
             self._verifier, full, small, query, candidates, self._config, should_stop

@@ -54,9 +54,7 @@ class TargetFilter:
 
     @property
     def velocity(self) -> Array | None:
-        """Velocity (3,) in m/s, world axes, of the most probable track; None before a second
-        observation.
-        """
+        """Velocity (3,), m/s, world, of the most probable track; None before 2 observations."""
         if not self._tracks or self._tracks[0].sightings < 2:
             return None
         velocity: Array = self._tracks[0].mean[3:].copy()
