@@ -59,7 +59,7 @@ class AutopilotSource(Protocol):
 
 
 def drift_sigma_m(seconds: float) -> float:
-    """Horizontal sigma of an EKF's position, m, `seconds` after its last absolute measurement."""
+    """Horizontal sigma, m (at most 5 km), that an EKF gains in `seconds` without measurements."""
     return min(SENSORS.ekf_drift.sigma_m(seconds), _LARGEST_SIGMA_M)
 
 
@@ -105,7 +105,9 @@ class PositionQualityMonitor:
             self._fix_ns = time_ns
 
     def at(self, state: VehicleState, now_ns: int, *, on_gnss: bool = True) -> PositionQuality:
-        """Quality of this state's position at now_ns. on_gnss: whether the EKF uses GNSS."""
+        """Quality of this state's position at now_ns. Healthy GNSS is noted as the last absolute
+        measurement. on_gnss: whether the EKF uses GNSS.
+        """
         healthy = on_gnss and gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
         with self._lock:
             if healthy:
@@ -156,7 +158,7 @@ class AutopilotPose:
         self.belief = PositionQualityMonitor(config)
 
     def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
-        """Note the time of an accepted estimate. Never blocks.
+        """Note the time of an accepted estimate that `reaches_ekf`. Never blocks.
 
         reaches_ekf: whether positions are sent to the EKF. A fix in shadow mode or on hold does not
         correct the EKF, which may drift; the search region must allow for that.

@@ -55,7 +55,7 @@ EVENT_COLUMNS = ("time_ns", "level", "text", "alert")
 
 def fresh_folder(folder: Path) -> Path:
     """`folder`, or a numbered one beside it if it already holds a record, so that a restart in
-    flight does not overwrite the record.
+    flight does not overwrite the record. Creates nothing.
     """
     candidate, number = folder, 2
     while (candidate / "estimates.csv").exists():
@@ -65,9 +65,8 @@ def fresh_folder(folder: Path) -> Path:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove the record of a failed start, whose files hold at most column names.
-
-    Any of the files may be missing.
+    """Remove the record of a failed start, whose files hold at most column names. Any of the files
+    may be missing. Does nothing if a row was written or the disk fails; keeps other files.
     """
     tables = [folder / name for name in ("estimates.csv", "targets.csv", "events.csv")]
     snapshots = folder / "snapshots"
@@ -82,8 +81,8 @@ def remove_empty(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, config: CompanionConfig) -> None:
-    """Write ``record.json``: settings, the map's hash, versions, and one time on both clocks.
-
+    """Write ``record.json`` into an existing folder: settings without credentials, the map's hash,
+    versions, and one time on both clocks.
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
     `ReportError` if it cannot be written, `DiskFaultError` if the disk is the cause.
     """
@@ -224,7 +223,7 @@ class Recorder:
                 self._written(frame)
 
     def close(self) -> bool:
-        """Write the queue and close the files. False if the disk hangs, which is not waited for."""
+        """Write the queue and close the files. False if the disk hangs for 10 s."""
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)
@@ -323,7 +322,9 @@ class RecordKeeper:
     def open(
         self, config: CompanionConfig, record: RecordConfig, claim: Callable[[Path], None]
     ) -> None:
-        """Create a record in its own folder. claim: called with the folder before it is created."""
+        """Create a record in its own folder. claim: called with the folder before it is created. If
+        the disk is full or failing, the record is marked incomplete; otherwise `ReportError`.
+        """
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
@@ -352,7 +353,9 @@ class RecordKeeper:
             _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
-        """Write the queue, close the files, and write map files (KML etc.) of the targets."""
+        """Write the queue, close the files, and write map files (KML etc.) of the targets; nothing
+        if no record is open.
+        """
         answers = self.recorder is None or self.recorder.close()
         if self.folder is not None and answers:
             try:
