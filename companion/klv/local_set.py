@@ -112,7 +112,8 @@ def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
 def decode(packet: bytes) -> dict[int, float | str | int]:
     """Decode a packet to values by tag, `TIME` in microseconds; unknown tags are left out.
 
-    ValueError for another label, a packet that is cut short, or a wrong checksum.
+    ValueError for another label, a packet that is cut short, or a wrong checksum; a packet without
+    a checksum is read.
     """
     if packet[:16] != UNIVERSAL_LABEL:
         raise ValueError("not a local set of ST 0601")

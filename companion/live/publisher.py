@@ -107,14 +107,14 @@ class Publisher:
             self._thread.join(2.0)
 
     def close(self) -> None:
-        """Release the socket, after `stop`."""
+        """Close the socket and remove its file, after `stop`."""
         for end in (self._listening, self._woken, self._waker):
             end.close()
         with contextlib.suppress(OSError):
             self.path.unlink()
 
     def pending_bytes(self) -> list[int]:
-        """Bytes not yet sent to each console."""
+        """Bytes of the message under way to each connected console; 0 if none is."""
         return [len(c.sending) for c in tuple(self._consoles.values())]
 
     def wake(self) -> None:

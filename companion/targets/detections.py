@@ -139,7 +139,7 @@ class DetectionListener:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening, wait for the thread, and free the port."""
         self._stop.set()
         wait_for_end(self._thread)
         self._socket.close()
