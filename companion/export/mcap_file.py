@@ -76,7 +76,7 @@ class McapFile:
         self._add(topic, "protobuf", self._schemas[name], message.SerializeToString(), time_ns)
 
     def attach(self, path: Path) -> None:
-        """Attach a file of the record unchanged."""
+        """Attach a JSON file of the record unchanged."""
         time_ns = path.stat().st_mtime_ns
         self._writer.add_attachment(
             time_ns, time_ns, path.name, "application/json", plain_bytes(path)
