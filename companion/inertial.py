@@ -48,7 +48,9 @@ class VehicleTelemetry(Protocol):
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time; None unless it uses GNSS."""
+        """The EKF's latitude, longitude (degrees) and altitude AMSL (m) at a time; None unless it
+        uses GNSS.
+        """
         ...
 
 

@@ -49,7 +49,7 @@ class MapOffsetTelemetry(Protocol):
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time; None unless the EKF uses GNSS."""
+        """As of `VehicleTelemetry`: the EKF's position at a time; None unless it uses GNSS."""
         ...
 
     def report_alert(self, alert: Alert) -> None:

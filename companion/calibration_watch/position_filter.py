@@ -61,7 +61,7 @@ class PositionFilter:
         return self._figure(_T)
 
     def forget_motion(self) -> None:
-        """Forget the motion since the last observation, after a gap or a jump of vision."""
+        """Reset position, velocity and IMU bias to unknown, after a gap or a jump of vision."""
         for at in (_P, _V, _A):
             self._loosen(at, 2)
 

@@ -42,7 +42,7 @@ class FlightSource:
         await self._event.wait()
 
     def watch(self, wanted: bool) -> None:
-        """Request frames from the flight, or stop."""
+        """Request frames from the flight, or stop; also from the next one that connects."""
         if wanted != self._wanted:
             self._wanted = wanted
             self._send({"kind": "watch", "frames": wanted})

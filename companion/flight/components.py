@@ -138,7 +138,7 @@ class Assembly:
         self._made.clear()
 
     def start(self, up: ExitStack) -> None:
-        """Start every component; `up` stops them in reverse."""
+        """Start every component, after `make`; `up` stops them in reverse."""
         for part in self._parts:
             made = self._made[part.kind]
             if part.start is not None:

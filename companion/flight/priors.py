@@ -54,7 +54,9 @@ class AutopilotSource(Protocol):
         ...
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's position (north, east, down) from its origin, m; None if unknown."""
+        """The EKF's position (north, east, down) from its origin, m, at a CLOCK_MONOTONIC time;
+        None if unknown.
+        """
         ...
 
 
@@ -214,7 +216,9 @@ class AutopilotPose:
         return bool(self._autopilot.state().ekf_flags & _ATTITUDE)
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """Prior of the camera's pose at a CLOCK_MONOTONIC time; None while unknown."""
+        """Prior of the camera's pose at a CLOCK_MONOTONIC time; None if position, its sigma,
+        attitude or gimbal is unknown. Not `independent` if the EKF's position is our own fixes'.
+        """
         state = self._autopilot.state()
         belief = self._quality(state, time_ns)
         if belief.sigma_m is None:
@@ -230,8 +234,8 @@ class AutopilotPose:
         return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
-        """The camera's rotation (3, 3), map axes from camera, at that time, from attitude and
-        gimbal; None if unknown.
+        """The camera's rotation (3, 3), map axes from camera, at a CLOCK_MONOTONIC time, by the
+        reported attitude of the camera to NED; None if unknown.
         """
         gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
@@ -271,10 +275,6 @@ class PriorSources:
 
     def __init__(self, *sources: PriorProvider) -> None:
         self._sources = sources
-
-    def add(self, source: PriorProvider) -> None:
-        """Add a source, used if the earlier ones have no prior."""
-        self._sources = (*self._sources, source)
 
     def at(self, time_ns: int) -> PosePrior | None:
         """A prior for that CLOCK_MONOTONIC time; None if no source has one."""

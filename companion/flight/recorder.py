@@ -205,7 +205,7 @@ class Recorder:
         self._put("targets", lambda: _target_row(fix, self._frame))
 
     def event(self, level: str, text: str, alert: str = "") -> None:
-        """Record an event at the current time. alert: its identifier, if any."""
+        """Record an event at the current time. level: info or warning; alert: identifier or ""."""
         row = (time.monotonic_ns(), level, text, alert)
         self._put("events", lambda: row)
 
@@ -338,7 +338,9 @@ class RecordKeeper:
             raise
 
     def link(self) -> None:
-        """Point the link ``latest`` beside the record to it, unless a record has that name."""
+        """Point the link ``latest`` beside the open record to it, unless a record has that name. A
+        failure is only logged.
+        """
         if self.folder is None or self.folder.name.startswith(LATEST_NAME):
             return
         link = self.folder.parent / LATEST_NAME

@@ -96,8 +96,8 @@ _LONGEST_TEXT = 127
 def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
     """Encode one packet: universal label, length, time, the fields by tag, checksum.
 
-    time_us: microseconds since 1970-01-01. fields: values by tag in ST 0601's units. ValueError for
-    a tag that is not known here.
+    time_us: microseconds since 1970-01-01. fields: values by tag in ST 0601's units; one out of its
+    tag's range is left out. ValueError for a tag that is not known here.
     """
     body = _item(TIME, time_us.to_bytes(8, "big"))
     for tag, value in sorted({**fields, LOCAL_SET_VERSION: VERSION}.items()):

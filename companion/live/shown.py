@@ -111,7 +111,7 @@ class ConsoleData:
             self._targets.pop(name, None)
 
     def add_event(self, level: str, text: str) -> None:
-        """Add an event, such as an alert, for the page's list. level: its severity."""
+        """Add an event, such as an alert, for the page's list. level: "info" or "warning"."""
         with self._lock:
             self._count += 1
             self._events.append((self._count, time.monotonic_ns(), level, text))

@@ -70,14 +70,14 @@ class RecordTables:
 
     @property
     def start_ns(self) -> int:
-        """Start of the record, CLOCK_MONOTONIC."""
+        """Start of the record, CLOCK_MONOTONIC ns; else the first estimate's exposure, else 0."""
         return self._time_ns("monotonic_ns") or int(
             next(iter(self.estimates.get("exposure_time_ns", ())), 0)
         )
 
     @property
     def utc_ns(self) -> int:
-        """UTC of the start; 0 if unknown."""
+        """UTC of `start_ns`, ns; 0 if unknown."""
         return self._time_ns("utc_ns")
 
     @property

@@ -88,7 +88,7 @@ class ExposureClock:
         self._held = False
 
     def exposure_time(self, stamps: FrameTimestamps, arrival_ns: int) -> int:
-        """CLOCK_MONOTONIC nanoseconds of the exposure of a frame that arrived at `arrival_ns`."""
+        """CLOCK_MONOTONIC ns of the exposure of the next frame, which arrived at `arrival_ns`."""
         if self._device and stamps.pts_ns is not None and _plausible(stamps.pts_ns, arrival_ns):
             return stamps.pts_ns
         if stamps.misp is not None and self._timing == "auto":

@@ -69,7 +69,7 @@ class FlightProcess:
             return None
 
     def close(self) -> None:
-        """Close the pipe of the signs of life; the process goes on. Harmless again."""
+        """Close the pipe of the signs of life, also repeatedly; the process goes on."""
         if self._beats >= 0:
             os.close(self._beats)
             self._beats = -1

@@ -207,8 +207,8 @@ class TargetManager:
         self._follow(name, life, click, fix)
 
     def add_detection(self, detection: Detection, estimate: PoseEstimate) -> None:
-        """Update a target by a detection in the estimate's frame, and report its position; at most
-        `rate_hz` times a second.
+        """Update a target by a detection in the estimate's frame, and report its position; more
+        than `rate_hz` detections a second are ignored.
         """
         name, time_ns = detection.target_id, estimate.exposure_time_ns
         life = self._lives.get(name)
