@@ -24,8 +24,8 @@ _PROFILE = ""  # Foxglove's schemas need none
 
 
 class McapFile:
-    """Writes rows of a flight to an MCAP file. clock_offset_ns: from CLOCK_MONOTONIC to UTC;
-    camera: of the images, None: no calibration.
+    """Writes rows of a flight to an MCAP file, which is replaced. clock_offset_ns: from
+    CLOCK_MONOTONIC to UTC; camera: of the images, None: no calibration.
     """
 
     def __init__(self, path: Path, clock_offset_ns: int, camera: Camera | None) -> None:

@@ -151,7 +151,8 @@ def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
 
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder, and the accepted
-    estimates as a trajectory (`TrajectoryFiles`, created with the first of them).
+    estimates as a trajectory (`TrajectoryFiles`, created with the first of them). The constructor
+    creates folder and files, replacing older ones (`ReportError`), and starts the thread.
 
     No method blocks its caller: rows beyond a bounded queue are dropped and counted. If the disk is
     full or gone, rows are dropped and counted too, and the flight continues without its record.

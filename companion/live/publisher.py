@@ -68,7 +68,8 @@ class _Console:
 
 
 class Publisher:
-    """Serves console processes at the socket `path`, in a thread of its own.
+    """Serves console processes at the socket `path`, which the constructor makes (`LinkError`), in
+    a thread of its own.
 
     shown: gives state documents and frames; orders: executes the console's orders. frames_hz: limit
     of frames per second. The flight calls only `start`, `stop` and `wake`.

@@ -23,8 +23,8 @@ class Beat:
 
 
 class FlightProcess:
-    """Starts and controls a flight process. standby: it is started with ``--standby``, prepares and
-    waits. hands_on: inherited file descriptors.
+    """Starts (in the constructor; OSError) and controls a flight process. standby: it is started
+    with ``--standby``, prepares and waits. hands_on: inherited file descriptors.
 
     It has its own process group, so that the terminal's interrupt reaches it through the supervisor
     only. It has no session of its own, because Linux schedules each session as one group and would

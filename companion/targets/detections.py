@@ -113,8 +113,8 @@ def parse_host_port(text: str) -> tuple[str, int]:
 
 
 class DetectionListener:
-    """Receives detections over UDP on a thread. Invalid datagrams are counted and ignored. Targets
-    of two senders with the same name are kept apart (`Senders`).
+    """Receives detections over UDP on a thread, from its construction on. Invalid datagrams are
+    counted and ignored. Targets of two senders with the same name are kept apart (`Senders`).
 
     address: host:port to listen at; `ConfigError` if it cannot be used. on_detection: called on
     that thread.
