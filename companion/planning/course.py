@@ -60,7 +60,7 @@ def straight(start: Array, end: Array) -> Course:
 def spline(
     start: Array, end: Array, arrives: Array, after: Array | None, *, curved_on: bool
 ) -> Course:
-    """A spline between two positions (3,). arrives: (3,) end direction of the previous course;
+    """A spline between two positions (3,), world metres. arrives: `leaves` of the course before;
     after: next position, None for a stop; curved_on: whether the next leg is a spline.
     """
     leaves = np.zeros(3)
