@@ -14,6 +14,7 @@ from rich.table import Table
 
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count
+from companion.writing import result_file, writing
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -45,6 +46,8 @@ def flight_command(
 
     if write and config is None:
         raise ConfigError("--write needs --config: which deployment file is to be changed?")
+    if report is not None:
+        result_file(report, "--json", (".json",), config, tlog, *record.glob("*.json"))
     loaded = load_record(record, 0.0, tlog, map_cache)
     with show_count(Console(stderr=True), "pictures") as count:
         found = calibrate(loaded, frames, count)
@@ -65,7 +68,9 @@ def flight_command(
     )  # fmt: skip
     console.print(_changes(wanted))
     if report is not None:
-        report.write_text(json.dumps(_figures(found, wanted, blind), indent=1), encoding="utf-8")
+        with writing(report, "--json"):
+            text = json.dumps(_figures(found, wanted, blind), indent=1)
+            report.write_text(text, encoding="utf-8")
     if write and config is not None:
         require_flown_with(config, wanted)
         kept = write_changed(config, wanted, f"calibrated by `companion calibrate flight {record}`")
