@@ -22,12 +22,12 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.basin import axes as basin_axes
-    from benchmarks.basin.run import BasinOutcome, groups, run, sized_starts, summary
+    from benchmarks.basin.run import BasinOutcome, run, sized_starts
     from benchmarks.basin.tables import Cells, ablation_table, covariance_table
     from benchmarks.basin.variants import (
         DEFAULT_ANCHORS,
@@ -67,40 +67,19 @@ def ablation(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """Table 4, or the priors: one line a variant and start."""
     rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
     outcomes = _registered(args, rows)
-    views = len({o.view for o in outcomes})
-    print(f"{args.set}: {views} views; R@1 = share within 1 m and 1 degree")
-    last = ""
-    for variant, start, mine, full in sorted(
-        groups(outcomes), key=lambda g: [v.name for v in rows].index(g[0])
-    ):
-        s = summary(mine, full)
-        nees = "    -" if s["nees"] is None else f"{s['nees']:5.1f}"
-        label, last = ("" if variant == last else variant), variant
-        print(
-            f"{label:34s} {start:9s} n={s['n']:<4.0f} R@1 {s['r1']:5.1f} "
-            f"[{s['r1_low']:4.1f}, {s['r1_high']:5.1f}]  change {s['change']:+5.1f} "
-            f"[{s['change_low']:+5.1f}, {s['change_high']:+5.1f}]  R@3 {s['r3']:5.1f}  "
-            f"median {s['median']:5.2f} m [{s['median_low']:.2f}, {s['median_high']:.2f}]  "
-            f"NEES {nees}  {s['ms']:5.1f} ms"
-        )
     return outcomes, ablation_table(args.set, outcomes)
 
 
 def covariance(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """NEES of "ours", those on which it was fitted apart."""
     outcomes = _registered(args, [Variant(FULL)])
-    columns, rows = covariance_table(args.set, outcomes, photos_of(args))
-    for row in (columns, *rows):
-        print(" | ".join(row))
-    return outcomes, (columns, rows)
+    return outcomes, covariance_table(args.set, outcomes, photos_of(args))
 
 
 def axes(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """Table 6 and Fig. 10: share converged against the initial error of each axis."""
     variants = basin_axes.axis_variants()
     outcomes = run(views_of(args), variants, basin_axes.axis_starts, args.model, args.processes)
-    print(args.set, end=": ")
-    basin_axes.report(outcomes)
     if args.plot:
         basin_axes.plot(outcomes, args.plot)
     return outcomes, basin_axes.table(outcomes)
@@ -133,9 +112,8 @@ def main() -> None:
     if args.set not in ("generated", "plain") and not (args.data / args.set).is_dir():
         parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
     outcomes, (columns, rows) = _TABLES[args.what](args)
-    if args.json:
-        made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}
-        write_figures(args.json, columns, rows, made)
+    made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}
+    show_figures(args.json, columns, rows, made)
 
 
 if __name__ == "__main__":
