@@ -1,6 +1,6 @@
 """Convergence of the registration: the paper's Table 4 (ablation), Table 6 and Fig. 10 (basin).
 
-    python -m benchmarks.basin ablation FOLDER [--set generated|plain|quito|portugal|caliterra]
+    python -m benchmarks.basin ablation FOLDER [--set generated|quito|portugal|caliterra]
     python -m benchmarks.basin priors FOLDER [--set ...] [--anchors N]
     python -m benchmarks.basin covariance FOLDER [--set ...]
     python -m benchmarks.basin axes FOLDER [--set ...] [--plot basin.png]
@@ -94,9 +94,7 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("what", choices=tuple(_TABLES), help="table")
     parser.add_argument("folder", type=Path, help="of worlds, maps and query images")
-    parser.add_argument(
-        "--set", default="generated", help="generated, plain, or a folder of --data"
-    )
+    parser.add_argument("--set", default="generated", help="generated, or a folder of --data")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="of real sets")
     parser.add_argument("--pairs", type=whole(1, 100_000), default=320, help="views")
     parser.add_argument("--processes", type=whole(1, 256), default=2, help="that register")
@@ -109,7 +107,7 @@ def main() -> None:
     parser.add_argument("--plot", type=output, help="PNG of the axes' curves")
     parser.add_argument("--json", type=output, help="the table and every outcome")
     args = parser.parse_args()
-    if args.set not in ("generated", "plain") and not (args.data / args.set).is_dir():
+    if args.set != "generated" and not (args.data / args.set).is_dir():
         parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
     outcomes, (columns, rows) = _TABLES[args.what](args)
     made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}

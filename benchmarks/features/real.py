@@ -18,15 +18,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.common.maps import build_map, layers_of, origin_of
 from benchmarks.features.pairs import DEGREES, METRES, SIZE, TestPair
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.importers.rules import ImportRules
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
@@ -52,30 +49,16 @@ def real_pairs(
     if (folder / "offsets.csv").exists():
         return _season_pairs(folder, count, seed, size)
     photos = folder / "queries"
-    origin = _origin(folder / "georef.json") if photos.exists() else None
-    with TileStreamer(TileCache.open(_map(folder, cache, origin))) as streamer:
+    with TileStreamer(TileCache.open(_map(folder, cache))) as streamer:
         renderer = NumbaRenderer(streamer)
         if photos.exists():
             return _photo_pairs(renderer, photos, count, seed, size)
         return _rendered_pairs(renderer, count, seed, size)
 
 
-def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
+def _map(folder: Path, cache: Path) -> Path:
     built = cache / f"map-{folder.name}"
-    if not built.exists():
-        layers = [folder / "dsm.tif", folder / "ortho.tif"]
-        # Heights only need to agree between map and poses here, so the separation does not matter.
-        build_cache(
-            layers if layers[0].exists() else folder,
-            built,
-            BuildOptions(
-                geoid_separation_m=0.0,
-                vertical_datum="ellipsoidal",
-                rules=ImportRules(trusted=frozenset({"geoid"})),
-                origin=origin,
-            ),
-        )
-    return built
+    return built if built.exists() else build_map(layers_of(folder), built, origin_of(folder))
 
 
 def _photo_pairs(
@@ -233,8 +216,3 @@ def plane_view(ortho: Image, pose: Pose, camera: Camera) -> tuple[Image, Float32
     )
     image[~on] = 0
     return image, np.where(on, depth, 0.0).astype(np.float32)
-
-
-def _origin(georef: Path) -> Geodetic:
-    origin = json.loads(georef.read_text())["origin"]
-    return Geodetic(origin["lat"], origin["lon"], origin["height"])

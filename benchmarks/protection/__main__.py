@@ -47,7 +47,7 @@ _COLUMNS = (
 def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
-    p.add_argument("--set", default="generated", help="generated, plain, quito, caliterra")
+    p.add_argument("--set", default="generated", help="generated, quito, caliterra")
     p.add_argument("--views", type=whole(2, 100_000), default=80, help="how many")
     p.add_argument("--draws", type=whole(1, 100), default=2, help="faults of each view")
     p.add_argument("--focal", type=number(-0.2, 0.2), help="share; instead of a drawn one")

@@ -39,7 +39,7 @@ from localizer.config import LocalizerConfig
 def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
-    p.add_argument("--set", default="generated", help="generated, plain, quito, caliterra")
+    p.add_argument("--set", default="generated", help="generated, quito, caliterra")
     p.add_argument("--views", type=whole(1, 100_000), default=40, help="how many")
     p.add_argument(
         "--heading", choices=("known", "unknown", "both"), default="both", help="to 15 degrees"
