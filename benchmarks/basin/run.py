@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.basin.variants import FULL, Variant
 from benchmarks.basin.views import BasinView
-from benchmarks.features.report import wilson
+from benchmarks.common.shares import wilson
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log

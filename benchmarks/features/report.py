@@ -70,16 +70,6 @@ def _outcome(row: dict[str, str]) -> PairOutcome:
     )
 
 
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share, in percent."""
-    if count == 0:
-        return 0.0, 100.0
-    z, p = 1.96, hits / count
-    middle = (p + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * np.sqrt(p * (1 - p) / count + z * z / (4 * count**2))
-    return 100 * max(middle - half, 0.0), 100 * min(middle + half, 1.0)
-
-
 def difference(
     a: Sequence[PairOutcome], b: Sequence[PairOutcome], limit: float = 1
 ) -> tuple[float, float, float]:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from benchmarks.common.figures import markdown
-from benchmarks.features.report import PairOutcome, difference, wilson
+from benchmarks.common.shares import wilson
+from benchmarks.features.report import PairOutcome, difference
 from localizer.synth.appearance.model import CONDITIONS
 
 Cells = tuple[tuple[str, ...], list[tuple[str, ...]]]  # columns and rows

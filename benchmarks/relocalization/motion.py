@@ -271,7 +271,7 @@ def run(
 
 def share(hits: int, count: int) -> dict[str, float]:
     """With its exact 95 % interval, per cent."""
-    low, high = exact_interval(hits, count) if count else (0.0, 100.0)
+    low, high = exact_interval(hits, count)
     return {"hits": hits, "count": count, "low": low, "high": high}
 
 

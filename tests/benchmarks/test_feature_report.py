@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.common.shares import wilson
 from benchmarks.features.report import (
     PairOutcome,
     difference,
     read_outcomes,
-    wilson,
     write_outcomes,
 )
 from benchmarks.features.tables import report
