@@ -22,10 +22,10 @@ class DeviceArray:
 
     @classmethod
     def of(cls, other: Any) -> DeviceArray:
-        """From any object with ``__cuda_array_interface__`` (CuPy, PyTorch, numba).
+        """From any object with ``__cuda_array_interface__`` (CuPy, PyTorch, numba), without a copy.
 
-        The array must be complete, because the registration's stream does not wait for other
-        streams. `DeviceArrayError` if it has strides.
+        Its values must have been computed (synchronize first), because the registration's stream
+        does not wait for other streams. `DeviceArrayError` if it has strides.
         """
         interface = other.__cuda_array_interface__
         if interface.get("strides") is not None:
@@ -44,8 +44,8 @@ class DeviceArray:
         return DeviceArray(self.address, shape, self.dtype, self.owner)
 
     def checked_address(self, dtype: DTypeLike) -> int:
-        """The address, after checks of type and alignment that the kernels rely on.
-        `DeviceArrayError` if one of them differs.
+        """The address for a kernel. `DeviceArrayError` if the array is not of `dtype` or not
+        aligned to 16 bytes.
         """
         if self.dtype != np.dtype(dtype):
             raise DeviceArrayError(

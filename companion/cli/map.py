@@ -331,14 +331,15 @@ def render(
     from localizer.geometry.camera import Camera
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection import inspect
+    from localizer.pictures import write_rgb
 
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
     with show_work(Console(stderr=True), "rendering; the first time compiles the renderer"):
         view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
     with writing(out, "--out"):
-        inspect.write_picture(out, view.rgb)
-        inspect.write_picture(depth, inspect.depth_picture(view.depth))
+        write_rgb(out, view.rgb)
+        write_rgb(depth, inspect.depth_picture(view.depth))
     shown = view.depth[view.depth > 0]
     Console().print(f"{out}, {depth}: depth {shown.min():.1f} to {shown.max():.1f} m")
 

@@ -49,7 +49,7 @@ class DrawnSensors:
         return float(truth.translation[2] + self.height_sigma_m * error)
 
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
-        """The localizer's settings with these sigmas."""
+        """The localizer's settings with these sigmas; what is not measured is not used."""
         tilt = self.tilt_sigma_deg
         attitude = None if tilt is None else AttitudePrior.with_sigma(tilt)
         return config.model_copy(
@@ -57,7 +57,9 @@ class DrawnSensors:
         )
 
     def auxiliary(self, sequence: Sequence) -> AuxiliarySensors:
-        """The drawn data in the form that a localizer needs, by the frames' exposure times."""
+        """The drawn data in the form that a localizer needs, at the frames' exposure times; None at
+        other times.
+        """
         index = {time_ns: k for k, time_ns in enumerate(sequence.times_ns)}
 
         def rotation_at(time_ns: int) -> Array | None:

@@ -43,7 +43,9 @@ class Sequence:
     is_timed: bool = True
 
     def frame(self, index: int) -> Frame:
-        """Decode one frame. `SequenceError` if its size differs from the camera's."""
+        """Decode one frame. `SequenceError` if its image cannot be read or has not the camera's
+        size.
+        """
         rgb = read_rgb(self.images[index])
         if rgb.shape[:2] != (self.camera.height, self.camera.width):
             raise SequenceError(
@@ -53,7 +55,7 @@ class Sequence:
         return Frame(rgb, self.times_ns[index], self.camera, index)
 
     def first(self, count: int) -> Sequence:
-        """The first frames of the sequence."""
+        """The sequence's first `count` frames; all if there are fewer."""
         return replace(
             self,
             images=self.images[:count],

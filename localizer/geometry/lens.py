@@ -76,7 +76,7 @@ def distorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tup
 
 
 def undistorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tuple[Array, Array]:
-    """Inverse of `distorted`; NaN for a fisheye ray at 90 degrees or more."""
+    """Inverse of `distorted`; NaN for a fisheye ray at more than 85 degrees from the axis."""
     if model == "fisheye":
         r = np.hypot(x, y)
         angle = _fisheye_angle(k, r)

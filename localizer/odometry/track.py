@@ -12,7 +12,6 @@ from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.growth import (
     between,
     distance_covariance,
-    distance_squared,
     fuse,
     kalman_update,
     transferred,
@@ -100,7 +99,8 @@ def rejection(config: OdometryConfig, result: Registration, prior: PosePrior) ->
     sigma = float(np.sqrt(result.covariance.diagonal()[:3].max()))
     if sigma > config.max_sigma_m:
         return f"position sigma {sigma:.1f} m is beyond {config.max_sigma_m:g}"
-    if distance_squared(prior, result.world_from_camera, result.covariance) > config.chi2_threshold:
+    distance = prior.mahalanobis_squared(result.world_from_camera, result.covariance)
+    if distance > config.chi2_threshold:
         return "the pose contradicts the prediction"
     return ""
 

@@ -107,7 +107,9 @@ class Relocalizer:
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> list[PlaceCandidate]:
-        """The most similar positions, best first; empty if cancelled or without any."""
+        """The most similar positions, best first; empty if cancelled, without any, and for a frame
+        without contrast (covered lens).
+        """
         camera = working_camera(query.frame.camera, min(_SEARCH_WIDTH, query.frame.camera.width))
         image = cv2.GaussianBlur(self._undistorted(query, camera), (0, 0), _BLUR_PX)
         if (
@@ -190,7 +192,8 @@ def open_relocalizer(
     should_stop: Callable[[], bool] = lambda: False,
 ) -> OpenRelocalizer | None:
     """Open a relocalizer with its own renderer and network, so that it and the tracker do not wait
-    for each other. Computes the map's overview if it is missing. None if cancelled.
+    for each other. Computes the map's overview if it is missing, and stores it (`open_overview`,
+    also for its arguments and errors). None if cancelled.
     """
     c = config.relocalization
     streamer = TileStreamer(cache, byte_budget=c.cache_mib * 2**20)

@@ -85,7 +85,7 @@ def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
 
 
 def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel:
-    """The finest level at which a patch of `side_m` can be compared."""
+    """The finest level at which a patch of `side_m` can be compared, otherwise the coarsest."""
     for level in levels:
         if side_m / level.gsd_m <= _MOST_PX:
             return level
@@ -113,7 +113,9 @@ def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
 
 
 def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> Array:
-    """Heights above ground (n,) to rectify for, so that each position has one near its own."""
+    """Heights above ground (n,) in m, ascending, to rectify for, so that each position has one near
+    its own; empty if no ground height is known.
+    """
     known = ground[np.isfinite(ground)]
     if len(known) == 0:
         return np.empty(0)

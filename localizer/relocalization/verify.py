@@ -198,7 +198,7 @@ class Verifier:
         if float(np.linalg.norm(away[:2])) > _FARTHEST_M:
             return False
         if query.heading_sigma_rad is not None:
-            _, heading = tilt_and_heading(result.world_from_camera.rotation, query.rotation)
+            _, heading = attitude_difference(result.world_from_camera.rotation, query.rotation)
             reach = self.config.heading_reach * query.heading_sigma_rad
             if abs(heading) > reach + 3 * _HEADING_SIGMA_RAD:
                 return False
@@ -207,7 +207,7 @@ class Verifier:
 
 def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseConstraint]:
     """Constraints by the query: roll and pitch, at the pose's heading, and the height."""
-    _, heading = tilt_and_heading(pose.rotation, query.rotation)
+    _, heading = attitude_difference(pose.rotation, query.rotation)
     tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
     return (
         attitude_constraint(with_heading(query.rotation, heading), tilt, np.pi),
@@ -222,9 +222,9 @@ def displaced(prior: PosePrior, away: Array) -> PosePrior:
     return replace(prior, world_from_camera=Pose(pose.rotation, place))
 
 
-def tilt_and_heading(rotation: Array, reference: Array) -> tuple[float, float]:
-    """Tilt (rad, >= 0) and rotation about the vertical (rad, counter-clockwise) of a rotation (3,
-    3) world_from_camera relative to a reference.
+def attitude_difference(rotation: Array, reference: Array) -> tuple[float, float]:
+    """(tilt, heading): tilt (rad, >= 0) and rotation about the vertical (rad, counter-clockwise) of
+    a rotation (3, 3) world_from_camera relative to a reference.
     """
     relative = rotation @ reference.T
     # Twist of the swing-twist decomposition: what of the turn is about the vertical.

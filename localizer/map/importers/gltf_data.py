@@ -35,7 +35,7 @@ class GltfData:
         self._buffers: dict[int, bytes] = {}
 
     def picture(self, index: int) -> bytes:
-        """Bytes of an encoded image: JPEG, PNG or WebP."""
+        """Bytes of an encoded image: JPEG, PNG or WebP. `MapSourceError` if there is none."""
         image = item(self.json.get("images", []), index, "image")
         if "bufferView" in image:
             return self.buffer_view(image["bufferView"])[0]

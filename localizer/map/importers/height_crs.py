@@ -120,7 +120,9 @@ def _keyed_heights(
 
 
 def geo_keys(path: Path) -> dict[int, int]:
-    """Numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty without one."""
+    """Numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty without one, and for a
+    file that cannot be read.
+    """
     try:
         with path.open("rb") as file:
             return _geo_keys(file)

@@ -57,7 +57,9 @@ def offline() -> Iterator[None]:
 
 
 def open_raster(path: Path) -> DatasetReader:
-    """Open a GeoTIFF; `MapSourceError` for another file. Use under `offline`."""
+    """Open a GeoTIFF, which the caller closes; `MapSourceError` for another file. Use under
+    `offline`.
+    """
     require_plain_file(path)
     _require_tiff(path)
     for beside in (f"{path}.ovr", f"{path}.msk"):
@@ -72,8 +74,8 @@ def open_raster(path: Path) -> DatasetReader:
 
 
 def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRules) -> Path:
-    """Write a constant height model below an orthophoto, for a flat map. `MapSourceError` or
-    `GeoreferenceError` if the orthophoto has heights or no georeference.
+    """Write a constant height model below an orthophoto, for a flat map, to `path`, and return
+    that. `MapSourceError` or `GeoreferenceError` if the orthophoto has heights or no georeference.
     """
     with offline(), open_raster(ortho) as data:
         require_sane(ortho, data, rules)
@@ -92,7 +94,7 @@ def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRul
 
 
 def open_cached(path: Path) -> DatasetReader:
-    """As `open_raster`; the dataset is cached for the next tile of the same process."""
+    """As `open_raster`, but kept for the next tile of the same process: do not close it."""
     stat = path.stat()
     return _kept(path, stat.st_mtime_ns, stat.st_size)
 
@@ -182,7 +184,9 @@ def has_own_mask(data: DatasetReader) -> bool:
 
 
 def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
-    """Band numbers of red, green and blue; `MapSourceError` for a palette."""
+    """Band numbers of red, green and blue, one and the same for grey; `MapSourceError` for a
+    palette.
+    """
     meaning = list(data.colorinterp)
     if meaning[0] == ColorInterp.palette:
         raise MapSourceError(

@@ -102,7 +102,9 @@ def limit_names() -> tuple[str, ...]:
 
 
 def require_plain_file(path: Path) -> None:
-    """`MapSourceError` for a pipe, socket or device, which may block for ever."""
+    """`MapSourceError` for a missing file, and for a pipe, socket or device, which may block for
+    ever.
+    """
     try:
         mode = path.stat().st_mode
     except OSError as error:
