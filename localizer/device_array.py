@@ -36,9 +36,7 @@ class DeviceArray:
         )  # fmt: skip
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """The same memory under another shape of the same size. `DeviceArrayError` if the sizes
-        differ.
-        """
+        """The same memory under another shape. `DeviceArrayError` if its size differs."""
         if int(np.prod(shape)) != int(np.prod(self.shape)):
             raise DeviceArrayError(f"a device array of shape {self.shape} cannot be {shape}")
         return DeviceArray(self.address, shape, self.dtype, self.owner)

@@ -36,8 +36,9 @@ def decode_rgb(
     data: bytes, *, turned: bool = True, grey_range: GreyRange | None = None
 ) -> Image | None:
     """RGB image (H, W, 3) of a file's content, grey ones with three equal channels; None if it is
-    no image of 8 or 16 bits; cv2.error if `data` is empty. turned: rotate it by its EXIF data.
-    Colour of 16 bits loses its lower 8. grey_range: see `grey_levels`, for 16-bit grey only.
+    no image, or of colours that have not 8 or 16 bits; cv2.error if `data` is empty. turned: rotate
+    it by its EXIF data. Colours of 16 bits lose the lower 8. grey_range, for 16-bit grey only, and
+    its errors: see `grey_levels`.
     """
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
     if not turned:

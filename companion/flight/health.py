@@ -135,7 +135,9 @@ class HealthMonitor:
             self._file.stop()
 
     def end(self, how: str) -> None:
-        """Set the reason for which the flight ends; the last report states it."""
+        """Set the reason for which the flight ends. From now on nothing is reported until `stop`,
+        whose last report states it.
+        """
         self._ended = how
 
     def add_estimate(self, estimate: PoseEstimate) -> None:

@@ -73,6 +73,7 @@ class Camera:
         and ``readout_ms``, or of other programs' keys (`localizer.geometry.camera_file`).
 
         `CameraError` for a distortion model that is not supported, and for impossible values.
+        where: begins its text.
         """
         try:
             camera = cls(**camera_numbers(data))
@@ -90,7 +91,7 @@ class Camera:
         return cls.from_dict(read_numbers(Path(path)), str(path))
 
     def to_dict(self) -> dict[str, Any]:
-        """Inverse of `from_dict`."""
+        """Inverse of `from_dict`, as JSON data under this project's keys."""
         return {k: getattr(self, k) for k in KEYS} | {
             "distortion": list(self.distortion), "distortion_model": self.distortion_model,
             "readout_ms": self.readout_ms,

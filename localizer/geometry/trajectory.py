@@ -112,9 +112,7 @@ def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
 
 
 def covariance_row(pose: StampedPose) -> tuple[str, ...] | None:
-    """A pose's texts for `COVARIANCE_COLUMNS`; the time is "" if unknown. None without a
-    covariance.
-    """
+    """The texts of `COVARIANCE_COLUMNS`, "" for an unknown time; None without a covariance."""
     if pose.covariance is None:
         return None
     time_ns = "" if pose.time_ns is None else str(pose.time_ns)

@@ -36,9 +36,7 @@ class OdometryStart:
     constraint: PoseConstraint | None
 
     def corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
-        """The constraint without the sensors' constant error, which is known at the start; None:
-        none.
-        """
+        """The constraint without the sensors' constant error, known at the start; None stays."""
         if constraint is None or self.constraint is None:
             return constraint
         return without_constant_error(constraint, self.constraint, self.pose)

@@ -17,9 +17,7 @@ _UNFINISHED_S = 86_400.0  # of a process that was cut off; one that writes takes
 
 
 def mark_used(folder: Path) -> None:
-    """Set an overview folder's modification time to now if possible, so that `drop_old`
-    keeps it.
-    """
+    """Set an overview folder's modification time to now if possible: `drop_old` keeps it."""
     try:
         os.utime(folder)
     except OSError:  # a map that is only read keeps what it has

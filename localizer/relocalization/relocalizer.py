@@ -48,6 +48,7 @@ class Relocalizer:
 
     extractor: the network without the detail level. The caller closes all arguments; no other
     thread may use the renderer. height_sigma_m: RMS of the object heights that the map lacks.
+    should_stop: called all the time; True cancels.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> Relocalization | None:
-        """The candidate that registration confirms; None if it confirms none."""
+        """The candidate that registration confirms; None if it confirms none, or if cancelled."""
         began = time.perf_counter()
         registered = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}
@@ -137,7 +138,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> list[VerifiedCandidate]:
-        """The registered candidates, best first; the best is refined to the end."""
+        """The registered candidates, best first and refined to the end; empty if cancelled."""
         full, small = self._sights(query)
         return Confirmation(
             self._verifier, full, small, query, candidates, self._config, should_stop

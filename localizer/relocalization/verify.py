@@ -113,7 +113,9 @@ class Verifier:
     def reference(
         self, prior: PosePrior, camera: Camera, extractor: FeatureExtractor | None = None
     ) -> RenderedReference | None:
-        """Render the map at the prior's pose; None if hardly any is in view."""
+        """Render the map at the prior's pose, waiting for its tiles; None if it fills under 10 % of
+        the view. extractor: of its features; None: the one with the detail level.
+        """
         view = self.renderer.render(prior.world_from_camera, camera, wait=True)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
             return None
@@ -130,10 +132,10 @@ class Verifier:
         return Aligned(displaced(prior, away) if near else prior, shift.score)
 
     def register_aligned(
-        self, full: QueryFeatures, place: Aligned, query: PlaceQuery
+        self, full: QueryFeatures, screened: Aligned, query: PlaceQuery
     ) -> tuple[PosePrior, FusedRegistration]:
-        """Align a screened candidate again at full size, and register the frame there."""
-        prior = place.prior
+        """Align a `screen` result again at full size, and register the frame there."""
+        prior = screened.prior
         reference = self.reference(prior, full.camera)
         for _ in range(_ALIGNMENTS):
             if reference is None:
@@ -216,7 +218,7 @@ def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseCon
 
 
 def displaced(prior: PosePrior, away: Array) -> PosePrior:
-    """A prior displaced by (2,) m to the east and north."""
+    """A prior displaced by `away` (2,), m to the east and north."""
     pose = prior.world_from_camera
     place = pose.translation + np.array([*away, 0.0])
     return replace(prior, world_from_camera=Pose(pose.rotation, place))

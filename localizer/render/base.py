@@ -141,9 +141,7 @@ class TileRenderer(ABC):
 
 
 def require_pinhole(camera: Camera) -> None:
-    """`CameraError` if the camera has distortion, which renderers do not support (see
-    `undistortion_maps`).
-    """
+    """`CameraError` if the camera has distortion, which renderers do not support."""
     if camera.is_distorted:
         raise CameraError(
             "the renderer takes an ideal pinhole camera; use camera.without_distortion() and "

@@ -54,9 +54,7 @@ class TargetFilter:
 
     @property
     def velocity(self) -> Array | None:
-        """Velocity (3,) in m/s, world axes, of the most probable track; None before a second
-        observation.
-        """
+        """Velocity (3,), m/s, world, of the most probable track; None before 2 observations."""
         if not self._tracks or self._tracks[0].sightings < 2:
             return None
         velocity: Array = self._tracks[0].mean[3:].copy()
@@ -81,7 +79,7 @@ class TargetFilter:
 
     def update(self, sighting: TargetSighting) -> TargetFix | None:
         """Fuse an observation of at least one surface, later than the last one; None for one that
-        fits no track. The third of those in a row restarts the filter: its surfaces become the
+        fits no track. The third of those in a row gives a fix again: its surfaces become the
         tracks.
         """
         tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]

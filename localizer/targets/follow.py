@@ -256,7 +256,9 @@ class ImageFollower:
 
     @property
     def is_changed(self) -> bool:
-        """Whether a static target's image changed suddenly and stayed so: it left or is covered."""
+        """Whether, by the frames of `watch`, a static target's image changed suddenly and stayed
+        so: it left or is covered.
+        """
         return self._stands.is_changed
 
     def shows_ground(self, gray: Gray, estimate: PoseEstimate) -> bool:

@@ -156,9 +156,7 @@ class StaticTarget:
         return n > 0 and sum(self._recent) > 2 * n + 8.0 * np.sqrt(n)
 
     def hypotheses(self) -> tuple[PositionHypothesis, ...]:
-        """The hypotheses: the one with the smallest expected error first, then by weight. Call
-        `update` before.
-        """
+        """All of them (`update` first): that of the smallest expected error, then by weight."""
         logs = np.array([h.log_weight for h in self._hypotheses])
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()

@@ -152,8 +152,8 @@ class TargetTrack:
         self._last = LastPosition(round(self._settings.confirm_s * 1e9))
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
-        """Predicted position (3,) and covariance (3, 3) without the common errors; None if none
-        yet.
+        """Predicted position (3,) and covariance (3, 3), common errors not in it; None if
+        unknown.
         """
         if self._last.fix is None:
             return None

@@ -59,9 +59,10 @@ class DualThreadEngine:
     Above 200 lines: a few lines for each cycle of each thread, and all share one state.
 
     subscribers: called on the localization thread with every estimate; they must not block.
-    prior_provider: called with a time in ns for an external pose if there is none or tracking is
-    LOST. searcher: finds a position without a prior, on its own thread. If it shows no progress for
-    two minutes, the hang is reported and frames no longer wait for it. clock: CLOCK_MONOTONIC, ns.
+    prior_provider: called there with a time in ns for an external pose if there is none or tracking
+    is LOST. searcher: finds a position without a prior, on its own thread. If it shows no progress
+    for two minutes, the hang is reported and frames no longer wait for it. clock: CLOCK_MONOTONIC,
+    ns.
     """
 
     def __init__(

@@ -77,7 +77,7 @@ class HealthCounters:
             self._health = replace(self._health, searching=searching, search_hangs=False)
 
     def set_search_hangs(self, hangs: bool) -> None:
-        """Set whether the running search no longer responds."""
+        """Set whether the running search no longer responds; its beginning is logged."""
         with self._lock:
             news = hangs and not self._health.search_hangs
             self._health = replace(self._health, search_hangs=hangs)

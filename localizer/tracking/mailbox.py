@@ -57,9 +57,7 @@ class Mailbox(Generic[T]):
             return item
 
     def close(self, error: Exception | None = None) -> None:
-        """End the mailbox and wake the consumer, with an error or none. Only the first call
-        counts.
-        """
+        """End it, and wake the consumer with an error or none. Only the first call counts."""
         with self._changed:
             if self._closed:
                 return

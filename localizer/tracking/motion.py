@@ -190,7 +190,7 @@ class MeasuredMotion:
         self._config, self._rotation_at = config, rotation_at
 
     def predict(self, state: MotionState, time_ns: int) -> MotionState:
-        """Predict the state at `time_ns`."""
+        """`predict` with the rotation that was measured in between, if any."""
         turn = self._turn(state.time_ns, time_ns)
         return predict(state, time_ns, self._config, turn)
 

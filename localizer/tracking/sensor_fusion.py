@@ -113,21 +113,21 @@ class SensorFusion:
         return with_map_error(result, self.height_error.sigma_m)
 
     def learn(
-        self, result: Registration, place: Pose, unknown: Array, distance_m: float, time_ns: int
+        self, result: Registration, pose: Pose, unknown: Array, distance_m: float, time_ns: int
     ) -> None:
         """Update attitude bias and height error with an accepted frame, if it shows new ground.
         Does nothing if the attitude is not used.
 
-        result: its registration before `fuse`; place: the accepted pose; unknown: (6, 6) covariance
+        result: its registration before `fuse`; pose: the accepted pose; unknown: (6, 6) covariance
         of the errors of map and camera model; distance_m: to the ground in view.
         """
-        if not self.attitude_bias.is_due(place.translation, distance_m):
+        if not self.attitude_bias.is_due(pose.translation, distance_m):
             return
         votes = result.agreement
         if votes is not None and votes.displacements is not None:
             # A gimbal that sinks looks like missing buildings. Over a surface model it would make
             # the pose less sure and pull it along, so there the image alone is heard.
-            known = [] if self._is_surface else self._constraints(place, time_ns)
+            known = [] if self._is_surface else self._constraints(pose, time_ns)
             likelihood = height_likelihood(
                 votes.displacements, result.world_from_camera, combine(*known) if known else None
             )
@@ -135,7 +135,7 @@ class SensorFusion:
                 self.height_error = self.height_error.updated(likelihood)
         seen = self._with_map_error(result)
         if seen.status is not RegistrationStatus.OK:
-            self.attitude_bias.skip_ground(place.translation, time_ns)
+            self.attitude_bias.skip_ground(pose.translation, time_ns)
             return
         self.attitude_bias.learn(
             AttitudeObservation(

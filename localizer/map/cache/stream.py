@@ -164,7 +164,7 @@ class TileStreamer:
             return self._waiting and not (self._nodes.evicted or self._to_load())
 
     def close(self) -> None:
-        """Stop the loader thread, unless its disk does not respond, and drop all tiles."""
+        """Stop the loader thread (waits at most 10 s), drop all tiles, and unlock the cache."""
         with self._lock:
             self._closed = True
             self._lock.notify_all()

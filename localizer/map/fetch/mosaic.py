@@ -68,9 +68,7 @@ def assemble(source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path) 
 
 
 def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
-    """`MapFetchError` if a piece is no complete image, has more than 8 bits, or another size than
-    requested.
-    """
+    """`MapFetchError` for no complete image, more than 8 bits, or another size than asked for."""
     try:
         if data[:4] in _TIFF:
             with offline(), MemoryFile(data) as memory, memory.open(driver="GTiff") as image:

@@ -73,9 +73,7 @@ def ring_of(places: object) -> Array | None:
 
 
 def one_line(text: object) -> str:
-    """A file's text for the map's manifest: printable, one line, at most 300 characters; "" if it
-    is no text.
-    """
+    """A file's text, printable, in one line of 300 characters at most; "" if it is no text."""
     if not isinstance(text, str):
         return ""
     plain = "".join(c if c.isprintable() else " " for c in text)

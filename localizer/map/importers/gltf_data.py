@@ -153,9 +153,7 @@ def normalised_bounds(bounds: Array, accessor: dict[str, Any]) -> Array:
 
 
 def vector(values: Any, length: int, what: str) -> Array:
-    """Numbers of the JSON as (length,). what: name for the error. `MapSourceError` for other
-    values.
-    """
+    """Numbers of the JSON as (length,); `MapSourceError`, which names `what`, for others."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:

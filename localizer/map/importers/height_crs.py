@@ -59,8 +59,8 @@ class StatedHeights:
 
 def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeights:
     """Unit and datum by a source's CRS and its band's unit tag (None: no tag); `GeoreferenceError`
-    if they contradict. where: the source; a GeoTIFF's keys are used if the CRS has no vertical
-    part.
+    if they contradict. where: the source; if it is the path of a GeoTIFF, its own vertical keys
+    precede the CRS.
     """
     keys = geo_keys(where) if isinstance(where, Path) else {}
     unit, datum, name = _keyed_heights(keys, where)

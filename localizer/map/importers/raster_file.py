@@ -57,9 +57,7 @@ def offline() -> Iterator[None]:
 
 
 def open_raster(path: Path) -> DatasetReader:
-    """Open a GeoTIFF, which the caller closes; `MapSourceError` for another file. Use under
-    `offline`.
-    """
+    """Open a GeoTIFF under `offline`; the caller closes it. `MapSourceError` for another file."""
     require_plain_file(path)
     _require_tiff(path)
     for beside in (f"{path}.ovr", f"{path}.msk"):
@@ -184,9 +182,7 @@ def has_own_mask(data: DatasetReader) -> bool:
 
 
 def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
-    """Band numbers of red, green and blue, one and the same for grey; `MapSourceError` for a
-    palette.
-    """
+    """Band numbers of red, green and blue, equal for grey; `MapSourceError` for a palette."""
     meaning = list(data.colorinterp)
     if meaning[0] == ColorInterp.palette:
         raise MapSourceError(
@@ -250,9 +246,7 @@ def _flat(source: str, target: str) -> Transformer:
 
 @dataclass(frozen=True)
 class HeightBand:
-    """Conversion of a DSM's values to metres: value * gain + offset; missing: an additional nodata
-    value.
-    """
+    """Makes metres of a DSM's values: value * gain + offset. missing: one more nodata value."""
 
     gain: float = 1.0
     offset: float = 0.0

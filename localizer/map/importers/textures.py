@@ -32,9 +32,7 @@ def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
 
 
 def require_readable(path: Path, rules: ImportRules) -> None:
-    """`MapSourceError` if an image cannot be decoded or is too large; trimesh would show the mesh
-    grey.
-    """
+    """`MapSourceError` for an image too large or not decodable: trimesh would show it grey."""
     try:
         with PillowImage.open(path) as picture:
             width, height = picture.size

@@ -142,9 +142,7 @@ def _read_tileset(path: Path, rules: ImportRules, up_axis: UpAxis | None) -> Sou
 
 
 def read_file(path: Path, rules: ImportRules) -> bytes:
-    """Bytes of a source file, gzip unpacked. `MapSourceError` if it is missing, another archive, or
-    too large.
-    """
+    """Bytes of a file, gzip unpacked. `MapSourceError`: missing, another archive, or too large."""
     require_plain_file(path)
     try:
         rules.require("file_bytes", path.stat().st_size, path)

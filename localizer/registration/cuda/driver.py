@@ -192,7 +192,9 @@ class Arena:
         self.generation = 0  # changes when any address has changed
 
     def buffer(self, name: str, size: int) -> int:
-        """Device address of buffer `name`, at least `size` bytes; enlarging loses its content."""
+        """Device address of buffer `name`, at least `size` bytes; enlarging it loses its content
+        and changes the address.
+        """
         address, have = self._buffers.get(name, (0, 0))
         if address and have >= size:
             return address
