@@ -13,26 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
 PACKAGES = ("localizer", "mavlink_bridge", "companion", "sitl", "benchmarks")
-MOST_MODULES, MOST_LINES, MOST_METHODS, MOST_PARAMETERS = 15, 200, 15, 7
-
-# Above that, each for its reason.
-_MANY_PARAMETERS = {
-    # One registration's inputs, as the paper and the reference name them; the CPU and the GPU take
-    # the same, so that they can be exchanged.
-    "localizer/registration/cuda/registration.py:register",
-    "localizer/registration/cuda/schedule.py:run",
-    "localizer/registration/cuda/schedule.py:_upload",
-    "localizer/registration/cuda/curvature.py:winner_curvature",
-    "localizer/odometry/keyframe.py:keyframe_anchors",
-    # The launch of a kernel: the fields of its argument block.
-    "localizer/registration/cuda/steps.py:refine_launch",
-    # What they are made of is opened elsewhere (`open_localizer`, the training's run).
-    "localizer/tracking/pipeline.py:__init__",
-    "localizer/training/data/live.py:__init__",
-    # A plan's place: where, how large, how turned.
-    "localizer/synth/plan/planner.py:place",
-    "localizer/synth/plan/houses.py:_plan_plot",
-}
+MOST_MODULES, MOST_LINES, MOST_METHODS = 15, 200, 15
 
 # Which packages each may import.
 _MAY_IMPORT = {
@@ -48,7 +29,6 @@ _OUTSIDE_MODULES = {"numba.core.runtime"}
 
 _IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.M)
 _REACHES = re.compile(r"([\w\])]+)\._(?!_)\w|import[^\n]* _(?!_)\w|setattr\(.*\b_(?!_)[A-Za-z]")
-_SIGNATURE = re.compile(r"^ *(?:async )?def \w+\((.*?)\)(?: ->|:)", re.M | re.S)
 _WAITS = re.compile(r"thread\w*\.join\((?:None)?\)", re.IGNORECASE)
 _FLIES = ("companion/", "mavlink_bridge/", "localizer/tracking/", "localizer/map/cache/")
 _CLASS = re.compile(r"^class .*\n(?:(?:[ \t)].*)?\n)*", re.M)  # up to the next line at column 0
@@ -101,33 +81,6 @@ def _too_large(node: ast.ClassDef) -> str:
     if methods > MOST_METHODS and f"{MOST_METHODS} public methods" not in reason:
         return f"{node.name} has {methods} public methods, and its docstring says no reason"
     return ""
-
-
-def long_signatures(files: Mapping[str, str]) -> list[str]:
-    """Functions of packages with too many parameters, `self` not counted. Compiled kernels take
-    what they need one by one, and a command takes its options.
-    """
-    return [
-        f"{path}: {node.name} takes {count} parameters; give it an object"
-        for path, text in files.items()
-        if path.split("/")[0] in PACKAGES
-        and any(m.group(1).count(",") >= MOST_PARAMETERS for m in _SIGNATURE.finditer(text))
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and (count := _parameters(node)) > MOST_PARAMETERS
-        and not _is_kernel_or_command(node)
-        and f"{path}:{node.name}" not in _MANY_PARAMETERS
-    ]
-
-
-def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-    return len(names) - (names[:1] in (["self"], ["cls"]))
-
-
-def _is_kernel_or_command(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    marks = [ast.unparse(mark) for mark in node.decorator_list]
-    return node.name.endswith("_command") or any("njit" in m or ".command(" in m for m in marks)
 
 
 def wrong_imports(files: Mapping[str, str]) -> list[str]:

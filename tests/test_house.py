@@ -11,7 +11,6 @@ from tests.house import (
     endless_waits,
     folder_circles,
     large_classes,
-    long_signatures,
     module_circles,
     private_reaches,
     sources,
@@ -21,7 +20,6 @@ from tests.house import (
 RULES = (
     crowded_folders,
     large_classes,
-    long_signatures,
     wrong_imports,
     folder_circles,
     module_circles,

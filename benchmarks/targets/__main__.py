@@ -122,14 +122,10 @@ def fly(args: argparse.Namespace) -> list[dict[str, object]]:
         samples, refused, count = samples + new, refused + not_told, count + of
         found = rows(samples, refused, count)
         if args.json:
-            document = {"arguments": _plain(args), "rows": found}
+            document = {"arguments": vars(args), "rows": found}
             document["samples"] = [asdict(s) for s in samples]
-            args.json.write_text(json.dumps(document))
+            args.json.write_text(json.dumps(document, default=str))
     return found
-
-
-def _plain(args: argparse.Namespace) -> dict[str, object]:
-    return {key: str(v) if isinstance(v, Path) else v for key, v in vars(args).items()}
 
 
 def main() -> None:

@@ -81,7 +81,7 @@ class CudaSchedule:
         self._timed = timed
         self._graph: tuple[GraphShape, Graph] | None = None
 
-    def run(
+    def run(  # noqa: PLR0913
         self,
         query: FeaturePyramid,
         camera: Camera,
@@ -186,7 +186,7 @@ class CudaSchedule:
             self._backend.arena.buffer, levels, count, _survivors(config, count), finish
         )
 
-    def _upload(
+    def _upload(  # noqa: PLR0913
         self,
         memory: FrameMemory,
         query: FeaturePyramid,

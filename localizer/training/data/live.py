@@ -49,7 +49,7 @@ class LivePlan:
 class LiveStream:
     """Makes batches like `training.data.batches.ShardStream`, from pairs rendered on demand."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         plan: LivePlan,
         scenes: SceneConfig,
