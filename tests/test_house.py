@@ -12,7 +12,7 @@ from tests.house import (
     folder_circles,
     large_classes,
     module_circles,
-    private_reaches,
+    private_names,
     sources,
     wrong_imports,
 )
@@ -23,7 +23,7 @@ RULES = (
     wrong_imports,
     folder_circles,
     module_circles,
-    private_reaches,
+    private_names,
     endless_waits,
 )
 
