@@ -24,12 +24,12 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
 from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import SEASON, look_at, moved
-from localizer.training.places.photos import read_photo
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
 
@@ -73,7 +73,7 @@ def _photo_pairs(
         rng = np.random.default_rng((seed, k))
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
-        image = read_photo(photos / "images" / names[photo])
+        image = read_rgb(photos / "images" / names[photo])
         query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
@@ -153,7 +153,7 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
     for k in range(count):
         rng = np.random.default_rng((seed, 3, k))
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
-        dates = [read_photo(p) for p in plot_dates(plot)]
+        dates = [read_rgb(p) for p in plot_dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
         view, query, truth = _plot_pair(surveyed, flown, rng, size)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
@@ -172,7 +172,7 @@ def plot_dates(plot: Path) -> list[Path]:
     """The green date, then the dry one."""
 
     def green(path: Path) -> float:
-        red_green_blue = read_photo(path).reshape(-1, 3).mean(0)
+        red_green_blue = read_rgb(path).reshape(-1, 3).mean(0)
         return float(red_green_blue[0] - red_green_blue[1])
 
     return sorted(plot.glob("*.jpg"), key=green)
