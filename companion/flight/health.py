@@ -274,7 +274,7 @@ class HealthMonitor:
             "rate_hz": self._rate(),
             "stages_ms": _stages([e for _, e in list(self._estimates)]),
             "bridge": self._bridge.counters(),
-            "shadow": {"ready": score.go, "text": score.line()},
+            "shadow": {"ready": score.ready, "text": score.line()},
             "guardian": _monitor_report(self._integrity_monitor),
             "map_shift": self._map_shift(),
             "targets": self._targets(),

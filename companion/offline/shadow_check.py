@@ -327,7 +327,7 @@ class _Player:
     def _score(self) -> None:
         score = self.bridge.shadow_score()
         self._scores.append(score)
-        if score.go:
+        if score.ready:
             self._counts.go_s += _SCORE_NS * 1e-9
             if self._counts.first_go_s is None:
                 self._counts.first_go_s = self._since_s()

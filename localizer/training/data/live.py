@@ -82,7 +82,7 @@ class LiveStream:
         return current.result()
 
     def close(self) -> None:
-        """End the processes that make places, and the threads."""
+        """End the processes that make places, and the threads; does not wait for them."""
         for pool in (self._thread, self._renderers, self._makers):
             pool.shutdown(wait=False, cancel_futures=True)
 
