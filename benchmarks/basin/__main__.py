@@ -21,23 +21,21 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+from benchmarks.basin import axes as basin_axes
+from benchmarks.basin.run import BasinOutcome, run, sized_starts
+from benchmarks.basin.tables import Cells, ablation_table, covariance_table
+from benchmarks.basin.variants import (
+    DEFAULT_ANCHORS,
+    FULL,
+    Variant,
+    our_rows,
+    paper_rows,
+    prior_rows,
+)
+from benchmarks.basin.views import BasinView, load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.figures import show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.basin import axes as basin_axes
-    from benchmarks.basin.run import BasinOutcome, run, sized_starts
-    from benchmarks.basin.tables import Cells, ablation_table, covariance_table
-    from benchmarks.basin.variants import (
-        DEFAULT_ANCHORS,
-        FULL,
-        Variant,
-        our_rows,
-        paper_rows,
-        prior_rows,
-    )
-    from benchmarks.basin.views import BasinView, load_views
+from benchmarks.common.named_errors import named_errors
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 

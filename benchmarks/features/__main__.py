@@ -31,35 +31,33 @@ import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.figures import write_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
+from benchmarks.common.named_errors import named_errors
+from benchmarks.features.methods import (
+    DirectMethod,
+    IntensityExtractor,
+    Levelled,
+    Method,
+    load_xfeat,
+    sift_pnp,
+)
+from benchmarks.features.pairs import (
+    DEGREES,
+    METRES,
+    SIZE,
+    MadePlaces,
+    TestPair,
+    made_pairs,
+    mesh_pairs,
+    narrowed,
+)
+from benchmarks.features.real import real_pairs
+from benchmarks.features.report import PairOutcome, read_outcomes, write_outcomes
+from benchmarks.features.tables import TABLES, report
 from localizer.config import LocalizerConfig
 from localizer.features import GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.registration import JNGOConfig
 from localizer.types import PosePrior
-
-with needs_torch():
-    from benchmarks.features.methods import (
-        DirectMethod,
-        IntensityExtractor,
-        Levelled,
-        Method,
-        load_xfeat,
-        sift_pnp,
-    )
-    from benchmarks.features.pairs import (
-        DEGREES,
-        METRES,
-        SIZE,
-        MadePlaces,
-        TestPair,
-        made_pairs,
-        mesh_pairs,
-        narrowed,
-    )
-    from benchmarks.features.real import real_pairs
-    from benchmarks.features.report import PairOutcome, read_outcomes, write_outcomes
-    from benchmarks.features.tables import TABLES, report
 
 _log = logging.getLogger(__name__)
 

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 
 from localizer.geometry.pose import Pose
-from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
-from localizer.training.data.batches import limit_haze
+from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
 from localizer.training.data.shards import PhotoSource, read_shard, shard_path, write_shards
 from localizer.training.data.worlds import world_pairs
@@ -120,8 +119,7 @@ def mesh_pairs(count: int, seed: int, size: tuple[int, int] = SIZE) -> list[Test
 
 
 def _degraded(pair: Pair, rng: np.random.Generator, place: int) -> TestPair:
-    look = limit_haze(sample_appearance(rng, pair.condition), pair.query_depth)
-    query = apply_appearance(pair.query, pair.query_depth, look, rng)
+    query = weathered(pair.query, pair.query_depth, pair.condition, rng)
     view = RenderedView(
         pair.reference, pair.reference_depth, pair.world_from_reference, pair.camera
     )

@@ -26,9 +26,8 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
-from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import SEASON, look_at, moved
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
@@ -77,9 +76,7 @@ def _photo_pairs(
         query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
-            query = apply_appearance(
-                query, depth, limit_haze(sample_appearance(rng, condition), depth), rng
-            )
+            query = weathered(query, depth, condition, rng)
         view = renderer.render(moved(rng, truth, np.inf, (METRES, DEGREES)), camera, wait=True)
         if condition in (COARSE_MAP, OLDER_MAP):
             view = _surveyed(view, rng, repainted=condition == OLDER_MAP)
@@ -114,8 +111,8 @@ def _rendered_pairs(
         view = _surveyed(view, rng, repainted=False)
         if condition == SEASON:
             query = _image(season_shift(_squared(query), rng), query.shape)
-        look = sample_appearance(rng, "day" if condition == SEASON else condition)
-        query = apply_appearance(query, seen.depth, limit_haze(look, seen.depth), rng)
+        weather = "day" if condition == SEASON else condition
+        query = weathered(query, seen.depth, weather, rng)
         pairs.append(TestPair(view, query, truth, condition, place=len(pairs)))
     return pairs
 
@@ -157,7 +154,7 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
         surveyed, flown = dates[:: -1 if dry_map else 1]
         view, query, truth = _plot_pair(surveyed, flown, rng, size)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
-        query = apply_appearance(query, seen, limit_haze(sample_appearance(rng, "day"), seen), rng)
+        query = weathered(query, seen, "day", rng)
         condition = "dry map, green flight" if dry_map else "green map, dry flight"
         pairs.append(TestPair(view, query, truth, condition, place=k // 2 % len(plots)))
     return pairs

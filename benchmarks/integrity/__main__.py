@@ -28,13 +28,11 @@ from pathlib import Path
 from benchmarks.common.arguments import Parser, existing, number, output
 from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.integrity.fit import fit, fit_table
-    from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
-    from benchmarks.integrity.report import COLUMNS, by_condition, cells, plot, rows
-    from benchmarks.integrity.run import StartOutcome, read, run_set, turn
+from benchmarks.common.named_errors import named_errors
+from benchmarks.integrity.fit import fit, fit_table
+from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
+from benchmarks.integrity.report import COLUMNS, by_condition, cells, plot, rows
+from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
 _USUAL = [name for name in SETS if name != UNSEEN]

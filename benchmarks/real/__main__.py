@@ -22,29 +22,27 @@ from typing import Any
 
 from benchmarks.common.arguments import Parser, output, whole
 from benchmarks.common.figures import markdown, show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
-    from benchmarks.real.report import (
-        DISPLACED,
-        JUDGED,
-        RIVALS,
-        SEARCHED,
-        attitude_text,
-        displaced_cells,
-        displaced_row,
-        judged_cells,
-        judged_row,
-        plot,
-        rival_cells,
-        rival_rows,
-        searched_cells,
-        searched_row,
-    )
-    from benchmarks.real.rivals import load_rivals, rival_images
-    from benchmarks.real.searched import searched_images
-    from benchmarks.real.sets import SETS, RealView, describe, load
+from benchmarks.common.named_errors import named_errors
+from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
+from benchmarks.real.report import (
+    DISPLACED,
+    JUDGED,
+    RIVALS,
+    SEARCHED,
+    attitude_text,
+    displaced_cells,
+    displaced_row,
+    judged_cells,
+    judged_row,
+    plot,
+    rival_cells,
+    rival_rows,
+    searched_cells,
+    searched_row,
+)
+from benchmarks.real.rivals import load_rivals, rival_images
+from benchmarks.real.searched import searched_images
+from benchmarks.real.sets import SETS, RealView, describe, load
 
 _JUDGED_AT = 1.0  # degrees of attitude, of rivals and displaced priors
 _ELSEWHERE = {"caliterra": "fengyuan"}  # whose map holds no place of a set; else caliterra's

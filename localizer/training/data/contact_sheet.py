@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from localizer.pictures import write_rgb
-from localizer.synth.appearance.model import apply_appearance, sample_appearance
-from localizer.training.data.batches import limit_haze
+from localizer.synth.appearance.model import weathered
 from localizer.training.data.pairs import Pair, warp_check
 from localizer.types import Image
 
@@ -24,8 +23,7 @@ def contact_sheet(pairs: Sequence[Pair], path: Path) -> Path:
 
 
 def _row(pair: Pair, rng: np.random.Generator) -> Image:
-    look = limit_haze(sample_appearance(rng, pair.condition), pair.query_depth)
-    weathered = apply_appearance(pair.query, pair.query_depth, look, rng)
+    degraded = weathered(pair.query, pair.query_depth, pair.condition, rng)
     warped, mask = warp_check(pair)
     height, width = mask.shape
     tiles = np.add.outer(np.arange(height) // _CHECKER_PX, np.arange(width) // _CHECKER_PX) % 2
@@ -35,5 +33,5 @@ def _row(pair: Pair, rng: np.random.Generator) -> Image:
     depth = pair.reference_depth
     gray = (255 * (depth - depth.min()) / max(float(np.ptp(depth)), 1e-3)).astype(np.uint8)
     return np.hstack(
-        [pair.reference, pair.query, weathered, checker, np.repeat(gray[..., None], 3, 2)]
+        [pair.reference, pair.query, degraded, checker, np.repeat(gray[..., None], 3, 2)]
     )
