@@ -1,4 +1,4 @@
-"""Generated test pairs for the feature benchmark: unseen places and a mesh world.
+"""Generated test pairs for the feature benchmark: unseen places.
 
 What differs between map and query is drawn by the training's own generator, with other seeds and
 with real textures that no training run has seen; model-card.md says what each difference
@@ -7,17 +7,15 @@ stands for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from localizer.geometry.pose import Pose
 from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
 from localizer.training.data.shards import PhotoSource, read_shard, shard_path, write_shards
-from localizer.training.data.worlds import world_pairs
 from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose
@@ -44,14 +42,12 @@ class TestPair:
 @dataclass(frozen=True)
 class MadePlaces:
     """Which generated pairs: split (test or validation), seed (0, 1, 2, ... other places), and
-    the folder of the real textures, if any; size: of the pictures. Wider ones look from further
-    away, so that a pixel is as much ground.
+    the folder of the real textures, if any.
     """
 
     split: str
     seed: int
     textures: Path | None
-    size: tuple[int, int] = SIZE
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -61,16 +57,15 @@ class MadePlaces:
     @property
     def name(self) -> str:
         """Folder of these pairs in the cache."""
-        wide = "" if self.size == SIZE else f"-{self.size[0]}"
-        return f"made-{self.split}-{self.seed}{wide}" + ("" if self.textures else "-untextured")
+        return f"made-{self.split}-{self.seed}" + ("" if self.textures else "-untextured")
 
     @property
     def scenes(self) -> SceneConfig:
         """Size and variety: each place is seen once under every condition."""
         return SceneConfig(
             cells=768,
-            width=self.size[0],
-            height=self.size[1],
+            width=SIZE[0],
+            height=SIZE[1],
             photo_share=0.4,
             references=len(self.conditions),
             queries_per_light=1,
@@ -95,27 +90,6 @@ def made_pairs(count: int, which: MadePlaces, cache: Path, workers: int = 2) -> 
         rng = np.random.default_rng((seed, 1))
         pairs += [_degraded(p, rng, seed) for p in read_shard(shard_path(folder, seed))]
     return pairs[:count]
-
-
-def narrowed(pair: TestPair, width: int) -> TestPair:
-    """The same pair in pictures of `width` pixels."""
-    camera = pair.view.camera
-    if width == camera.width:
-        return pair
-    size = (width, round(camera.height * width / camera.width))
-    rgb, query = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (
-        pair.view.rgb, pair.query))  # fmt: skip
-    depth = cv2.resize(pair.view.depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    view = RenderedView(rgb, depth, pair.view.world_from_camera, camera.resized(*size))
-    return replace(pair, view=view, query=query)
-
-
-def mesh_pairs(count: int, seed: int, size: tuple[int, int] = SIZE) -> list[TestPair]:
-    """Pairs of a generated mesh world that no training run has seen."""
-    rng = np.random.default_rng((seed, 2))
-    scenes = MadePlaces("test", seed, None, size).scenes
-    made = world_pairs(900_000 + seed, scenes, count=count)
-    return [_degraded(pair, rng, k) for k, pair in enumerate(made)]
 
 
 def _degraded(pair: Pair, rng: np.random.Generator, place: int) -> TestPair:
