@@ -40,7 +40,6 @@ from benchmarks.features.methods import (
 from benchmarks.features.pairs import (
     DEGREES,
     METRES,
-    SIZE,
     MadePlaces,
     TestPair,
     made_pairs,
@@ -158,13 +157,8 @@ def _model(text: str) -> Path:
 def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
     """The set's name, and its pairs."""
     if args.real is not None:
-        return args.real.resolve().name, real_pairs(
-            args.real,
-            args.pairs,
-            args.seed,
-            args.cache,
-            SIZE,
-        )
+        pairs = real_pairs(args.real, args.pairs, args.seed, args.cache)
+        return args.real.resolve().name, pairs
     textures = args.textures if args.textures.is_dir() else None
     if textures is None:
         _log.warning("%s is absent: places without real textures", args.textures)

@@ -20,7 +20,7 @@ from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose
 UNSEEN_GROUPS = ("boruszyn", "garfield_autumn", "neon_sjer_pairs")
-MADE_CONDITIONS = (*CONDITIONS, SEASON, OUTDATED, COMBINED)
+MADE_CONDITIONS = (*CONDITIONS, SEASON, OUTDATED, COMBINED)  # of each place a pair of each
 _FIRST_SEED = {"test": 5_000_000, "validation": 4_000_000}
 SIZE = (320, 240)
 
@@ -50,11 +50,6 @@ class MadePlaces:
     textures: Path | None
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """Of which each place has one pair."""
-        return MADE_CONDITIONS
-
-    @property
     def name(self) -> str:
         """Folder of these pairs in the cache."""
         return f"made-{self.split}-{self.seed}" + ("" if self.textures else "-untextured")
@@ -67,10 +62,10 @@ class MadePlaces:
             width=SIZE[0],
             height=SIZE[1],
             photo_share=0.4,
-            references=len(self.conditions),
+            references=len(MADE_CONDITIONS),
             queries_per_light=1,
             cell_m=(0.25, 0.55),
-            conditions=self.conditions,
+            conditions=MADE_CONDITIONS,
             motion=(METRES, DEGREES),
         )
 
@@ -78,7 +73,7 @@ class MadePlaces:
 def made_pairs(count: int, which: MadePlaces, cache: Path, workers: int = 2) -> list[TestPair]:
     """Pairs of unseen generated places, conditions in equal shares; written to `cache` once."""
     first = _FIRST_SEED[which.split] + 10_000 * which.seed
-    places = range(first, first + round(1.1 * count / len(which.conditions)) + 1)
+    places = range(first, first + round(1.1 * count / len(MADE_CONDITIONS)) + 1)
     folder = cache / which.name
     photos = None
     if which.textures is not None:

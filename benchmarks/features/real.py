@@ -37,22 +37,16 @@ _PLOT_TEXEL_M = 0.1
 _MADE = tuple(c for c in CONDITIONS if c != "day")
 
 
-def real_pairs(
-    folder: Path,
-    count: int,
-    seed: int,
-    cache: Path,
-    size: tuple[int, int] = SIZE,
-) -> list[TestPair]:
+def real_pairs(folder: Path, count: int, seed: int, cache: Path) -> list[TestPair]:
     """Pairs of the real set in `folder`, conditions in turn; its map is built in `cache` once."""
     if (folder / "offsets.csv").exists():
-        return _season_pairs(folder, count, seed, size)
+        return _season_pairs(folder, count, seed)
     photos = folder / "queries"
     with TileStreamer(TileCache.open(_map(folder, cache))) as streamer:
         renderer = NumbaRenderer(streamer)
         if photos.exists():
-            return _photo_pairs(renderer, photos, count, seed, size)
-        return _rendered_pairs(renderer, count, seed, size)
+            return _photo_pairs(renderer, photos, count, seed)
+        return _rendered_pairs(renderer, count, seed)
 
 
 def _map(folder: Path, cache: Path) -> Path:
@@ -60,10 +54,8 @@ def _map(folder: Path, cache: Path) -> Path:
     return built if built.exists() else build_map(layers_of(folder), built, origin_of(folder))
 
 
-def _photo_pairs(
-    renderer: NumbaRenderer, photos: Path, count: int, seed: int, size: tuple[int, int]
-) -> list[TestPair]:
-    camera = Camera.from_json(photos / "camera.json").resized(*size)
+def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -> list[TestPair]:
+    camera = Camera.from_json(photos / "camera.json").resized(*SIZE)
     poses = json.loads((photos / "poses.json").read_text())
     names = sorted(p.name for p in (photos / "images").iterdir())
     kinds = (PHOTO, COARSE_MAP, OLDER_MAP, *_MADE)
@@ -73,7 +65,7 @@ def _photo_pairs(
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
         image = read_rgb(photos / "images" / names[photo])
-        query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        query = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
             query = weathered(query, depth, condition, rng)
@@ -92,15 +84,13 @@ def _surveyed(view: RenderedView, rng: np.random.Generator, *, repainted: bool) 
     )
 
 
-def _rendered_pairs(
-    renderer: NumbaRenderer, count: int, seed: int, size: tuple[int, int]
-) -> list[TestPair]:
+def _rendered_pairs(renderer: NumbaRenderer, count: int, seed: int) -> list[TestPair]:
     """Views of the map itself, 80 to 200 m up, under every condition in turn."""
     kinds = (*CONDITIONS, SEASON)
     rng = np.random.default_rng((seed, 1))
     pairs: list[TestPair] = []
     while len(pairs) < count:
-        camera = Camera.from_fov(*size, rng.uniform(40, 75))
+        camera = Camera.from_fov(*SIZE, rng.uniform(40, 75))
         truth = _view(rng)
         start = moved(rng, truth, np.inf, (METRES, DEGREES))
         view, seen = (renderer.render(pose, camera, wait=True) for pose in (start, truth))
@@ -143,7 +133,7 @@ def _view(rng: np.random.Generator) -> Pose:
     return look_at(target, rng.uniform(80, 200) / np.sin(pitch), pitch, rng)
 
 
-def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) -> list[TestPair]:
+def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
     """A plot at one date as the map and at the other as the flight, 25 to 40 m above it."""
     plots = unseen_plots(folder)
     pairs: list[TestPair] = []
@@ -152,7 +142,7 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
         dates = [read_rgb(p) for p in plot_dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
-        view, query, truth = _plot_pair(surveyed, flown, rng, size)
+        view, query, truth = _plot_pair(surveyed, flown, rng)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
         query = weathered(query, seen, "day", rng)
         condition = "dry map, green flight" if dry_map else "green map, dry flight"
@@ -176,11 +166,11 @@ def plot_dates(plot: Path) -> list[Path]:
 
 
 def _plot_pair(
-    surveyed: Image, flown: Image, rng: np.random.Generator, size: tuple[int, int]
+    surveyed: Image, flown: Image, rng: np.random.Generator
 ) -> tuple[RenderedView, Image, Pose]:
     """Two views of flat ground: all of the query and four fifths of the map's view lie on it."""
     while True:
-        camera = Camera.from_fov(*size, rng.uniform(35, 50))
+        camera = Camera.from_fov(*SIZE, rng.uniform(35, 50))
         pitch = np.radians(rng.uniform(65, 90))
         at = rng.uniform(-12, 12, 2)
         truth = look_at(np.array([*at, 0.0]), rng.uniform(25, 40) / np.sin(pitch), pitch, rng)
