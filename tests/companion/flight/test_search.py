@@ -200,6 +200,19 @@ def test_a_search_that_is_not_ready_or_cannot_be_says_so(cache, monkeypatch):
     assert events == [("warning", "no search for a lost place: too large a map")]
 
 
+def test_without_the_autopilots_attitude_it_says_what_it_waits_for(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    assert search.lacks is None
+    falling.rotation = lambda _time_ns: None
+    search.search(falling.frame(), lambda: False)
+    assert search.lacks is AlertId.WAITING_FOR_PRIOR
+    del falling.rotation
+    search.search(falling.frame(), lambda: False)
+    assert len(slow.queries) == 1
+    assert search.lacks is None
+
+
 def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, cache):
     """At 30 km that lies 70 m above the ellipsoid: no height that was tried was the right one."""
     falling = Falling()
