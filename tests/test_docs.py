@@ -4,28 +4,21 @@ import importlib.util
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from benchmarks.site.__main__ import outdated
 from benchmarks.site.kept import DATA, load
 from mavlink_bridge.alerts.integrity import INTEGRITY
+from tests.pages import PAGES, ROOT
 
-ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    [
-        *ROOT.glob("docs/**/*.md"),
-        *(ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
-    ]
-)
 _LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
-def _prose(page):
+def _prose(text):
     """Number and text of each line outside of code blocks and tables."""
     code = False
-    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(text.splitlines(), start=1):
         code ^= line.lstrip().startswith("```")
         if not code and not line.startswith(("|", "<!-- kept")):
             yield number, line
@@ -34,8 +27,8 @@ def _prose(page):
 def test_links_lead_somewhere():
     broken = [
         f"{page.relative_to(ROOT)}: {link}"
-        for page in PAGES
-        for link, _ in _LINK.findall(page.read_text(encoding="utf-8"))
+        for page, text in PAGES.items()
+        for link, _ in _LINK.findall(text)
         if "://" not in link and not (page.parent / link).exists()
     ]
     assert not broken
@@ -44,8 +37,8 @@ def test_links_lead_somewhere():
 def test_prose_fits_a_screen():
     long = [
         f"{page.relative_to(ROOT)}:{number}: {len(line)} characters"
-        for page in PAGES
-        for number, line in _prose(page)
+        for page, text in PAGES.items()
+        for number, line in _prose(text)
         if len(line) > 120
     ]
     assert not long
@@ -101,7 +94,9 @@ def test_the_site_builds_strictly_and_asks_no_network(tmp_path):
         )
     }
     assert not asked
-    assert (tmp_path / "reference" / "cli.html").is_file()
+    for name, words in (("reference/cli", "companion try"), ("reference/api", "open_localizer")):
+        assert words in (tmp_path / f"{name}.html").read_text(encoding="utf-8")
+    assert (tmp_path / "source/configs/deployment.yaml.html").is_file()
 
 
 def test_every_tutorial_says_what_comes_next() -> None:

@@ -122,6 +122,15 @@ def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
     assert best[1][0] < 0.3
 
 
+def test_a_patch_of_which_nothing_is_seen_looks_like_no_place():
+    """The search of a low, steep view ended with a division by zero."""
+    features = np.random.default_rng(2).integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    correlator = LevelCorrelator(level(features), 0)
+    unseen = transform_patch(np.zeros((16, 16, 3), np.float32), np.zeros((16, 16), np.float32))
+    for block in correlator.blocks():
+        assert np.abs(correlator.correlate(unseen, block)).max() == 0
+
+
 def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
     """The least recently used would be the next one wanted: going round, nothing was ever found."""
     features = np.random.default_rng(0).integers(-99, 99, (3, 512, 512)).astype(np.int8)
