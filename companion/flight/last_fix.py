@@ -61,8 +61,8 @@ class LastFix:
     origin: tuple[float, float, float] | None = None
 
     def has_same_origin(self, state: VehicleState, time_ns: int) -> bool:
-        """Whether the EKF still uses the same origin at time_ns: False after a reboot of the
-        autopilot, or if the origin was moved.
+        """Whether the EKF still uses the same origin at time_ns (CLOCK_MONOTONIC): False after a
+        reboot of the autopilot, or if the origin was moved; True if nothing tells. state: newest.
         """
         offset_ns, origin = state.clock_offset_ns, _place(state.origin)
         since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS
@@ -81,7 +81,9 @@ def _place(origin: Origin | None) -> tuple[float, float, float] | None:
 
 
 def read_last_fix(path: Path, boot: str) -> LastFix | None:
-    """The position that a process of this boot wrote; None without one that can be trusted."""
+    """The position in the file, if a process of this boot (id `boot`) wrote it; None otherwise. If
+    the file is there but unreadable, implausible or writable by others, the log says so.
+    """
     try:
         status = os.lstat(path)
         if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
@@ -157,11 +159,11 @@ class FixMemory:
         self._thread.start()
 
     def hand_over(self) -> None:
-        """A restart follows the coming stop: keep the file for the next process."""
+        """Make `stop` keep the file, for the process that follows."""
         self._leaves = True
 
     def stop(self) -> None:
-        """Stop. After a clean shutdown the file is removed. Does not wait for a disk that hangs."""
+        """Stop the thread; remove the file unless `hand_over` was called or the disk hangs."""
         self._stop.set()
         if wait_for_end(self._thread) and self._path is not None and not self._leaves:
             try:
@@ -170,14 +172,16 @@ class FixMemory:
                 _log.warning("the last fix is not removed: %s", error)
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Store a position that the map confirmed, to be written. Never blocks."""
+        """Take a position that the map confirmed, to be written if it is trusted then; forget the
+        previous process's. Other estimates are ignored. Never blocks.
+        """
         if estimate.accepted and estimate.state is TrackingState.TRACKING:
             self._newest, self._before = estimate, None
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """Prior for time_ns (CLOCK_MONOTONIC) by the previous process's position and the EKF's
-        displacement since; None if unknown or too old, or after this process has found a position
-        itself.
+        """Prior of the camera for time_ns (CLOCK_MONOTONIC) by the previous process's position and
+        the EKF's displacement since. None while attitude or displacement is unknown, and from then
+        on if it is too old, if the EKF jumped, or if this process has found a position itself.
         """
         last = self._before
         if last is None:

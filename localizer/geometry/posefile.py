@@ -74,7 +74,9 @@ def _parse(line: str, where: str) -> PoseRow:
 
 
 def write_poses(path: Path | str, rows: Iterable[PoseRow]) -> None:
-    """Write a pose file: 1e-9 degrees of position (0.1 mm), 1e-4 m, 1e-6 degrees of angle."""
+    """Write a pose file into an existing folder, replacing one there. Rounded to 1e-9 degrees of
+    position (0.1 mm), 1e-4 m and 1e-6 degrees of angle. Names must be without blanks.
+    """
     Path(path).write_text("".join(f"{pose_line(row)}\n" for row in rows), encoding="utf-8")
 
 
@@ -88,7 +90,7 @@ def pose_line(row: PoseRow) -> str:
 
 
 def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:
-    """The row's pose in the map's ENU frame."""
+    """The row's pose, OpenCV camera axes to the ENU frame of the map about `frame`'s origin."""
     p = row.position
     centre = frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
     roll, pitch, yaw = np.radians([row.roll_deg, row.pitch_deg, row.yaw_deg])

@@ -37,7 +37,9 @@ class CudaBackend:
         self.arena = Arena(device)
 
     def kernels(self, channels: int) -> Kernels:
-        """The loaded kernels for a channel count; compiling takes seconds, once per machine."""
+        """The loaded kernels for a channel count; the first call compiles for seconds, once per
+        machine. The device must be active. `CudaError` if that fails.
+        """
         if channels not in self._kernels:
             image = self._compile(channels, self.half, self.device.architecture)
             self._kernels[channels] = self.device.load(image.code)
@@ -79,7 +81,7 @@ class CudaBackend:
         )
 
     def close(self) -> None:
-        """Free the device memory."""
+        """Free the buffers in device memory; a later call allocates them again."""
         with self.lock:
             self.device.activate()
             self.arena.close()

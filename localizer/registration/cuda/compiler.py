@@ -34,7 +34,7 @@ class Image:
 
 
 def cache_directory() -> Path:
-    """Folder of compiled images: `PILOT_CACHE`, else the user's cache directory."""
+    """Folder of compiled images, which may not exist: "cuda" in PILOT_CACHE or the user's cache."""
     return cache_folder("cuda")
 
 

@@ -17,7 +17,7 @@ from localizer.registration.cuda.steps import KernelLaunch
 from localizer.types import Float32
 
 
-def geometry(
+def level_without_features(
     points: Float32,
     focal: tuple[float, float],
     centre: tuple[float, float],

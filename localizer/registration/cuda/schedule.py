@@ -27,8 +27,8 @@ from localizer.registration.cpu.reference import count_in_view
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import CudaBackend, to_precision
 from localizer.registration.cuda.curvature import (
-    geometry,
     last_settings,
+    level_without_features,
     winner_curvature,
     winner_motion,
 )
@@ -120,7 +120,9 @@ class CudaSchedule:
             if len(found.scores) > 0 and found.finite:
                 points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
                 level = query.levels[last]
-                seen = geometry(points, *level_intrinsics(camera, level), level.confidence.shape)
+                seen = level_without_features(
+                    points, *level_intrinsics(camera, level), level.confidence.shape
+                )
                 found = self._with_curvature(found, shape, memory, last, seen, scale)
             if not self._timed:
                 return found

@@ -185,7 +185,7 @@ class Lamp:
 
 
 def draw_lamps(count: int, width: int, height: int, rng: np.random.Generator) -> Iterator[Lamp]:
-    """Draw random lamps for one image."""
+    """Draw `count` random lamps for one image."""
     for _ in range(count):
         radius = float(rng.uniform(0.01, 0.06)) * width
         x, y = float(rng.uniform(0, width)), float(rng.uniform(0, height))

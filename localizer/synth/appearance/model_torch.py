@@ -1,4 +1,4 @@
-"""`appearance.apply_appearance` on any torch device, with the same model in the same order.
+"""`appearance.model.apply_appearance` on any torch device, with the same model in the same order.
 
 Sensor noise comes from torch's generator; JPEG is its quantisation without entropy coding.
 """

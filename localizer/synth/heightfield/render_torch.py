@@ -1,4 +1,4 @@
-"""`heightfield_render.render` for many views at once on any torch device.
+"""`heightfield.render.render` for many views at once on any torch device.
 
 It walks the same rays over the same samples as the CPU's kernel, all rays in step: the depths are
 equal but for float32 rounding, which now and then moves a silhouette by a pixel.
@@ -46,7 +46,7 @@ class ScenePool:
         self.scalars = torch.zeros(slots, 10, **new)
 
     def put(self, slot: int, scene: LitScene) -> None:
-        """Copy a scene into a slot."""
+        """Copy a scene of the pool's `cells` into a slot, over what was there."""
         count = min(len(scene.facades), _FACADES)
         self.height[slot] = torch.from_numpy(scene.height).flatten()
         self.block_max[slot] = torch.from_numpy(scene.block_max).flatten()

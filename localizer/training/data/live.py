@@ -104,7 +104,7 @@ class LiveStream:
         return current.result()
 
     def close(self) -> None:
-        """End the processes that make places."""
+        """End the thread and the processes; does not wait for them."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self._makers.shutdown(wait=False, cancel_futures=True)
 
@@ -147,7 +147,7 @@ class LiveStream:
     def pairs(
         self, step: int, count: int, rng: np.random.Generator, noise: torch.Generator
     ) -> Iterator[Pair]:
-        """Up to `count` degraded pairs of the step's places."""
+        """Up to `count` pairs of the step's places, which are loaded; degraded if `appearance`."""
         numbers = self._plan.window(step)
         drawn: list[tuple[int, int, Pose, Pose, Camera]] = []
         for _ in range(count):

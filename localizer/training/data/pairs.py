@@ -236,7 +236,9 @@ def named_conditions(rng: np.random.Generator, condition: str) -> FlightDay:
 def draw_views(
     rng: np.random.Generator, survey: LitScene, lived: LitScene, config: SceneConfig
 ) -> tuple[Pose, Pose, Camera] | None:
-    """Draw the poses of a pair with enough common view; None after a few failed tries."""
+    """Draw (reference pose, query pose, camera) with enough common view; None after a few failed
+    tries. survey, lived: the reference's scene and the query's.
+    """
     for _ in range(12):
         fov = rng.uniform(30, 90)
         camera = Camera.from_fov(config.width, config.height, fov)
@@ -261,7 +263,7 @@ def _viewpoint(rng: np.random.Generator, scene: LitScene, camera: Camera) -> tup
 
 
 def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Generator) -> Pose:
-    """A camera at `distance` from `target`, `pitch_rad` below the horizon, with some roll."""
+    """A camera at `distance` from `target`, `pitch_rad` below the horizon; draws heading, roll."""
     yaw, roll = rng.uniform(0, 2 * np.pi), np.radians(rng.normal(0, 3))
     flat = np.cos(pitch_rad)
     forward = np.array([flat * np.cos(yaw), flat * np.sin(yaw), -np.sin(pitch_rad)])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localizer.errors import SequenceError
 from localizer.pictures import read_rgb
-from localizer.plain_files import visible
+from localizer.plain_files import without_hidden
 
 _SEASONS = "neon_sjer_pairs"  # group whose plots were photographed at two dates
 
@@ -23,7 +23,7 @@ class PhotoLibrary:
     """
 
     def __init__(self, root: Path, groups: tuple[str, ...], *, held_out: bool = False) -> None:
-        self._files = {g: visible((root / g).rglob("*.jpg")) for g in groups}
+        self._files = {g: without_hidden((root / g).rglob("*.jpg")) for g in groups}
         if _SEASONS in self._files:
             plots = sorted({f.parent for f in self._files[_SEASONS]})
             mine = {p for k, p in enumerate(plots) if (k % 4 == 3) == held_out}
@@ -57,7 +57,7 @@ class PhotoLibrary:
     ) -> list[NDArray[np.uint8]]:
         plots = sorted({f.parent for f in files})
         chosen = [plots[i] for i in rng.choice(len(plots), 9, replace=len(plots) < 9)]
-        dates = [visible(plot.glob("*.jpg")) for plot in chosen]
+        dates = [without_hidden(plot.glob("*.jpg")) for plot in chosen]
         layers = [_grid([read_photo(d[k]) for d in dates], n, 3) for k in (0, -1)]
         return layers[:: int(rng.choice((-1, 1)))]
 
