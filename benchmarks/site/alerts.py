@@ -29,18 +29,17 @@ For the pilot and the operator: every text that the companion sends. Made from t
 `python -m benchmarks.site`; do not edit.
 
 An alert is sent as STATUSTEXT `{PREFIX}TEXT`. Left: its text, its identifier in `events.csv` and
-`health.json`, and *error* or *critical* if this is its severity. Right: when it is raised, when it
-ends, its meaning and effect, and in bold what to do. In a text, N is a number; other capitals are a
-name, a number or a reason. `bridge.origin` and the like are keys of the deployment file; limits
-without a key are fixed.
+`health.json`, and the severity *error* or *critical* (others: warning or less). Right: its cause,
+end, meaning and effect, and in bold what to do. In a text, N is a number; other capitals are a
+name, a number or a reason. `bridge.origin` and the like are keys of the deployment file.
 
 **Fixes:** an alert stops fixes only if its text begins with *output held* or *not sent*, or its row
 says *no fixes*.
 
 **Ends:** with *while*, an alert is active as long as this is true; with *Ends:*, until that is
-true; others report one moment. The end of a check of positions is sent as `cleared: NAME`, of some
-others as the text in brackets; otherwise the next text shows it, such as `injecting`, `the EKF
-follows` or `localization tracking`, 1.5 s later or more (up to 60 s if the alert recurs).
+true; others report one moment. The end is sent as `cleared: NAME` (checks of positions), as the
+text in brackets, or by the next text, such as `injecting`, `the EKF follows` or `localization
+tracking`, after 1.5 s (up to 60 s if the alert recurs).
 
 **Times:** "for 2 s" means all the time. A check without data (no fix for 1 s, no frame for 2 s, no
 IMU messages) leaves its alert as it is. "More than A, and more than B": both.

@@ -12,8 +12,6 @@ _TAKE_OVER = "take over"
 _VIDEO = f"{_TAKE_OVER}; check the camera and its link"
 _NO_FIX = "no fixes"
 _DISK = "check the disk after landing"
-_NO_SEARCH = "on the ground restart the program; in flight stay where vision works"
-_AGAIN = "a lost position is found again only if the autopilot knows it"
 _CLICK = "click again"
 _RESOLUTION = "set the camera to the calibrated resolution"
 _CONSOLE = "console: "
@@ -42,8 +40,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "frame; N m: 95 % bound of the error",
               "fly back over mapped ground with buildings and roads"),
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
-              "ten frames in a row are rejected; or one, and odometry fails during `bridging` or "
-              "with a too uncertain prediction",
+              "ten frames in a row are rejected, or odometry fails during `bridging` or with a too "
+              "uncertain prediction",
               "a position is found and confirmed", f"{_NO_FIX}; N: time since the last fix",
               _TAKE_OVER),
     condition(A.EKF_UNCERTAIN, WARNING, "autopilot position +-{metres:.0f} m", {"metres": "m"},
@@ -65,9 +63,11 @@ HEALTH: tuple[AlertSpec, ...] = (
               _TAKE_OVER),
     condition(A.NO_SEARCH, WARNING, "no map search possible, see the log", {},
               "the map search could not be prepared", "a restart",
-              _AGAIN, _NO_SEARCH),
+              "a lost position is found again only if the autopilot knows it",
+              "on the ground restart the program; in flight stay where vision works"),
     condition(A.SEARCH_HANGS, WARNING, "the search hangs", {},
-              "the search thread has made no progress for 2 min", WHILE, _AGAIN, _NO_SEARCH),
+              "the search thread has made no progress for 2 min", WHILE, "as `no_search`",
+              "as `no_search`"),
     condition(A.SEARCHING, INFO, "searching the map", {},
               "no position is known since the start", "the first frame is processed", _NO_FIX,
               "give the position"),

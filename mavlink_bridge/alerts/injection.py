@@ -13,7 +13,7 @@ _DOCTOR = "after landing run `companion doctor`"
 _LANDMARKS = "check landmarks"
 _UNVERIFIED = "map and calibration are not verified"
 _MAP = "check map and calibration"
-_NOT_VERIFIED = "vision is not verified yet"
+_NOT_VERIFIED = "not verified yet"
 _NOT_USED = "the EKF uses no fix"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
@@ -56,13 +56,13 @@ INJECTION: tuple[AlertSpec, ...] = (
               f"{_TAKE_OVER}; check the rate of ATTITUDE", lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
               "the horizontal sigma N of a fix is above 10 m", WHILE,
-              "the position is too uncertain; during `bridging` ArduPilot still receives the "
-              "velocity", _TAKE_OVER, lead=_NOT_SENT),
+              "the position is too uncertain (velocity: as `hpl_over_limit`)", _TAKE_OVER,
+              lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
               "in three of the last five fixes vision's yaw is over 20 deg off the autopilot's, or "
-              "turned over 3.5 deg unlike the gyros since the last good fixes (none for 60 s: is "
-              "over 3.5 deg off the autopilot's)",
+              "turned over 3.5 deg unlike the gyros (without a good fix for 60 s: is over 3.5 deg "
+              "off the autopilot's)",
               "five fixes in a row are within 70 % of the limits",
               "compass, camera mounting or map is rotated; N: vision minus autopilot",
               f"{_TAKE_OVER}; check compass and camera mounting", lead=_NOT_SENT),
@@ -132,24 +132,25 @@ INJECTION: tuple[AlertSpec, ...] = (
           "the EKF is where the fixes are", NOTHING),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
-              "positions are sent at less than 4 Hz (message gps_input: 4.65 Hz)", WHILE,
+              "positions are sent at less than 4 Hz (gps_input: 4.65 Hz; EKF check)", WHILE,
               "the EKF may stop using them",
               f"{_LANDMARKS}; on the ground check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
-              "the EKF's flag EKF_UNINITIALIZED is set (ArduPilot)", WHILE, _NOT_USED,
+              "ArduPilot's EKF flag EKF_UNINITIALIZED is set (EKF check)", WHILE, _NOT_USED,
               _TAKE_OVER),
     condition(A.EKF_NO_SOURCE, WARNING, "the EKF has no position source", {},
-              "the EKF's flag EKF_CONST_POS_MODE is set", WHILE, _NOT_USED,
+              "the EKF flag EKF_CONST_POS_MODE is set (EKF check)", WHILE, _NOT_USED,
               f"{_TAKE_OVER}; {_DOCTOR}"),
     condition(A.EKF_NO_POSITION, WARNING, "the EKF reports no local position", {},
-              "LOCAL_POSITION_NED is missing for the times of the fixes", WHILE,
+              "LOCAL_POSITION_NED is missing for the fixes' times (EKF check)", WHILE,
               "whether the EKF uses the fixes is unknown", f"{_TAKE_OVER}; {_DOCTOR}"),
     condition(A.EKF_OFF_FIXES, WARNING, "the EKF is {metres:.1f} m from what is sent",
               {"metres": "m"},
-              "the EKF's median distance N from the fixes is above 2 m + 5 sigma", WHILE,
+              "the EKF's median distance N from the fixes is above 2 m + 5 sigma (EKF check)",
+              WHILE,
               "source set, EKF origin or yaw is wrong", f"{_LANDMARKS}; {_DOCTOR}"),
     condition(A.EKF_REJECTS_FIXES, WARNING, "the EKF rejects positions", {},
-              "the test ratio is above 1", WHILE, _NOT_USED,
+              "the test ratio is above 1 (EKF check)", WHILE, _NOT_USED,
               f"{_TAKE_OVER}; after landing check VISO_POS_M_NSE and the delay"),
     condition(A.FIXES_LATE, WARNING, "fixes {age_ms:.0f} ms old, delay_ms {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},

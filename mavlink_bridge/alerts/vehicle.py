@@ -34,7 +34,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "MAVLink works again", NOTHING),
     condition(A.FC_SILENT, WARNING, "no heartbeat from the flight controller", {},
               "no heartbeat in the first 5 s (in health.json: for 3 s at any time)",
-              "`fc_found`", _NO_LINK, _CABLE),
+              "`fc_found`", "as `fc_lost`", "as `fc_lost`"),
     event(A.FC_REBOOTED, WARNING, "flight controller rebooted", {},
           "the boot time in its messages ran back",
           "the EKF restarted with its first source set; messages relative to its origin wait for "
@@ -48,8 +48,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "after `gnss_lost`: a 3D fix for 5 s, and no `gnss_refused`", "GNSS can be used again",
           "select the GNSS source set if you want it"),
     event(A.ARMED_WITHOUT_GNSS, WARNING, "armed without GNSS, {output}", {"output": Output},
-          "at arming, or when the program meets an armed vehicle: no 3D fix in the last 1.5 s (no "
-          "GNSS report at all: after 3 s)", _SENT_OR_NOT,
+          "at arming, or when the program meets an armed vehicle: no 3D fix in the last 1.5 s",
+          _SENT_OR_NOT,
           "on the ground: do not take off unless planned; in flight, if nothing is injected, "
           f"{_TAKE_OVER}"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
@@ -67,8 +67,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           f"{_TAKE_OVER}; stop one of them"),
     event(A.DUPLICATE_SYSTEM_ID, WARNING, "two autopilots have system id {system}",
           {"system": "id"},
-          "this id comes from a second autopilot, make or firmware version; or boot times run "
-          "back 40 times in 5 s",
+          "this id comes from a second autopilot, make or firmware version, or boot times "
+          "alternate",
           "the data of both are mixed",
           f"{_TAKE_OVER}; on the ground change one system id"),
     event(A.AUTOPILOT_IGNORED, WARNING, "autopilot {system} ignored, using {used}",
