@@ -109,16 +109,25 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
             lived, season = flight_day_scene(rng, place, visit, fixed)
-        pair = draw_views(rng, survey, lived, config)
-        if pair is None:
-            continue
-        reference, query, camera = pair
-        image, depth = render(survey, reference, camera)
-        seen, seen_depth = render(lived, query, camera, supersample=2)
-        yield Pair(
-            image, depth, seen, seen_depth, reference, query, camera, visit.weather,
-            visit.outdated, source, season,
-        )  # fmt: skip
+        views = draw_views(rng, survey, lived, config)
+        if views is not None:
+            yield render_pair(survey, lived, views, visit, source, season=season)
+
+
+def render_pair(
+    survey: LitScene, lived: LitScene, views: tuple[Pose, Pose, Camera], visit: FlightDay,
+    source: str, *, season: bool,
+) -> Pair:  # fmt: skip
+    """The reference's view of the survey and the query's view of the place later, without weather.
+    views: as `draw_views` returns them.
+    """
+    reference, query, camera = views
+    image, depth = render(survey, reference, camera)
+    seen, seen_depth = render(lived, query, camera, supersample=2)
+    return Pair(
+        image, depth, seen, seen_depth, reference, query, camera, visit.weather, visit.outdated,
+        source, season,
+    )  # fmt: skip
 
 
 def draw_place(
