@@ -47,7 +47,7 @@ class FakeBridge:
         return {"fix_latency_ms": float("nan")}
 
     def shadow_score(self):
-        return SimpleNamespace(go=False, line=lambda: "no comparison yet")
+        return SimpleNamespace(ready=False, line=lambda: "no comparison yet")
 
 
 def _one_report(
