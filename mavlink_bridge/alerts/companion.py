@@ -11,7 +11,7 @@ WARNING, NOTICE, INFO = Severity.WARNING, Severity.NOTICE, Severity.INFO
 _TAKE_OVER = "take over"
 _VIDEO = f"{_TAKE_OVER}; check the camera and its link"
 _NO_FIX = "no fixes"
-_DISK = "check the disk after landing"
+_DISK = "check the disk"
 _CLICK = "click again"
 _RESOLUTION = "set the camera to the calibrated resolution"
 _CONSOLE = "console: "
@@ -22,8 +22,8 @@ _NUMBER_WHY: dict[str, Kind] = {"number": "", "why": "name"}
 HEALTH: tuple[AlertSpec, ...] = (
     condition(A.INITIALIZING, INFO, "localization initializing", {},
               "frames are processed, but the first position is not confirmed",
-              "three or more frames in a row are accepted and confirm it; or ten are rejected "
-              "(`lost`)",
+              "three or more frames in a row are accepted and confirm it; or ten in a row are "
+              "rejected (`lost`)",
               _NO_FIX, _TAKE_OVER),
     condition(A.TRACKING, INFO, "localization tracking", {}, "frames are accepted",
               "`degraded`, `bridging` or `lost`",
@@ -40,8 +40,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "frame; N m: 95 % bound of the error",
               "fly back over mapped ground with buildings and roads"),
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
-              "ten frames in a row are rejected, or odometry fails during `bridging` or with a too "
-              "uncertain prediction",
+              "ten frames in a row are rejected, or odometry fails during `bridging` or while the "
+              "predicted position is too uncertain",
               "a position is found and confirmed", f"{_NO_FIX}; N: time since the last fix",
               _TAKE_OVER),
     condition(A.EKF_UNCERTAIN, WARNING, "autopilot position +-{metres:.0f} m", {"metres": "m"},
@@ -57,13 +57,13 @@ HEALTH: tuple[AlertSpec, ...] = (
               {"done": "Hz", "offered": "Hz"},
               "over 5 s fewer than 3 frames/s are processed, and 6 or more received", WHILE,
               "there are too few fixes for the EKF",
-              f"{_TAKE_OVER}; on the ground check the computer's load and temperature"),
+              f"{_TAKE_OVER}; check the computer's load and temperature"),
     condition(A.SEARCH_NOT_READY, WARNING, "search not ready", {},
               "the position is not known, and the map search is being prepared", WHILE, _NO_FIX,
               _TAKE_OVER),
     condition(A.NO_SEARCH, WARNING, "no map search possible, see the log", {},
               "the map search could not be prepared", "a restart",
-              "a lost position is found again only if the autopilot knows it",
+              "a lost position is found again only near the autopilot's own position (GNSS)",
               "on the ground restart the program; in flight stay where vision works"),
     condition(A.SEARCH_HANGS, WARNING, "the search hangs", {},
               "the search thread has made no progress for 2 min", WHILE, "as `no_search`",
@@ -127,9 +127,10 @@ HEALTH: tuple[AlertSpec, ...] = (
               f"set a zoom level inside the table; {_TAKE_OVER}"),
     event(A.MAP_OFFSET, NOTICE, "map {metres:.1f} m {direction} of GNSS{applied}",
           {"metres": "m", "direction": Direction, "applied": MapOffsetUse},
-          "vision and GNSS differed by a constant offset (15 m at most) for a minute or more; "
-          "again if it changes by 2 m",
-          "*applied* (`bridge.injection.map_shift`): it is subtracted from the fixes",
+          "for a minute or more vision and GNSS differed by N, over 3.4 times the receiver's "
+          "accuracy and 15 m at most; again if N changes by 2 m",
+          "map or GNSS is off; *applied* (`bridge.injection.map_shift`): N is subtracted from the "
+          "fixes",
           "check the map's georeference after landing"),
     event(A.DETECTOR_OFF, WARNING, "the detector is off, see the log", {},
           "the detection model cannot be loaded, or fails in three frames in a row",
@@ -173,8 +174,8 @@ TARGETS: tuple[AlertSpec, ...] = (
           "after `target_may_have_left` it looks as before", "the target has not moved", NOTHING),
     condition(A.TARGET_SILENT, WARNING, "{name} not reported: {why}",
               {"name": "name", "why": "name"},
-              "a detected and reported target's position is rejected for 2 s; one such text in 10 "
-              "s at most", WHILE, "the target is neither sent nor shown", NOTHING),
+              "a detected and reported target's position is rejected for 2 s (WHY); one such text "
+              "in 10 s at most", WHILE, "the target is neither sent nor shown", NOTHING),
 )  # fmt: skip
 CONSOLE: tuple[AlertSpec, ...] = (
     event(A.CONSOLE_STOP, NOTICE, "targets ended", {},

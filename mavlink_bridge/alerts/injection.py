@@ -122,7 +122,7 @@ INJECTION: tuple[AlertSpec, ...] = (
     event(A.INJECTION_RESTORED, NOTICE, "injection on (restored, {seconds:.0f} s old)",
           {"seconds": "s"},
           "mode rc: a process that crashed or was killed N s ago (10 min at most) had injection "
-          "enabled", "fixes are sent", "disable it by RC channel or command if you want"),
+          "enabled", "fixes are sent", NOTHING),
     event(A.JUMP_REPEATED, NOTICE, "the EKF missed a jump: announced again", {},
           "after `reset_counter` incremented, the EKF is still over 1 m + 3 sigma off the fixes",
           "the next fix increments it again, five times at most", NOTHING),
@@ -180,5 +180,5 @@ INJECTION: tuple[AlertSpec, ...] = (
               "fixes are sent without a time", "set the clock and restart"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": "name"},
           "the .tlog (`bridge.tlog`) cannot be written", "MAVLink messages are not recorded",
-          "check the disk after landing"),
+          "check the disk"),
 )  # fmt: skip

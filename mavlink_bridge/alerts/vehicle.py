@@ -21,7 +21,7 @@ _TAKE_OVER = "take over"
 _LANDMARKS = "check landmarks"
 _CABLE = "take over; check the link to the flight controller"
 _NO_LINK = "no fix reaches the autopilot; this text arrives only over `bridge.ground_connection`"
-_AS_BEFORE = "none: a gimbal that follows a target goes on"
+_AS_BEFORE = "nothing changes: a gimbal that follows a target goes on"
 _MOUNT = "check the gimbal's parameters (MNT1_*)"
 _SENT_OR_NOT = "*injecting*: fixes are sent; *nothing is injected*: the EKF has no position"
 
@@ -83,7 +83,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "three answers in 10 s are over 10 s off the autopilot's timestamps",
           "a second system may answer; its answers are ignored", _SIGN),
     condition(A.TIMESYNC_UNANSWERED, WARNING, "TIMESYNC unanswered: stamps may drift", {},
-              "no answer for 15 s, after earlier ones and with heartbeats",
+              "no answer for 15 s, after earlier ones, although heartbeats arrive",
               "an answer",
               "the fixes' times drift by up to 0.2 ms per second",
               "check the link to the flight controller",
