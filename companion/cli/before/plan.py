@@ -79,7 +79,7 @@ def plan_command(
         plan = make_plan(planned, cache, deployment, question, count)
     camera = deployment.camera.model.camera().without_distortion()
     with show_work(Console(stderr=True), "drawing the pictures"):
-        sheet = pictures.sheet_of(plan, cache)
+        sheet = pictures.render_map_square(plan, cache)
         aim = aim_of(deployment, pitch)
         shown = (
             ("Track", pictures.track_picture(sheet, plan)),

@@ -18,7 +18,7 @@ from rasterio.windows import Window
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.cloud import NODATA, check_depth
+from localizer.map.fetch.cloud import NODATA, require_8_bits
 from localizer.map.fetch.heights import UNITS, metres_of
 from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.importers.raster_file import offline
@@ -86,7 +86,7 @@ def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
     ) as error:  # fmt: skip
         raise MapFetchError(f"{source.name}: piece {piece.name} is no image: {error}") from error
     if not source.has_heights:
-        check_depth(f"{source.name}: piece {piece.name}", dtype)
+        require_8_bits(f"{source.name}: piece {piece.name}", dtype)
     elif bands != 1 or dtype == "uint8":
         raise MapFetchError(
             f"{source.name}: sends {bands} bands of {dtype}, no heights; set `format` to a GeoTIFF "
