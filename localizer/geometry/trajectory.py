@@ -6,7 +6,6 @@ poses here are `world_from_camera` in the map's ENU frame, OpenCV camera axes.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -95,20 +94,6 @@ def _parse_tum(line: str, where: str) -> StampedPose:
     if not np.isfinite([*position, *q]).all() or abs(np.linalg.norm(q) - 1.0) > 0.01:
         raise PoseFileError(f"{where}: not a position and a unit quaternion")
     return StampedPose(str(time_ns), Pose(matrix_from_quaternion(q), position), time_ns)
-
-
-def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
-    """Write the upper triangles as CSV (`COVARIANCE_COLUMNS`). Poses without one are skipped.
-
-    Axes 0 to 2: position east, north, up (m); 3 to 5: rotation vector about them (rad).
-    """
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COVARIANCE_COLUMNS)
-        for pose in poses:
-            row = covariance_row(pose)
-            if row is not None:
-                writer.writerow(row)
 
 
 def covariance_row(pose: StampedPose) -> tuple[str, ...] | None:
