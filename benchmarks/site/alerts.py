@@ -59,8 +59,8 @@ without GNSS a failed check stays failed |
 | output held | fixes are made, but none is sent until the alert ends |
 | reset | the first fix after *output held* increments `reset_counter`: the EKF jumps to it |
 | inhibit | injection and the switch to the vision source set do not start, except by the pilot \
-(mode rc) or `force`. Running injection continues. After a crash before injection started, the \
-alert stays for 10 min |
+(mode rc) or `force`. Running injection continues. A restart within 10 min after a crash before \
+injection restores the alert |
 | no fixes | vision makes no fix until the alert ends |
 | EKF check | the first alert from `fix_rate_low` to `ekf_rejects_fixes` whose condition is true \
 for the positions sent in the last 3 s |

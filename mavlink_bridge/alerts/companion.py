@@ -141,8 +141,8 @@ TARGETS: tuple[AlertSpec, ...] = (
           "a click's position is found",
           "a target is made; N: its horizontal sigma (both axes)", NOTHING),
     event(A.TARGET_REFUSED, WARNING, "target {number} refused: {why}", _NUMBER_WHY,
-          "a click's position cannot be found (no map or a hole there, over 5 km away, or known to "
-          "over 50 m only)", _NO_TARGET, _CLICK),
+          "a click's position cannot be found (WHY, such as no map there, over 5 km away, or known "
+          "to over 50 m only)", _NO_TARGET, _CLICK),
     event(A.TARGET_UNREADABLE, WARNING, "target {number} refused: map unreadable?", _NUMBER,
           "an error while a click's position is computed", _NO_TARGET,
           "click again; after landing read the log"),

@@ -178,7 +178,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               "message gps_input: at the start the companion's clock is before 2023",
               "a restart with a set clock",
               "fixes are sent without a time", "set the clock and restart"),
-    event(A.TLOG_INCOMPLETE, WARNING, "tlog is incomplete: {why}", {"why": "name"},
-          "the .tlog (`bridge.tlog`) cannot be written", "MAVLink messages are not recorded",
-          "check the disk"),
+    event(A.TLOG_INCOMPLETE, WARNING, "tlog incomplete: {why}", {"why": "name"},
+          "the .tlog (`bridge.tlog`) cannot be written, or has 2 GiB",
+          "MAVLink messages are not recorded", "check the disk"),
 )  # fmt: skip

@@ -11,14 +11,14 @@ _WITHIN = "N + 2 sigma is below the limit for 10 s"
 _CALIBRATE = "after landing run `companion calibrate flight` on the record"
 _TAKE_OVER = "take over"
 _IF_LASTS = "if it lasts, take over"
-_ADDED = "now in covariance and protection level"
+_ADDED = "now included in covariance and protection level"
 _STILL_VELOCITY = "during `bridging` ArduPilot still receives the velocity"
 
 INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VIDEO_FROZEN, ERROR, "video frozen", "video frozen {seconds:.0f} s",
               {"seconds": "s"},
-              "in flight: identical frames for 1.5 s; no image motion while the EKF's velocity "
-              "makes 2 m, or for 2 s + 0.027 s per metre of ground across the image (3 s or more)",
+              "in flight: identical frames for 1.5 s; no image motion over 2 m of flight (EKF's "
+              "velocity), or for 2 s + 0.027 s per metre of ground across the image (3 s or more)",
               "the image moves for 2 s",
               "camera or link repeat a frame: the position stands still",
               _TAKE_OVER, action=OutputAction.EXCLUDE_AND_RESET, clear_s=2.0),
@@ -43,8 +43,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=0.2, clear_s=5.0),
     AlertSpec(A.HEIGHT_MISMATCH, ERROR, "height mismatch", "height {metres:.0f} m off barometer",
               {"metres": "m"},
-              "armed: vision's and barometer's height changed by N differently in the last 2 min, "
-              "for 2 s by more than 8 m + 4 sigma + 16 % of the climb",
+              "armed: in the last 2 min vision's height changed N more or less than the "
+              "barometer's; for 2 s N exceeds 8 m + 4 sigma + 16 % of the climb",
               "N is within the limit for 5 s",
               "vision's height is wrong, its position probably too", _TAKE_OVER,
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=2.0, clear_s=5.0),
@@ -60,9 +60,9 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               "position step {metres:.0f} m, unexplained", {"metres": "m"},
               "the mean of five fixes is off that of the five before by more than 1 m, and by more "
               "than motion and 4 sigma explain, but less than a jump",
-              "a step back; disarmed; along the course: the time offset is measured, and too small "
-              "for it; across (in a hover: always): the position is found again after `bridging` "
-              "or `lost`",
+              "a step back; disarmed; for steps along the course: a measured time offset that is "
+              "too small to explain them; for steps across (in a hover: all): the position is "
+              "found again after `bridging` or `lost`",
               f"the position may be wrong by N (sum of steps, 3 m at most), {_ADDED}",
               "keep N more distance to obstacles", repeat_s=60.0),
     AlertSpec(A.TILT_MISMATCH, WARNING, "tilt mismatch", "tilt {degrees:.0f} deg off autopilot",

@@ -22,7 +22,7 @@ _LANDMARKS = "check landmarks"
 _CABLE = "take over; check the link to the flight controller"
 _NO_LINK = "no fix reaches the autopilot; this text arrives only over `bridge.ground_connection`"
 _AS_BEFORE = "nothing changes: a gimbal that follows a target goes on"
-_MOUNT = "check the gimbal's parameters (MNT1_*)"
+_MOUNT = "check the gimbal's MNT1 parameters"
 _SENT_OR_NOT = "*injecting*: fixes are sent; *nothing is injected*: the EKF has no position"
 
 VEHICLE: tuple[AlertSpec, ...] = (
