@@ -47,8 +47,8 @@ class DeviceArray:
         """
         if self.dtype != np.dtype(dtype):
             raise DeviceArrayError(
-                f"device features are {self.dtype}, the kernels were asked for {np.dtype(dtype)}: "
-                "export the network in that precision or choose the other"
+                f"device features are {self.dtype}, the kernels take {np.dtype(dtype)}: export the "
+                "network in that precision"
             )
         if self.address % 16:
             raise DeviceArrayError(f"device array at {self.address:#x} is not aligned to 16 bytes")

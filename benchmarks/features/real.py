@@ -18,21 +18,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.common.maps import build_map, layers_of, origin_of
 from benchmarks.features.pairs import DEGREES, METRES, SIZE, TestPair
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.importers.rules import ImportRules
+from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
-from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import SEASON, look_at, moved
-from localizer.training.places.photos import read_photo
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
 
@@ -41,47 +37,25 @@ _PLOT_TEXEL_M = 0.1
 _MADE = tuple(c for c in CONDITIONS if c != "day")
 
 
-def real_pairs(
-    folder: Path,
-    count: int,
-    seed: int,
-    cache: Path,
-    size: tuple[int, int] = SIZE,
-) -> list[TestPair]:
+def real_pairs(folder: Path, count: int, seed: int, cache: Path) -> list[TestPair]:
     """Pairs of the real set in `folder`, conditions in turn; its map is built in `cache` once."""
     if (folder / "offsets.csv").exists():
-        return _season_pairs(folder, count, seed, size)
+        return _season_pairs(folder, count, seed)
     photos = folder / "queries"
-    origin = _origin(folder / "georef.json") if photos.exists() else None
-    with TileStreamer(TileCache.open(_map(folder, cache, origin))) as streamer:
+    with TileStreamer(TileCache.open(_map(folder, cache))) as streamer:
         renderer = NumbaRenderer(streamer)
         if photos.exists():
-            return _photo_pairs(renderer, photos, count, seed, size)
-        return _rendered_pairs(renderer, count, seed, size)
+            return _photo_pairs(renderer, photos, count, seed)
+        return _rendered_pairs(renderer, count, seed)
 
 
-def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
+def _map(folder: Path, cache: Path) -> Path:
     built = cache / f"map-{folder.name}"
-    if not built.exists():
-        layers = [folder / "dsm.tif", folder / "ortho.tif"]
-        # Heights only need to agree between map and poses here, so the separation does not matter.
-        build_cache(
-            layers if layers[0].exists() else folder,
-            built,
-            BuildOptions(
-                geoid_separation_m=0.0,
-                vertical_datum="ellipsoidal",
-                rules=ImportRules(trusted=frozenset({"geoid"})),
-                origin=origin,
-            ),
-        )
-    return built
+    return built if built.exists() else build_map(layers_of(folder), built, origin_of(folder))
 
 
-def _photo_pairs(
-    renderer: NumbaRenderer, photos: Path, count: int, seed: int, size: tuple[int, int]
-) -> list[TestPair]:
-    camera = Camera.from_json(photos / "camera.json").resized(*size)
+def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -> list[TestPair]:
+    camera = Camera.from_json(photos / "camera.json").resized(*SIZE)
     poses = json.loads((photos / "poses.json").read_text())
     names = sorted(p.name for p in (photos / "images").iterdir())
     kinds = (PHOTO, COARSE_MAP, OLDER_MAP, *_MADE)
@@ -90,13 +64,11 @@ def _photo_pairs(
         rng = np.random.default_rng((seed, k))
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
-        image = read_photo(photos / "images" / names[photo])
-        query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        image = read_rgb(photos / "images" / names[photo])
+        query = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
-            query = apply_appearance(
-                query, depth, limit_haze(sample_appearance(rng, condition), depth), rng
-            )
+            query = weathered(query, depth, condition, rng)
         view = renderer.render(moved(rng, truth, np.inf, (METRES, DEGREES)), camera, wait=True)
         if condition in (COARSE_MAP, OLDER_MAP):
             view = _surveyed(view, rng, repainted=condition == OLDER_MAP)
@@ -112,15 +84,13 @@ def _surveyed(view: RenderedView, rng: np.random.Generator, *, repainted: bool) 
     )
 
 
-def _rendered_pairs(
-    renderer: NumbaRenderer, count: int, seed: int, size: tuple[int, int]
-) -> list[TestPair]:
+def _rendered_pairs(renderer: NumbaRenderer, count: int, seed: int) -> list[TestPair]:
     """Views of the map itself, 80 to 200 m up, under every condition in turn."""
     kinds = (*CONDITIONS, SEASON)
     rng = np.random.default_rng((seed, 1))
     pairs: list[TestPair] = []
     while len(pairs) < count:
-        camera = Camera.from_fov(*size, rng.uniform(40, 75))
+        camera = Camera.from_fov(*SIZE, rng.uniform(40, 75))
         truth = _view(rng)
         start = moved(rng, truth, np.inf, (METRES, DEGREES))
         view, seen = (renderer.render(pose, camera, wait=True) for pose in (start, truth))
@@ -131,8 +101,8 @@ def _rendered_pairs(
         view = _surveyed(view, rng, repainted=False)
         if condition == SEASON:
             query = _image(season_shift(_squared(query), rng), query.shape)
-        look = sample_appearance(rng, "day" if condition == SEASON else condition)
-        query = apply_appearance(query, seen.depth, limit_haze(look, seen.depth), rng)
+        weather = "day" if condition == SEASON else condition
+        query = weathered(query, seen.depth, weather, rng)
         pairs.append(TestPair(view, query, truth, condition, place=len(pairs)))
     return pairs
 
@@ -163,18 +133,18 @@ def _view(rng: np.random.Generator) -> Pose:
     return look_at(target, rng.uniform(80, 200) / np.sin(pitch), pitch, rng)
 
 
-def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) -> list[TestPair]:
+def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
     """A plot at one date as the map and at the other as the flight, 25 to 40 m above it."""
     plots = unseen_plots(folder)
     pairs: list[TestPair] = []
     for k in range(count):
         rng = np.random.default_rng((seed, 3, k))
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
-        dates = [read_photo(p) for p in plot_dates(plot)]
+        dates = [read_rgb(p) for p in plot_dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
-        view, query, truth = _plot_pair(surveyed, flown, rng, size)
+        view, query, truth = _plot_pair(surveyed, flown, rng)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
-        query = apply_appearance(query, seen, limit_haze(sample_appearance(rng, "day"), seen), rng)
+        query = weathered(query, seen, "day", rng)
         condition = "dry map, green flight" if dry_map else "green map, dry flight"
         pairs.append(TestPair(view, query, truth, condition, place=k // 2 % len(plots)))
     return pairs
@@ -189,18 +159,18 @@ def plot_dates(plot: Path) -> list[Path]:
     """The green date, then the dry one."""
 
     def green(path: Path) -> float:
-        red_green_blue = read_photo(path).reshape(-1, 3).mean(0)
+        red_green_blue = read_rgb(path).reshape(-1, 3).mean(0)
         return float(red_green_blue[0] - red_green_blue[1])
 
     return sorted(plot.glob("*.jpg"), key=green)
 
 
 def _plot_pair(
-    surveyed: Image, flown: Image, rng: np.random.Generator, size: tuple[int, int]
+    surveyed: Image, flown: Image, rng: np.random.Generator
 ) -> tuple[RenderedView, Image, Pose]:
     """Two views of flat ground: all of the query and four fifths of the map's view lie on it."""
     while True:
-        camera = Camera.from_fov(*size, rng.uniform(35, 50))
+        camera = Camera.from_fov(*SIZE, rng.uniform(35, 50))
         pitch = np.radians(rng.uniform(65, 90))
         at = rng.uniform(-12, 12, 2)
         truth = look_at(np.array([*at, 0.0]), rng.uniform(25, 40) / np.sin(pitch), pitch, rng)
@@ -233,8 +203,3 @@ def plane_view(ortho: Image, pose: Pose, camera: Camera) -> tuple[Image, Float32
     )
     image[~on] = 0
     return image, np.where(on, depth, 0.0).astype(np.float32)
-
-
-def _origin(georef: Path) -> Geodetic:
-    origin = json.loads(georef.read_text())["origin"]
-    return Geodetic(origin["lat"], origin["lon"], origin["height"])

@@ -30,15 +30,11 @@ import numpy as np
 from benchmarks.basin.views import SIZE, ground_height
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
-from benchmarks.common.figures import markdown, write_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
+from benchmarks.common.figures import show_figures
+from benchmarks.common.named_errors import named_errors
 from benchmarks.common.shares import exact_interval
 from benchmarks.odometry.stretches import StretchPlan, TestStretch, make_stretch
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, with_threads
-
-with needs_torch():
-    from localizer.training.data.batches import limit_haze
-    from localizer.training.data.pairs import soften
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
 from localizer.evaluation.places import SimulatedPlaceData
@@ -56,11 +52,13 @@ from localizer.synth.appearance.model import (
     CONDITIONS,
     Appearance,
     apply_appearance,
+    limit_haze,
     sample_appearance,
 )
 from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.pipeline import Localizer
+from localizer.training.data.pairs import soften
 from localizer.types import Frame, PosePrior, TrackingState
 
 # Of a set: the map that is searched, the world that is seen, how far from the middle it is flown.
@@ -271,7 +269,7 @@ def run(
 
 def share(hits: int, count: int) -> dict[str, float]:
     """With its exact 95 % interval, per cent."""
-    low, high = exact_interval(hits, count) if count else (0.0, 100.0)
+    low, high = exact_interval(hits, count)
     return {"hits": hits, "count": count, "low": low, "high": high}
 
 
@@ -327,11 +325,6 @@ def cells(rows: Sequence[dict[str, object]]) -> list[tuple[str, ...]]:
     return made
 
 
-def table(rows: Sequence[dict[str, object]]) -> str:
-    """One line a row."""
-    return markdown(COLUMNS, cells(rows))
-
-
 def main() -> None:
     p = Parser(__doc__)
     p.add_argument("folder", type=existing, nargs="?", help="of worlds and maps")
@@ -366,9 +359,7 @@ def main() -> None:
             known = args.heading == "known"
             run(site, kept, args.first, args.trials, known, more_time, save)
     rows = shares(kept)
-    print(table(rows))
-    if args.json:
-        write_figures(args.json, COLUMNS, cells(rows), {"shares": rows})
+    show_figures(args.json, COLUMNS, cells(rows), {"shares": rows})
 
 
 if __name__ == "__main__":

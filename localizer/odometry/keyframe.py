@@ -64,7 +64,7 @@ class Keyframe:
         return add_scale_error(self.scale_covariance, self.scale, hop)
 
 
-def keyframe_anchors(
+def keyframe_anchors(  # noqa: PLR0913
     features: FeaturePyramid,
     camera: Camera,
     world_from_camera: Pose,

@@ -166,7 +166,7 @@ class Localizer:
     is_loading: whether requested tiles are still loading.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         renderer: MapRenderer,
         extractor: FeatureExtractor,

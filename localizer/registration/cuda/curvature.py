@@ -36,7 +36,7 @@ def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) ->
     return mean_motion(projection_jacobian(problem, x[visible], translation))
 
 
-def winner_curvature(
+def winner_curvature(  # noqa: PLR0913
     backend: CudaBackend,
     memory: FrameMemory,
     scoring: KernelLaunch,

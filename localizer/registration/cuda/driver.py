@@ -36,7 +36,6 @@ class Device:
             self._attribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR),
         )
         self.multiprocessors = self._attribute(attribute.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
-        self.clock_hz = 1e3 * self._attribute(attribute.CU_DEVICE_ATTRIBUTE_CLOCK_RATE)
         self.stream = self._call(
             self._api.cuStreamCreate, self._api.CUstream_flags.CU_STREAM_NON_BLOCKING
         )

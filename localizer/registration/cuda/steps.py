@@ -109,7 +109,7 @@ def _sharpening(shape: GraphShape, memory: FrameMemory) -> Iterator[KernelLaunch
     yield KernelLaunch("quality", searched - 1, 1, _FEW_THREADS, quality)
 
 
-def refine_launch(
+def refine_launch(  # noqa: PLR0913
     shape: GraphShape,
     memory: FrameMemory,
     level: int,

@@ -84,7 +84,7 @@ class Planner:
     slots: list[tuple[float, float, float, float]] = field(default_factory=list)
     corners: list[Array] = field(default_factory=list)  # corners of painted pitches
 
-    def place(
+    def place(  # noqa: PLR0913
         self, rng: np.random.Generator, kind: Kind, centre: ArrayLike, angle: float, length: float,
         width: float, eaves: float, margin: float = 1.5,
     ) -> Building | None:  # fmt: skip

@@ -1,4 +1,4 @@
-"""The training loop: both losses together, EMA, exact resumption, curves."""
+"""The training loop: both losses together, EMA, exact resumption."""
 
 from __future__ import annotations
 

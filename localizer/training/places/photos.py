@@ -41,8 +41,8 @@ class PhotoLibrary:
             return self._seasons(rng, n, files)
         if group == "neon_forest":
             chosen = rng.choice(len(files), 9, replace=True)
-            return [_grid([read_photo(files[i]) for i in chosen], n, 3)]
-        image = read_photo(files[int(rng.integers(len(files)))])
+            return [_grid([read_rgb(files[i]) for i in chosen], n, 3)]
+        image = read_rgb(files[int(rng.integers(len(files)))])
         short = min(image.shape[:2])
         side = int(rng.uniform(0.55, 1.0) * short)
         y = int(rng.integers(0, image.shape[0] - side + 1))
@@ -58,13 +58,8 @@ class PhotoLibrary:
         plots = sorted({f.parent for f in files})
         chosen = [plots[i] for i in rng.choice(len(plots), 9, replace=len(plots) < 9)]
         dates = [without_hidden(plot.glob("*.jpg")) for plot in chosen]
-        layers = [_grid([read_photo(d[k]) for d in dates], n, 3) for k in (0, -1)]
+        layers = [_grid([read_rgb(d[k]) for d in dates], n, 3) for k in (0, -1)]
         return layers[:: int(rng.choice((-1, 1)))]
-
-
-def read_photo(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a photo's file; `SequenceError` if it is no image."""
-    return read_rgb(path)
 
 
 def _grid(images: list[NDArray[np.uint8]], n: int, per_side: int) -> NDArray[np.uint8]:
