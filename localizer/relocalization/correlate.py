@@ -159,7 +159,7 @@ class LevelCorrelator:
         raw = scipy.fft.irfft(columns, SIZE, axis=1, workers=1)
         small = SIZE // _COARSE
         energy = scipy.fft.irfft2(block.energy * patch.mask.conj(), (small, small), workers=1)
-        least = _LEAST_ENERGY * self._usual * patch.weight * patch.cells**2
+        least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
         scores = np.empty((STEP, STEP), np.float32)
         _normalised(raw, energy, np.float32(least), np.float32(max(patch.norm, 1e-9)), scores)
         return scores

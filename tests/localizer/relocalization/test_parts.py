@@ -17,7 +17,7 @@ from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import rectify, with_heading
-from localizer.relocalization.search import above_roofs, ground_of, scales
+from localizer.relocalization.search import above_roofs, ground_of, trial_heights
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
 from localizer.render.topview import DOWN
@@ -59,7 +59,7 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
     near = replace(asked, region=SearchRegion.circle(np.array([1700.0, -200.0]), 50.0))
     assert ground_of(flat, near).max() == 80  # within what is seen, if not below
     off = replace(asked, region=SearchRegion.circle(np.array([9000.0, 0.0]), 50.0))
-    assert len(scales(off, ground_of(flat, off), CONFIG)) == 0
+    assert len(trial_heights(off, ground_of(flat, off), CONFIG)) == 0
     assert ground_of(flat, query()).shape == flat.ground.shape
 
 
@@ -122,6 +122,15 @@ def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
     assert best[1][0] < 0.3
 
 
+def test_a_patch_of_which_nothing_is_seen_looks_like_no_place():
+    """The search of a low, steep view ended with a division by zero."""
+    features = np.random.default_rng(2).integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    correlator = LevelCorrelator(level(features), 0)
+    unseen = transform_patch(np.zeros((16, 16, 3), np.float32), np.zeros((16, 16), np.float32))
+    for block in correlator.blocks():
+        assert np.abs(correlator.correlate(unseen, block)).max() == 0
+
+
 def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
     """The least recently used would be the next one wanted: going round, nothing was ever found."""
     features = np.random.default_rng(0).integers(-99, 99, (3, 512, 512)).astype(np.int8)
@@ -173,12 +182,12 @@ def test_rectified_ground_lies_where_it_is():
 
 def test_heights_cover_the_ground_and_its_error():
     ground = np.array([[0.0, 20.0], [np.nan, -5.0]], np.float32)
-    found = scales(query(), ground, CONFIG)
+    found = trial_heights(query(), ground, CONFIG)
     reach = np.sqrt(CONFIG.scale_step)
     assert found[0] <= 78 * reach
     assert found[-1] >= 107 / reach
     assert (found[1:] / found[:-1] <= CONFIG.scale_step + 1e-9).all()
-    assert len(scales(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
+    assert len(trial_heights(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
 
 
 def test_the_height_is_above_roofs_that_the_map_lacks():
@@ -187,7 +196,7 @@ def test_the_height_is_above_roofs_that_the_map_lacks():
     flat.ground[:] = ((0.0, 1.0), (np.nan, -1.0))
     asked = query(height_m=120.0, height_sigma_m=3.0)
     over = above_roofs(asked, flat, 8.0, CONFIG)
-    seen, bare = (scales(each, flat.ground, CONFIG) for each in (over, asked))
+    seen, bare = (trial_heights(each, flat.ground, CONFIG) for each in (over, asked))
     assert len(seen) == len(bare) == 1  # takes no longer
     assert 120 / CONFIG.scale_step < seen[0] < bare[0] - 4  # bare ground stays within a step
     assert above_roofs(asked, flat, 2.0, CONFIG).height_m == 118
