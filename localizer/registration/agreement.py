@@ -165,6 +165,8 @@ def _patch_grid(problem: LevelProblem, rotation: Array, translation: Array) -> _
     side = 2 * _REACH + 1
     sums = np.zeros((len(names), side, side), np.float32)
     weights = problem.anchor_confidence[whole] * sample_map(problem.confidence, u, v)
+    features = np.ascontiguousarray(problem.anchor_features[whole])
+    _add(problem.features, features, u, v, weights, part, sums)
     anchors = np.bincount(part, minlength=len(names))
     tangent = projection_jacobian(problem, x, translation)
     inverse = np.linalg.inv(pose_tangent_map(rotation, translation))
@@ -174,14 +176,13 @@ def _patch_grid(problem: LevelProblem, rotation: Array, translation: Array) -> _
         [motion.reshape(-1, 12), -motion[:, :, 2], problem.points.T[whole, :2]], axis=1
     )
     mean = np.zeros((len(names), 16))
-    features = np.ascontiguousarray(problem.anchor_features[whole])
-    _add(problem.features, features, u, v, weights, part.astype(np.int64), values, sums, mean)
+    _add_rows(values, part, mean)
     mean /= np.maximum(anchors, 1)[:, None]
     return _PatchGrid(sums, anchors, mean[:, :12].reshape(-1, 2, 6), mean[:, 12:14], mean[:, 14:])
 
 
 @njit(**JIT)
-def _add(features, anchors, u, v, weights, part, values, sums, totals):  # type: ignore[no-untyped-def]
+def _add(features, anchors, u, v, weights, part, sums):  # type: ignore[no-untyped-def]
     channels = features.shape[2]
     side = sums.shape[1]
     reach = (side - 1) // 2
@@ -202,5 +203,10 @@ def _add(features, anchors, u, v, weights, part, values, sums, totals):  # type:
                 top = raw[p, q] + a * (raw[p, q + 1] - raw[p, q])
                 low = raw[p + 1, q] + a * (raw[p + 1, q + 1] - raw[p + 1, q])
                 sums[part[k], p, q] += weights[k] * (top + b * (low - top))
-        for p in range(values.shape[1]):
-            totals[part[k], p] += values[k, p]
+
+
+@njit(**JIT)
+def _add_rows(values, part, sums):  # type: ignore[no-untyped-def]
+    for k in range(len(part)):
+        for q in range(values.shape[1]):
+            sums[part[k], q] += values[k, q]
