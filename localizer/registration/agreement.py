@@ -166,7 +166,7 @@ def _patch_grid(problem: LevelProblem, rotation: Array, translation: Array) -> _
     sums = np.zeros((len(names), side, side), np.float32)
     weights = problem.anchor_confidence[whole] * sample_map(problem.confidence, u, v)
     features = np.ascontiguousarray(problem.anchor_features[whole])
-    _add(problem.features, features, u, v, weights, part, sums)
+    _add(problem.features, features, u, v, weights.astype(np.float32), part, sums)
     anchors = np.bincount(part, minlength=len(names))
     tangent = projection_jacobian(problem, x, translation)
     inverse = np.linalg.inv(pose_tangent_map(rotation, translation))

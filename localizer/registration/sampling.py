@@ -20,9 +20,9 @@ def sample_features(features: Float32, x: Array, y: Array) -> Float32:
     return out
 
 
-def sample_map(values: Float32, x: Array, y: Array) -> Float32:
+def sample_map(values: Float32, x: Array, y: Array) -> Array:
     """`sample_features` of one channel (h, w): values (N,)."""
-    return sample_features(values[..., None], x, y)[:, 0]
+    return sample_features(values[..., None], x, y)[:, 0].astype(np.float64)
 
 
 def structure_tensors(
