@@ -14,11 +14,9 @@ import time
 
 import cv2
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks.common.arguments import Parser, number, output, whole
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
@@ -141,8 +139,7 @@ def main() -> None:
     columns = (
         "backend", "M triangles", "CPU ms", "wall ms", "CPU / numba", "depth median", "depth p99.9",
     )  # fmt: skip
-    table, rows = Table(*columns), list[tuple[str, ...]]()
-    console = Console()
+    rows = list[tuple[str, ...]]()
     for millions in options.triangles:
         meshes = town(millions * 1e6)
         count = sum(len(m.faces) for m in meshes)
@@ -151,7 +148,7 @@ def main() -> None:
             try:
                 renderer = make_renderer(backend, StaticTiles(meshes), threads=options.threads)
             except RenderError as error:
-                console.print(f"{backend}: {error}")
+                print(f"{backend}: {error}")
                 continue
             cpu, wall = measure(renderer, camera, options.frames)
             reference = cpu if reference is None else reference
@@ -167,11 +164,8 @@ def main() -> None:
                     f"{np.percentile(errors, 99.9):.3f} mm",
                 )
             )
-            table.add_row(*rows[-1])
             renderer.close()
-    console.print(table)
-    if options.json:
-        write_figures(options.json, columns, rows)
+    show_figures(options.json, columns, rows)
 
 
 if __name__ == "__main__":

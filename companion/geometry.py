@@ -14,11 +14,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.geometry.geo import BODY_FROM_CAMERA, NED_FROM_ENU, Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 
-# OpenCV's z (forward), x (right), y (down) are the gimbal's x, y, z.
-GIMBAL_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+GIMBAL_FROM_CAMERA = BODY_FROM_CAMERA
 
 
 class GimbalFrame(Enum):

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from localizer.geometry.trajectory import (
         StampedPose,
         read_tum,
-        write_covariances,
         write_tum,
     )
     from localizer.map.building.build import build_cache
@@ -79,7 +78,6 @@ _HOMES = {
     "StampedPose": "localizer.geometry.trajectory",
     "read_tum": "localizer.geometry.trajectory",
     "write_tum": "localizer.geometry.trajectory",
-    "write_covariances": "localizer.geometry.trajectory",
     "LocalizerError": "localizer.errors",
     "CameraError": "localizer.errors",
     "GeoreferenceError": "localizer.errors",
@@ -119,7 +117,6 @@ __all__ = [  # noqa: RUF022
     "StampedPose",
     "read_tum",
     "write_tum",
-    "write_covariances",
     "LocalizerError",
     "CameraError",
     "GeoreferenceError",

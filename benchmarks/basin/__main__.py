@@ -1,7 +1,6 @@
 """Convergence of the registration: the paper's Table 4 (ablation), Table 6 and Fig. 10 (basin).
 
     python -m benchmarks.basin ablation FOLDER [--set generated|quito|portugal|caliterra]
-    python -m benchmarks.basin priors FOLDER [--set ...] [--anchors N]
     python -m benchmarks.basin covariance FOLDER [--set ...]
     python -m benchmarks.basin axes FOLDER [--set ...] [--plot basin.png]
 
@@ -21,23 +20,19 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+from benchmarks.basin import axes as basin_axes
+from benchmarks.basin.run import BasinOutcome, run, sized_starts
+from benchmarks.basin.tables import Cells, ablation_table, covariance_table
+from benchmarks.basin.variants import (
+    FULL,
+    Variant,
+    our_rows,
+    paper_rows,
+)
+from benchmarks.basin.views import BasinView, load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.figures import show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.basin import axes as basin_axes
-    from benchmarks.basin.run import BasinOutcome, run, sized_starts
-    from benchmarks.basin.tables import Cells, ablation_table, covariance_table
-    from benchmarks.basin.variants import (
-        DEFAULT_ANCHORS,
-        FULL,
-        Variant,
-        our_rows,
-        paper_rows,
-        prior_rows,
-    )
-    from benchmarks.basin.views import BasinView, load_views
+from benchmarks.common.named_errors import named_errors
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 
@@ -64,9 +59,8 @@ def _registered(args: argparse.Namespace, rows: list[Variant]) -> list[BasinOutc
 
 
 def ablation(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
-    """Table 4, or the priors: one line a variant and start."""
-    rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
-    outcomes = _registered(args, rows)
+    """Table 4: one line a variant and start."""
+    outcomes = _registered(args, paper_rows() + our_rows())
     return outcomes, ablation_table(args.set, outcomes)
 
 
@@ -86,7 +80,7 @@ def axes(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
 
 
 _TABLES: dict[str, Callable[[argparse.Namespace], tuple[list[BasinOutcome], Cells]]] = {
-    "ablation": ablation, "priors": ablation, "covariance": covariance, "axes": axes,
+    "ablation": ablation, "covariance": covariance, "axes": axes,
 }  # fmt: skip
 
 
@@ -102,13 +96,12 @@ def main() -> None:
     parser.add_argument(
         "--starts", nargs="+", type=number(0.01, 90), default=STARTS, help="m and degrees"
     )
-    parser.add_argument("--anchors", type=int, default=DEFAULT_ANCHORS, help="N of `priors`")
     parser.add_argument("--only", nargs="*", help="variants whose name contains one of these")
     parser.add_argument("--plot", type=output, help="PNG of the axes' curves")
     parser.add_argument("--json", type=output, help="the table and every outcome")
     args = parser.parse_args()
     if args.set != "generated" and not (args.data / args.set).is_dir():
-        parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
+        parser.error(f"--set: {args.set!r} is neither generated nor a folder of {args.data}")
     outcomes, (columns, rows) = _TABLES[args.what](args)
     made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}
     show_figures(args.json, columns, rows, made)

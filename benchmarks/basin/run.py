@@ -150,16 +150,12 @@ class BasinTrial:
             yield self._outcome(variant.name, found, ms)
 
     def _register(self, variant: Variant, optimizer: JNGO, anchors: Anchors) -> Registration:
-        constraint = None
-        if variant.constraint is not None:
-            constraint = variant.constraint(self.view.truth, np.random.default_rng((self.index, 5)))
         return optimizer.register(
             variant.shown(self.query),
             self.view.camera,
             anchors,
             self.prior,
             motion=self.prior if variant.motion else None,
-            constraint=constraint,
             seed=self.index,
         )
 

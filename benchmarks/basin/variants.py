@@ -9,29 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 from unittest import mock
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.registration import (
-    PoseConstraint,
-    attitude_constraint,
-    combine,
-    height_constraint,
-    position_constraint,
-    select_anchors,
-)
+from localizer.geometry.pose import Array
 from localizer.registration import hypotheses as hypothesis_module
+from localizer.registration import select_anchors
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, Refinement
 from localizer.registration.config import JNGOConfig
 from localizer.registration.jngo import JNGO
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RenderedView
 
-DEFAULT_ANCHORS = 4000
+_ANCHORS = 4000
 FULL = "ours"
 
 
@@ -39,18 +31,16 @@ FULL = "ours"
 class Variant:
     """One row. anchors: N; motion: whether the prior serves as the prediction of Eq. 10;
     confidence: False takes all confidences as 1; detail: False leaves the detail level out;
-    patches: (dotted name, replacement); constraint: what other sensors know, from the true pose
-    and their noise; loss: changes the backend's settings.
+    patches: (dotted name, replacement); loss: changes the backend's settings.
     """
 
     name: str
     config: JNGOConfig = field(default_factory=JNGOConfig)
-    anchors: int = DEFAULT_ANCHORS
+    anchors: int = _ANCHORS
     motion: bool = True
     confidence: bool = True
     detail: bool = True
     patches: tuple[tuple[str, object], ...] = ()
-    constraint: Callable[[Pose, np.random.Generator], PoseConstraint] | None = None
     loss: Callable[[LMSettings], LMSettings] | None = None
 
     def optimizer(self) -> JNGO:
@@ -153,44 +143,6 @@ def our_rows() -> list[Variant]:
         Variant("N = 8000", anchors=8000),
         Variant("without confidence", confidence=False),
     ]
-
-
-def prior_rows(anchors: int = DEFAULT_ANCHORS) -> list[Variant]:
-    """Priors as residuals (section 9 of the specification), with the noise that they claim."""
-    rows = [
-        Variant(FULL),
-        Variant("attitude 0.2° tilt, 1° heading", constraint=partial(_attitude, 0.2, 1.0)),
-        Variant("attitude 0.7° tilt, 4° heading", constraint=partial(_attitude, 0.7, 4.0)),
-        Variant("height 1 m", constraint=partial(_height, 1.0)),
-        Variant("height 5 m", constraint=partial(_height, 5.0)),
-        Variant("position 0.5 m", constraint=partial(_position, 0.5)),
-        Variant("position 2 m", constraint=partial(_position, 2.0)),
-        Variant("all: 0.7° 4° 5 m 2 m", constraint=_everything),
-    ]
-    return [replace(row, anchors=anchors) for row in rows]
-
-
-def _attitude(
-    tilt_deg: float, heading_deg: float, truth: Pose, rng: np.random.Generator
-) -> PoseConstraint:
-    sigma = np.radians([tilt_deg, tilt_deg, heading_deg])
-    seen = so3_exp(rng.normal(0.0, sigma)) @ truth.rotation
-    return attitude_constraint(seen, float(sigma[0]), float(sigma[2]))
-
-
-def _height(sigma: float, truth: Pose, rng: np.random.Generator) -> PoseConstraint:
-    return height_constraint(float(truth.translation[2] + rng.normal(0.0, sigma)), sigma)
-
-
-def _position(sigma: float, truth: Pose, rng: np.random.Generator) -> PoseConstraint:
-    seen = truth.translation + rng.normal(0.0, sigma, 3)
-    return position_constraint(seen, np.eye(3) * sigma**2)
-
-
-def _everything(truth: Pose, rng: np.random.Generator) -> PoseConstraint:
-    return combine(
-        _attitude(0.7, 4.0, truth, rng), _height(5.0, truth, rng), _position(2.0, truth, rng)
-    )
 
 
 def _huber(settings: LMSettings) -> LMSettings:

@@ -26,11 +26,15 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import (
+    CONDITIONS,
+    apply_appearance,
+    limit_haze,
+    sample_appearance,
+)
 from localizer.synth.config import SURVEY, WorldConfig
 from localizer.synth.visits.visit import Visit, draw_look
 from localizer.synth.world import build_visits
-from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import look_at, soften
 from localizer.types import Image, RenderedView
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.bridge.autopilot import autopilot
 from benchmarks.common.arguments import Parser, number, output
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from mavlink_bridge import Bridge, BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig, OriginConfig
@@ -121,23 +121,19 @@ def main() -> None:
     )
     parser.add_argument("--json", type=output, help="the table, for benchmarks.site.keep")
     arguments = parser.parse_args()
-    print("  load  messages/s in  fixes/s  CPU (cores)  estimate to socket ms p50 / p99   lost")
     rows: list[tuple[float, float | None]] = [(load, None) for load in arguments.load]
     rows += [(max(arguments.load), interval) for interval in (5.0, COMPANION_SWITCH_MS)]
     made = []
     for load, interval in rows:
         r = run(load, arguments.seconds, interval)
-        what = "" if interval is None else f"  neighbour, switch interval {interval:g} ms"
-        name = f"{load:g} times, {r['received']:.0f} messages/s in" + what.replace("  ", ", ")
-        made.append((name, f"{r['cpu']:.2f}", f"{r['p50']:.2f} / {r['p99']:.2f}"))
-        print(
-            f"{load:5.0f}x {r['received']:14.0f} {r['fixes']:8.0f} {r['cpu']:12.2f}"
-            f" {r['p50']:22.2f} / {r['p99']:.2f} {r['lost']:10.0f}{what}",
-            flush=True,
-        )
-    if arguments.json:
-        columns = ("traffic", "CPU, cores", "estimate to socket, ms, median / p99")
-        write_figures(arguments.json, columns, made)
+        what = "" if interval is None else f", neighbour, switch interval {interval:g} ms"
+        name = f"{load:g} times, {r['received']:.0f} messages/s in{what}"
+        latency = f"{r['p50']:.2f} / {r['p99']:.2f}"
+        made.append((name, f"{r['fixes']:.0f}", f"{r['cpu']:.2f}", latency, f"{r['lost']:.0f}"))
+    columns = (
+        "traffic", "fixes/s", "CPU, cores", "estimate to socket, ms, median / p99", "lost",
+    )  # fmt: skip
+    show_figures(arguments.json, columns, made)
 
 
 if __name__ == "__main__":

@@ -19,15 +19,3 @@ def named_errors() -> Iterator[None]:
     except (CompanionError, LocalizerError, BridgeError, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(2)
-
-
-@contextmanager
-def needs_torch() -> Iterator[None]:
-    """Around the imports of a benchmark that does nothing without PyTorch."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        print("this benchmark needs PyTorch: pip install '.[train]'", file=sys.stderr)
-        sys.exit(2)

@@ -6,8 +6,6 @@
     python -m benchmarks.features --real ../shared/data/caliterra --pairs 320   (real photos)
     python -m benchmarks.features --real ../shared/data/quito --pairs 280       (real mesh)
     python -m benchmarks.features --real ../shared/data/textures/neon_sjer_pairs --pairs 80
-    python -m benchmarks.features --widths 320 640 --baselines --models shipped NEW.onnx
-    python -m benchmarks.features --swarm-alone --baselines     (what draws of the prior add)
     python -m benchmarks.features --tilts 0.5 --baselines       (what roll and pitch add)
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
@@ -15,8 +13,7 @@ season (feature_real.py says what the real sets are). The reference is rendered 
 the query's true pose. The direct methods go through the same `JNGO`, gradient and network with the
 fixed detail level and the number of anchors as in flight; the matchers go through PnP-RANSAC on the
 rendered depth. Generated pairs and real maps are kept below --cache. A checkpoint is chosen on
-`--split validation`; `test` is for the final report. `--widths` makes the pictures as wide as the
-widest and shrinks the very same pairs for the others.
+`--split validation`; `test` is for the final report.
 """
 
 from __future__ import annotations
@@ -31,35 +28,29 @@ import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.figures import write_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
+from benchmarks.common.named_errors import named_errors
+from benchmarks.features.methods import (
+    DirectMethod,
+    IntensityExtractor,
+    Levelled,
+    Method,
+    load_xfeat,
+    sift_pnp,
+)
+from benchmarks.features.pairs import (
+    DEGREES,
+    METRES,
+    MadePlaces,
+    TestPair,
+    made_pairs,
+)
+from benchmarks.features.real import real_pairs
+from benchmarks.features.report import PairOutcome, read_outcomes, write_outcomes
+from benchmarks.features.tables import TABLES, report
 from localizer.config import LocalizerConfig
 from localizer.features import GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
-from localizer.registration import JNGOConfig
 from localizer.types import PosePrior
-
-with needs_torch():
-    from benchmarks.features.methods import (
-        DirectMethod,
-        IntensityExtractor,
-        Levelled,
-        Method,
-        load_xfeat,
-        sift_pnp,
-    )
-    from benchmarks.features.pairs import (
-        DEGREES,
-        METRES,
-        SIZE,
-        MadePlaces,
-        TestPair,
-        made_pairs,
-        mesh_pairs,
-        narrowed,
-    )
-    from benchmarks.features.real import real_pairs
-    from benchmarks.features.report import PairOutcome, read_outcomes, write_outcomes
-    from benchmarks.features.tables import TABLES, report
 
 _log = logging.getLogger(__name__)
 
@@ -100,12 +91,10 @@ def build_methods(
     baselines: Sequence[str],
     models: Sequence[Path],
     anchors: int,
-    *,
-    alone: bool = False,
-    tilts_deg: Sequence[float] = (),
+    tilts_deg: Sequence[float],
 ) -> dict[str, Method | Levelled]:
-    """The baselines, as far as installed, then the networks; alone: these without the draws of the
-    prior, too; tilts_deg: and with roll and pitch heard, so exactly.
+    """The baselines, as far as installed, then the networks; tilts_deg: these with roll and pitch
+    heard, so exactly, too.
     """
     methods: dict[str, Method | Levelled] = {}
     for key in baselines:
@@ -117,9 +106,6 @@ def build_methods(
     for model in models:
         extractor = DetailExtractor(load_extractor(None if model == SHIPPED else model))
         name = "tiny" if model == SHIPPED else str(model)
-        if alone:
-            swarm = JNGOConfig(preselected=0)
-            methods[f"{name}, swarm alone"] = DirectMethod(extractor, anchors, swarm)
         direct = methods[name] = DirectMethod(extractor, anchors)
         for tilt_deg in tilts_deg:
             methods[f"{name}, tilt to {tilt_deg:g} deg"] = Levelled(direct, tilt_deg)
@@ -153,18 +139,10 @@ def parser() -> Parser:
         "--models", nargs="*", type=_model, default=[SHIPPED], help="ONNX files, or `shipped`"
     )
     p.add_argument(
-        "--swarm-alone", action="store_true", help="models without draws of the prior, too"
-    )
-    p.add_argument(
         "--tilts", type=number(0.01, 90), nargs="*", default=[],
         help="models with an autopilot's roll and pitch, too, that are off by so many degrees",
     )  # fmt: skip
-    p.add_argument(
-        "--widths", type=whole(64, 4096), nargs="+", default=[SIZE[0]], help="of the pictures"
-    )
-    kind = p.add_mutually_exclusive_group()
-    kind.add_argument("--real", type=existing, help="folder of a real set, instead of made places")
-    kind.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
+    p.add_argument("--real", type=existing, help="folder of a real set, instead of made places")
     p.add_argument("--out", type=output, help="CSV of every outcome")
     p.add_argument("--report", type=existing, nargs="+", help="tables of earlier CSVs, no run")
     p.add_argument("--table", choices=TABLES, default="sets", help="that --json keeps")
@@ -177,22 +155,14 @@ def _model(text: str) -> Path:
 
 
 def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
-    """The set's name, and its pairs, as wide as the widest that is asked for."""
-    size = (max(args.widths), max(args.widths) * SIZE[1] // SIZE[0])
-    if args.mesh:
-        return "mesh world", mesh_pairs(args.pairs, args.seed, size)
+    """The set's name, and its pairs."""
     if args.real is not None:
-        return args.real.resolve().name, real_pairs(
-            args.real,
-            args.pairs,
-            args.seed,
-            args.cache,
-            size,
-        )
+        pairs = real_pairs(args.real, args.pairs, args.seed, args.cache)
+        return args.real.resolve().name, pairs
     textures = args.textures if args.textures.is_dir() else None
     if textures is None:
         _log.warning("%s is absent: places without real textures", args.textures)
-    which = MadePlaces(args.split, args.seed, textures, size)
+    which = MadePlaces(args.split, args.seed, textures)
     return "generated", made_pairs(args.pairs, which, args.cache)
 
 
@@ -204,14 +174,9 @@ def main() -> None:
         if args.json:
             write_figures(args.json, *TABLES[args.table](outcomes))
         return
-    methods = build_methods(
-        args.baselines, args.models, args.anchors, alone=args.swarm_alone, tilts_deg=args.tilts
-    )
+    methods = build_methods(args.baselines, args.models, args.anchors, args.tilts)
     source, pairs = make_pairs(args)
-    outcomes = []
-    for width in args.widths:
-        name = source if len(args.widths) == 1 else f"{source}, {width} wide"
-        outcomes += evaluate(methods, [narrowed(p, width) for p in pairs], name, args.seed)
+    outcomes = evaluate(methods, pairs, source, args.seed)
     if args.out:
         write_outcomes(outcomes, args.out)
     print(report(outcomes))

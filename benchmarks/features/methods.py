@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from localizer.features import FeatureExtractor
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.registration import JNGO, JNGOConfig, PoseConstraint, attitude_constraint
+from localizer.registration import JNGO, PoseConstraint, attitude_constraint
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
 
@@ -43,10 +43,8 @@ class IntensityExtractor:
 class DirectMethod:
     """Feature-metric registration with one extractor, as the product does it."""
 
-    def __init__(
-        self, extractor: FeatureExtractor, anchors: int, config: JNGOConfig | None = None
-    ) -> None:
-        self._extractor, self._optimizer, self._anchors = extractor, JNGO(config), anchors
+    def __init__(self, extractor: FeatureExtractor, anchors: int) -> None:
+        self._extractor, self._optimizer, self._anchors = extractor, JNGO(), anchors
 
     def __call__(
         self, view: RenderedView, query: Image, prior: PosePrior, seed: int,

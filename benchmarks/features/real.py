@@ -26,9 +26,8 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
-from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import SEASON, look_at, moved
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
@@ -38,22 +37,16 @@ _PLOT_TEXEL_M = 0.1
 _MADE = tuple(c for c in CONDITIONS if c != "day")
 
 
-def real_pairs(
-    folder: Path,
-    count: int,
-    seed: int,
-    cache: Path,
-    size: tuple[int, int] = SIZE,
-) -> list[TestPair]:
+def real_pairs(folder: Path, count: int, seed: int, cache: Path) -> list[TestPair]:
     """Pairs of the real set in `folder`, conditions in turn; its map is built in `cache` once."""
     if (folder / "offsets.csv").exists():
-        return _season_pairs(folder, count, seed, size)
+        return _season_pairs(folder, count, seed)
     photos = folder / "queries"
     with TileStreamer(TileCache.open(_map(folder, cache))) as streamer:
         renderer = NumbaRenderer(streamer)
         if photos.exists():
-            return _photo_pairs(renderer, photos, count, seed, size)
-        return _rendered_pairs(renderer, count, seed, size)
+            return _photo_pairs(renderer, photos, count, seed)
+        return _rendered_pairs(renderer, count, seed)
 
 
 def _map(folder: Path, cache: Path) -> Path:
@@ -61,10 +54,8 @@ def _map(folder: Path, cache: Path) -> Path:
     return built if built.exists() else build_map(layers_of(folder), built, origin_of(folder))
 
 
-def _photo_pairs(
-    renderer: NumbaRenderer, photos: Path, count: int, seed: int, size: tuple[int, int]
-) -> list[TestPair]:
-    camera = Camera.from_json(photos / "camera.json").resized(*size)
+def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -> list[TestPair]:
+    camera = Camera.from_json(photos / "camera.json").resized(*SIZE)
     poses = json.loads((photos / "poses.json").read_text())
     names = sorted(p.name for p in (photos / "images").iterdir())
     kinds = (PHOTO, COARSE_MAP, OLDER_MAP, *_MADE)
@@ -74,12 +65,10 @@ def _photo_pairs(
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
         image = read_rgb(photos / "images" / names[photo])
-        query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        query = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
-            query = apply_appearance(
-                query, depth, limit_haze(sample_appearance(rng, condition), depth), rng
-            )
+            query = weathered(query, depth, condition, rng)
         view = renderer.render(moved(rng, truth, np.inf, (METRES, DEGREES)), camera, wait=True)
         if condition in (COARSE_MAP, OLDER_MAP):
             view = _surveyed(view, rng, repainted=condition == OLDER_MAP)
@@ -95,15 +84,13 @@ def _surveyed(view: RenderedView, rng: np.random.Generator, *, repainted: bool) 
     )
 
 
-def _rendered_pairs(
-    renderer: NumbaRenderer, count: int, seed: int, size: tuple[int, int]
-) -> list[TestPair]:
+def _rendered_pairs(renderer: NumbaRenderer, count: int, seed: int) -> list[TestPair]:
     """Views of the map itself, 80 to 200 m up, under every condition in turn."""
     kinds = (*CONDITIONS, SEASON)
     rng = np.random.default_rng((seed, 1))
     pairs: list[TestPair] = []
     while len(pairs) < count:
-        camera = Camera.from_fov(*size, rng.uniform(40, 75))
+        camera = Camera.from_fov(*SIZE, rng.uniform(40, 75))
         truth = _view(rng)
         start = moved(rng, truth, np.inf, (METRES, DEGREES))
         view, seen = (renderer.render(pose, camera, wait=True) for pose in (start, truth))
@@ -114,8 +101,8 @@ def _rendered_pairs(
         view = _surveyed(view, rng, repainted=False)
         if condition == SEASON:
             query = _image(season_shift(_squared(query), rng), query.shape)
-        look = sample_appearance(rng, "day" if condition == SEASON else condition)
-        query = apply_appearance(query, seen.depth, limit_haze(look, seen.depth), rng)
+        weather = "day" if condition == SEASON else condition
+        query = weathered(query, seen.depth, weather, rng)
         pairs.append(TestPair(view, query, truth, condition, place=len(pairs)))
     return pairs
 
@@ -146,7 +133,7 @@ def _view(rng: np.random.Generator) -> Pose:
     return look_at(target, rng.uniform(80, 200) / np.sin(pitch), pitch, rng)
 
 
-def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) -> list[TestPair]:
+def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
     """A plot at one date as the map and at the other as the flight, 25 to 40 m above it."""
     plots = unseen_plots(folder)
     pairs: list[TestPair] = []
@@ -155,9 +142,9 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
         dates = [read_rgb(p) for p in plot_dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
-        view, query, truth = _plot_pair(surveyed, flown, rng, size)
+        view, query, truth = _plot_pair(surveyed, flown, rng)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
-        query = apply_appearance(query, seen, limit_haze(sample_appearance(rng, "day"), seen), rng)
+        query = weathered(query, seen, "day", rng)
         condition = "dry map, green flight" if dry_map else "green map, dry flight"
         pairs.append(TestPair(view, query, truth, condition, place=k // 2 % len(plots)))
     return pairs
@@ -179,11 +166,11 @@ def plot_dates(plot: Path) -> list[Path]:
 
 
 def _plot_pair(
-    surveyed: Image, flown: Image, rng: np.random.Generator, size: tuple[int, int]
+    surveyed: Image, flown: Image, rng: np.random.Generator
 ) -> tuple[RenderedView, Image, Pose]:
     """Two views of flat ground: all of the query and four fifths of the map's view lie on it."""
     while True:
-        camera = Camera.from_fov(*size, rng.uniform(35, 50))
+        camera = Camera.from_fov(*SIZE, rng.uniform(35, 50))
         pitch = np.radians(rng.uniform(65, 90))
         at = rng.uniform(-12, 12, 2)
         truth = look_at(np.array([*at, 0.0]), rng.uniform(25, 40) / np.sin(pitch), pitch, rng)

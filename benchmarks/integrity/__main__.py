@@ -3,7 +3,7 @@
     python -m benchmarks.integrity FOLDER [--sets generated quito ...] [--minutes 10]
     python -m benchmarks.integrity FOLDER --without SEEN
     python -m benchmarks.integrity FOLDER --fit localizer/integrity/probability.json
-    python -m benchmarks.integrity FOLDER --report [--json out.json] [--plot out.png]
+    python -m benchmarks.integrity FOLDER --report [--json out.json]
 
 FOLDER keeps worlds, maps, views and one file of outcomes a set (`integrity/SET.jsonl`); a run goes
 on where the last one ended, and ends after so many minutes. Every view begins near the truth (3 m,
@@ -28,13 +28,11 @@ from pathlib import Path
 from benchmarks.common.arguments import Parser, existing, number, output
 from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.integrity.fit import fit, fit_table
-    from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
-    from benchmarks.integrity.report import COLUMNS, by_condition, cells, plot, rows
-    from benchmarks.integrity.run import StartOutcome, read, run_set, turn
+from benchmarks.common.named_errors import named_errors
+from benchmarks.integrity.fit import fit, fit_table
+from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
+from benchmarks.integrity.report import COLUMNS, by_condition, cells, rows
+from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
 _USUAL = [name for name in SETS if name != UNSEEN]
@@ -52,7 +50,6 @@ def parser() -> Parser:
     p.add_argument("--without", type=existing, help="folder whose outcomes' views are left out")
     p.add_argument("--report", action="store_true", help="tables of what is there; no run")
     p.add_argument("--json", type=output, help="the report's table and rows")
-    p.add_argument("--plot", type=output, help="PNG: agreement over quality")
     return p
 
 
@@ -89,8 +86,6 @@ def main() -> None:
     show_figures(args.json, COLUMNS, cells(made), {"rows": [asdict(r) for r in made]})
     print()
     print(by_condition(outcomes, config))
-    if args.plot:
-        plot(outcomes, config, args.plot)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,9 @@
-"""What each acceptance lets through and what it costs, with exact intervals; table, JSON, plot."""
+"""What each acceptance lets through and what it costs, with exact intervals; table and JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-
-import matplotlib.pyplot as plt
-import numpy as np
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.beginnings import WRONG
@@ -142,21 +138,3 @@ def by_condition(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> s
             f"| {Rate.of(false, len(focal))} |"
         )
     return "\n".join(lines)
-
-
-def plot(outcomes: Sequence[StartOutcome], config: IntegrityConfig, path: Path) -> None:
-    """Log odds over quality, of right and of wrong results."""
-    figure, axes = plt.subplots(figsize=(7, 5))
-    seen = [o for o in outcomes if o.ok and o.parts]
-    for label, right, colour in (("wrong", False, "tab:red"), ("right", True, "tab:green")):
-        mine = [o for o in seen if o.right is right and (right or o.far)]
-        x, y = [o.quality for o in mine], [o.log_odds for o in mine]
-        axes.scatter(np.array(x), np.array(y), s=3, color=colour, label=f"{label}, {len(mine)}")
-    axes.axhline(config.min_log_odds, color="black", ls="--", lw=0.8)
-    axes.set_xlabel("registration quality")
-    axes.set_ylabel("log odds of the right place")
-    axes.legend()
-    axes.grid(alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path, dpi=90)
-    plt.close(figure)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localizer.geometry.camera import Camera
+from localizer.geometry.geo import level_camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.registration import (
     PoseConstraint,
@@ -62,8 +63,11 @@ def make_stretch(plan: StretchPlan, condition: str, seed: int, ground_m: float) 
     for t in times:
         swing = _WOBBLE_DEG * np.sin(np.array([0.7, 0.5]) * t + phase[:2])
         height = ground_m + plan.height_m + 2.0 * np.sin(0.15 * t + phase[2])
-        rotation = _looking(down + swing[0], heading) @ so3_exp([0, 0, np.radians(swing[1])])
-        poses.append(Pose(rotation, np.array([*place, height])))
+        level = level_camera(
+            np.array([*place, height]), heading, -float(np.radians(down + swing[0]))
+        )
+        rolled = level.rotation @ so3_exp([0, 0, np.radians(swing[1])])
+        poses.append(Pose(rolled, level.translation))
         heading += _steer(place, heading, plan.half_m, 0.02 * np.sin(0.1 * t + phase[3])) / (
             plan.rate_hz
         )
@@ -77,14 +81,6 @@ def start(plan: StretchPlan, seed: int) -> tuple[Array, float]:
     rng = np.random.default_rng((seed, 0))
     place = rng.uniform(-1, 1, 2) * np.array(plan.half_m)
     return place, float(rng.uniform(0, 2 * np.pi))
-
-
-def _looking(down_deg: float, heading: float) -> Array:
-    """Rotation of a camera that looks `down_deg` below the horizon, image x horizontal."""
-    p = np.radians(down_deg)
-    z = np.array([np.cos(p) * np.sin(heading), np.cos(p) * np.cos(heading), -np.sin(p)])
-    x = np.array([np.cos(heading), -np.sin(heading), 0.0])
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 def _steer(place: Array, heading: float, half: tuple[float, float], drift: float) -> float:

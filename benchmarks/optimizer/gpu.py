@@ -1,4 +1,4 @@
-"""The GPU's part of the optimizer benchmark, beside the paper's Table 7; '-' where there is none.
+"""Milliseconds of the optimizer on a GPU, beside 0.44 to 0.49 of the paper's kernel (Table 7).
 
     python -m benchmarks.optimizer.gpu [--json out.json]
 
@@ -8,15 +8,14 @@ which starts from the same poses each time.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks.common.arguments import Parser, output
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.optimizer.problem import SIZES, make_problem, make_swarm, naive_torch
 from localizer.geometry.camera import Camera
@@ -91,7 +90,7 @@ def torch_ms(problem: LevelProblem, swarm: Poses) -> float | None:
     if not torch.cuda.is_available():
         return None
 
-    step = naive_torch(problem, swarm, 1, "cuda")
+    step = naive_torch(problem, swarm)
     times = []
     for k in range(WARM_UP + REPEATS):
         start, stop = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -150,79 +149,38 @@ def schedule_ms(
     )
 
 
-def print_tables(
-    console: Console, problems: dict[int, LevelProblem], swarm: Poses
-) -> list[tuple[str, ...]]:
-    """The GPU tables; without a GPU the same tables with '-' and the reason. The measured figures
-    as rows of `COLUMNS`.
-    """
-    sizes = tuple(problems)
-    rows: dict[str, list[float | None]] = {
-        name: [None] * len(sizes) for name in ("naive PyTorch", "fused kernel")
-    }
-    notes = ["GPU: -"]
-    schedules: list[tuple[str, ...]] = []
-    try:
-        device = Device()
-    except CudaError as error:
-        notes = [f"no GPU column: {error}"]
-    else:
-        notes = [f"GPU: {device.name}, {device.multiprocessors} multiprocessors"]
-        measure(device, problems, swarm, rows, notes, schedules)
-    table = Table(title="GPU: ms per LM iteration, device events, median")
-    for heading in ("backend", *(f"{s} x {s}" for s in sizes)):
-        table.add_column(heading, justify="right")
-    for name, values in rows.items():
-        table.add_row(name, *("-" if v is None else f"{v:.4f}" for v in values))
-    table.add_row("paper: CUDA port (RTX)", "5.21", "5.24", "5.72")
-    table.add_row("paper: CUDA fused kernel (RTX)", "0.44", "0.47", "0.49")
-    console.print(table)
-    table = Table(title="GPU: ms per schedule at 128/256/512 px, M=144, C=32")
-    for heading in ("schedule", "upload", "graph", "off by m"):
-        table.add_column(heading, justify="right")
-    for row in schedules or [("2/3/4, 144 -> 64 -> 16, N=500", "-", "-", "-")]:
-        table.add_row(*row)
-    console.print(table)
-    for note in notes:
-        console.print(note)
-    return [
-        *((f"LM iteration, {name}", f"{size} x {size}", "-" if ms is None else f"{ms:.4f}")
-          for name, values in rows.items() for size, ms in zip(sizes, values, strict=True)),
-        *((f"registration {label}: {part}", "128, 256, 512", ms)
-          for label, *both, _ in schedules
-          for part, ms in zip(("upload", "graph"), both, strict=True)),
-    ]  # fmt: skip
-
-
-def measure(
-    device: Device,
-    problems: dict[int, LevelProblem],
-    swarm: Poses,
-    rows: dict[str, list[float | None]],
-    notes: list[str],
-    schedules: list[tuple[str, ...]],
-) -> None:
-    """Fill the tables."""
-    for k, problem in enumerate(problems.values()):
-        rows["naive PyTorch"][k] = torch_ms(problem, swarm)
+def measured(device: Device) -> list[tuple[str, ...]]:
+    """The rows of `COLUMNS`."""
+    problems, swarm = {size: make_problem(size) for size in SIZES}, make_swarm()
     backend = CudaBackend(device)
-    notes.append(f"{backend.kernels(32).resources('refine_many')}")
-    for k, problem in enumerate(problems.values()):
-        rows["fused kernel"][k] = fused_ms(backend, problem, swarm)
+    print(f"{backend.kernels(32).resources('refine_many')}")
+    naive = [torch_ms(problem, swarm) for problem in problems.values()]
+    fused = [fused_ms(backend, problem, swarm) for problem in problems.values()]
+    rows: list[tuple[str, ...]] = [
+        (f"LM iteration, {name}", f"{size} x {size}", "-" if ms is None else f"{ms:.4f}")
+        for name, values in (("naive PyTorch", naive), ("fused kernel", fused))
+        for size, ms in zip(SIZES, values, strict=True)
+    ]
     for label, config, anchors in SCHEDULES:
         upload, graph, error = schedule_ms(backend, swarm, config, anchors)
-        schedules.append((label, f"{upload:.3f}", f"{graph:.3f}", f"{error:.3f}"))
+        print(f"registration {label}: off by {error:.3f} m")
+        for part, ms in (("upload", upload), ("graph", graph)):
+            rows.append((f"registration {label}: {part}", "128, 256, 512", f"{ms:.3f}"))
     backend.close()
+    return rows
 
 
 def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--json", type=output, help="the figures, for benchmarks.site.keep")
     args = parser.parse_args()
-    problems = {size: make_problem(size) for size in SIZES}
-    rows = print_tables(Console(), problems, make_swarm())
-    if args.json is not None:
-        write_figures(args.json, COLUMNS, rows)
+    try:
+        device = Device()
+    except CudaError as error:
+        print(f"nothing to measure: {error}")
+        sys.exit(2)
+    print(f"GPU: {device.name}, {device.multiprocessors} multiprocessors")
+    show_figures(args.json, COLUMNS, measured(device))
 
 
 if __name__ == "__main__":

@@ -15,23 +15,22 @@ SIZES = (128, 256, 512)
 Poses = tuple[np.ndarray, np.ndarray]
 
 
-def make_problem(size: int, width: int | None = None, channels: int = CHANNELS) -> LevelProblem:
+def make_problem(size: int, channels: int = CHANNELS) -> LevelProblem:
     """Smooth random unit features; anchors at 80 to 160 m; the truth is the identity rotation."""
-    width = width or size
     rng = np.random.default_rng(size)
-    f = smooth_features(rng, size, width, channels)
-    uv = rng.uniform([0.05 * width, 0.05 * size], [0.95 * width, 0.95 * size], (ANCHORS, 2))
+    f = smooth_features(rng, size, channels)
+    uv = rng.uniform(0.05 * size, 0.95 * size, (ANCHORS, 2))
     # Morton-like order: the anchors of a real view come sorted along the Z curve.
-    cell = (uv * 32 / width).astype(int)
+    cell = (uv * 32 / size).astype(int)
     code = sum(((cell[:, i] >> b) & 1) << (2 * b + i) for b in range(5) for i in (0, 1))
     uv = uv[np.argsort(code)]
     depth = rng.uniform(80, 160, ANCHORS)
-    focal, centre = float(width), (width / 2 - 0.5, size / 2 - 0.5)
+    focal, centre = float(size), (size / 2 - 0.5, size / 2 - 0.5)
     points = np.column_stack([(uv - centre) / focal * depth[:, None], depth])
     points[:, 2] -= 110.0
     return LevelProblem(
         f,
-        rng.uniform(0.3, 1, (size, width)).astype(np.float32),
+        rng.uniform(0.3, 1, (size, size)).astype(np.float32),
         (focal, focal),
         centre,
         np.ascontiguousarray(points.T, dtype=np.float32),
@@ -40,34 +39,31 @@ def make_problem(size: int, width: int | None = None, channels: int = CHANNELS) 
     )
 
 
-def smooth_features(rng: np.random.Generator, h: int, w: int, channels: int) -> np.ndarray:
-    """Unit features (h, w, C) with structure of four pixels."""
-    coarse = rng.standard_normal((channels, max(h // 4, 3), max(w // 4, 3))).astype(np.float32)
-    f = np.dstack([cv2.resize(c, (w, h), interpolation=cv2.INTER_CUBIC) for c in coarse])
+def smooth_features(rng: np.random.Generator, size: int, channels: int) -> np.ndarray:
+    """Unit features (size, size, C) with structure of four pixels."""
+    coarse = rng.standard_normal((channels, size // 4, size // 4)).astype(np.float32)
+    f = np.dstack([cv2.resize(c, (size, size), interpolation=cv2.INTER_CUBIC) for c in coarse])
     return np.ascontiguousarray(f / (np.linalg.norm(f, axis=-1, keepdims=True) + 1e-6))
 
 
-def make_swarm(count: int = HYPOTHESES) -> Poses:
+def make_swarm() -> Poses:
     """The paper's box of rotations about the camera and N(0, 1 m)."""
-    rng = np.random.default_rng(0)
+    rng, count = np.random.default_rng(0), HYPOTHESES
     turns = np.radians(np.column_stack([rng.uniform(-11, 11, (count, 2)), rng.normal(0, 1, count)]))
     rotations = np.stack([so3_exp(t) for t in turns])
     # The camera turns about its own centre, 110 m above the local origin.
     return rotations, rotations @ np.array([0.0, 0.0, 110.0]) + rng.normal(0, 1, (count, 3))
 
 
-def naive_torch(
-    problem: LevelProblem, swarm: Poses, threads: int, device: str = "cpu"
-) -> Callable[[], object]:
-    """One batched Gauss-Newton iteration with explicit Jacobians."""
+def naive_torch(problem: LevelProblem, swarm: Poses) -> Callable[[], object]:
+    """One batched Gauss-Newton iteration with explicit Jacobians, on the GPU."""
     import torch
     from torch.nn.functional import grid_sample
 
-    torch.set_num_threads(threads)
     h, w, _ = problem.features.shape
 
     def on(array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(array).to(device)
+        return torch.from_numpy(array).to("cuda")
 
     maps = on(problem.features).permute(2, 0, 1)[None].contiguous()
     confidence = on(problem.confidence)[None, None]
@@ -83,7 +79,7 @@ def naive_torch(
         image = image.expand(len(u), -1, -1, -1)
         return grid_sample(image, grid, align_corners=True)[..., 0].transpose(1, 2)
 
-    eye = torch.eye(6, device=device)
+    eye = torch.eye(6, device="cuda")
 
     def step() -> object:
         with torch.no_grad():

@@ -20,14 +20,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.common.arguments import Parser, number, output, whole
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS
-    from benchmarks.places.rivals import RIVALS, unavailable
-    from benchmarks.places.run import PlacesPlan, chosen_cells, run
-    from benchmarks.places.table import draw, markdown, read_results, write_json
-    from benchmarks.places.worlds import PLACES
+from benchmarks.common.named_errors import named_errors
+from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS
+from benchmarks.places.rivals import RIVALS, unavailable
+from benchmarks.places.run import PlacesPlan, chosen_cells, run
+from benchmarks.places.table import draw, markdown, read_results, write_json
+from benchmarks.places.worlds import PLACES
 
 
 def main() -> None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose, matrix_from_euler
+from localizer.geometry.geo import level_camera
+from localizer.geometry.pose import Array, Pose
 from localizer.synth.appearance.model import CONDITIONS
 
 LENGTH_M = 80.0
@@ -16,9 +17,6 @@ FORECASTS, PICTURES = 3, 6  # along a leg; each forecast stands for PICTURES / F
 _HEIGHTS_M, _PITCHES_DEG = (30.0, 260.0), (-90.0, -35.0)
 _REACH = 0.45  # of the world's side: some views leave the map
 _CAMERA = Camera.from_fov(1280, 720, 65.0)
-# OpenCV axes of a camera that looks along the body's x, and NED to ENU.
-_BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @dataclass(frozen=True)
@@ -36,10 +34,9 @@ class TestLeg:
     def poses(self, count: int) -> list[Pose]:
         """World poses of the camera at the middles of so many equal parts."""
         yaw, pitch = np.radians([self.heading_deg, self.pitch_deg])
-        rotation = _ENU_FROM_NED @ matrix_from_euler(0.0, float(pitch), float(yaw))
         along = np.array([np.sin(yaw), np.cos(yaw), 0.0])
         steps = (np.arange(count) + 0.5) * LENGTH_M / count
-        return [Pose(rotation @ _BODY_FROM_CAMERA, self.start + s * along) for s in steps]
+        return [level_camera(self.start + s * along, float(yaw), float(pitch)) for s in steps]
 
 
 def draw_legs(

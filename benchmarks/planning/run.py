@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,12 +27,16 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.jngo import JNGO
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance.model import apply_appearance, sample_appearance
+from localizer.synth.appearance.model import (
+    Appearance,
+    apply_appearance,
+    limit_haze,
+    sample_appearance,
+)
 from localizer.tracking.pipeline import reference_anchors, working_camera
-from localizer.types import Image, RenderedView
+from localizer.types import RenderedView
 from sitl.demo.assets import FlightAssets
 
-_DENSEST_HAZE = 2.0  # optical depth at the view's median distance, as pictures for training have it
 _BYTES = 96 * 2**20
 
 
@@ -114,7 +117,7 @@ class LegFlyer:
         forecaster: Forecaster,
         pose: Pose,
         live: RenderedView,
-        look: Any,
+        look: Appearance,
         rng: np.random.Generator,
     ) -> RegisteredFrame:
         prior = draw_prior(pose, rng)
@@ -124,19 +127,12 @@ class LegFlyer:
         anchors = reference_anchors(
             reference, self._extractor, self._config.anchors, self._config.seed
         )
-        query = self._extractor.extract(_weathered(live, look, rng))
+        look = limit_haze(look, live.depth)
+        query = self._extractor.extract(apply_appearance(live.rgb, live.depth, look, rng))
         found = self._optimizer.register(query, live.camera, anchors, prior)
         error = found.world_from_camera.distance_to(pose)[0]
         accepted = forecaster.is_accepted(found, prior)
         return RegisteredFrame(accepted, float(min(error, WORST_M)), position_sigma_m(found))
-
-
-def _weathered(live: RenderedView, look: Any, rng: np.random.Generator) -> Image:
-    surface = live.depth[live.depth > 0]
-    if surface.size:
-        limit = _DENSEST_HAZE / float(np.median(surface))
-        look = replace(look, extinction_per_m=min(look.extinction_per_m, limit))
-    return apply_appearance(live.rgb, live.depth, look, rng)
 
 
 def run_world(assets: FlightAssets, count: int, path: Path, more_time: Callable[[], bool]) -> int:

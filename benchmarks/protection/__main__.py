@@ -2,7 +2,6 @@
 
     python -m benchmarks.protection --set generated --views 80 --draws 2 --out generated.json
     python -m benchmarks.protection --set caliterra --views 50 --draws 2 --out caliterra.json
-    python -m benchmarks.protection --set generated --views 20 --focal 0.05 --out focal.json
     python -m benchmarks.protection --report generated.json caliterra.json --out fit.json
     python -m benchmarks.protection --flights report-loop/* --out flights.json
 
@@ -29,12 +28,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.basin.views import load_views
-from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.figures import markdown, write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.protection import flights
 from benchmarks.protection.draws import LENSES
-from benchmarks.protection.fit import RISKS, Coverage, along_axis, coverage, fitted, halves
+from benchmarks.protection.fit import RISKS, Coverage, coverage, fitted, halves
 from benchmarks.protection.run import FaultOutcome, run
 from companion.integrity_monitor.config import ProtectionConfig
 from mavlink_bridge.errors import TlogError
@@ -50,7 +49,6 @@ def parser() -> Parser:
     p.add_argument("--set", default="generated", help="generated, quito, caliterra")
     p.add_argument("--views", type=whole(2, 100_000), default=80, help="how many")
     p.add_argument("--draws", type=whole(1, 100), default=2, help="faults of each view")
-    p.add_argument("--focal", type=number(-0.2, 0.2), help="share; instead of a drawn one")
     p.add_argument("--lens", choices=tuple(LENSES), default="careful", help="how well known")
     p.add_argument("--seed", type=whole(0, 1_000_000), default=0, help="of the faults")
     p.add_argument("--cache", type=Path, default=Path(".cache/basin"), help="of views and maps")
@@ -150,16 +148,11 @@ def main() -> None:
     done = {o.view for o in outcomes[: len(outcomes) // args.draws * args.draws]}
     outcomes = [o for o in outcomes if o.view in done]
     views = load_views(args.set, args.cache, args.data, args.views)
-    for outcome in run(
-        args.set, views, args.draws, args.seed, args.focal, args.lens, skip=len(done)
-    ):
+    for outcome in run(args.set, views, args.draws, args.seed, args.lens, skip=len(done)):
         outcomes.append(outcome)
         if args.out:  # after each one: an interrupted run keeps what it has
             args.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
     print(f"{len(outcomes)} registered, {sum(o.accepted for o in outcomes)} accepted")
-    if args.focal is not None:
-        back, across = along_axis([o for o in outcomes if o.accepted])
-        print(f"behind along the axis {back:.2f}, across {across:.2f} of focal x depth")
 
 
 if __name__ == "__main__":

@@ -81,17 +81,15 @@ class InstallationFault:
         )
 
 
-def drawn(
-    rng: np.random.Generator, lens: LensSigmas, *, focal: float | None = None
-) -> InstallationFault:
-    """A fault. focal: instead of a drawn one."""
+def drawn(rng: np.random.Generator, lens: LensSigmas) -> InstallationFault:
+    """A fault."""
     share = float(rng.normal(0.0, lens.focal))
     x, y = (float(p) for p in rng.normal(0.0, lens.principal, 2))
     east, north, up = (float(m) for m in rng.normal(0.0, MAP_M))
     arm = rng.normal(0.0, ARM_M, 3) + np.radians(rng.normal(0.0, BORESIGHT_DEG, 3)) * 0.3
     speed, course = rng.uniform(0.0, SPEED_MPS), rng.uniform(0.0, 2.0 * np.pi)
     return InstallationFault(
-        share if focal is None else focal,
+        share,
         (x, y),
         float(rng.normal(0.0, lens.k1)),
         (east, north, up),

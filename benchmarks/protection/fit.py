@@ -106,16 +106,3 @@ def _level(o: FaultOutcome, config: ProtectionConfig) -> tuple[float, float]:
     """By the budget of its lens, as the flight's table chooses it by the deployment."""
     config = config.of_camera(calibrated=o.lens != "careful")
     return budget(o.sigma_m, o.height_m, (o.speed_mps, 0.0), config)
-
-
-def along_axis(outcomes: Sequence[FaultOutcome]) -> tuple[float, float]:
-    """Of a focal length that is long by `focal`: by how many times focal x depth the position is
-    behind along the optical axis, median, and the median of what is left across, same units.
-    """
-    back, across = [], []
-    for o in outcomes:
-        error, axis = np.array(o.error_m), np.array(o.axis)
-        unit = o.focal * o.depth_m
-        back.append(-float(error @ axis) / unit)
-        across.append(float(np.linalg.norm(error - axis * (error @ axis))) / abs(unit))
-    return float(np.median(back)), float(np.median(across))

@@ -28,30 +28,24 @@ _PASSES = 2  # in flight each reference is rendered where the last frame was fou
 @dataclass(frozen=True)
 class FaultOutcome:
     """One frame with one fault. error_m: east, north, up of the registration alone; beside_m: of
-    map, lever arm and time; axis: the true optical axis; sigma_m: by the covariance, worst
-    horizontal and vertical; depth_m: of the ground along the axis.
+    map, lever arm and time; sigma_m: by the covariance, worst horizontal and vertical.
     """
 
     set: str
     view: int
     condition: str
     height_m: float
-    depth_m: float
-    fov_deg: float
     speed_mps: float
-    focal: float
     accepted: bool
     sigma_m: tuple[float, float]
     error_m: tuple[float, float, float]
     beside_m: tuple[float, float, float]
-    axis: tuple[float, float, float]
     lens: str = "careful"
 
 
 def run(
-    name: str, views: Sequence[BasinView], draws: int, seed: int, focal: float | None, lens: str,
-    *, skip: int = 0,
-) -> Iterator[FaultOutcome]:  # fmt: skip
+    name: str, views: Sequence[BasinView], draws: int, seed: int, lens: str, *, skip: int = 0
+) -> Iterator[FaultOutcome]:
     """Every view from number `skip` on with so many faults; each view's are the same whatever else
     is run.
     """
@@ -62,14 +56,12 @@ def run(
         with TileStreamer(TileCache.open(cache)) as streamer:
             renderer = NumbaRenderer(streamer, 1)
             for k, view in some:
-                seen = renderer.render(view.truth, view.camera, wait=True).depth
-                depth_m = float(np.median(seen[seen > 0]))
                 rng = np.random.default_rng((seed, k))
                 for _ in range(draws):
-                    fault = drawn(rng, LENSES[lens], focal=focal)
+                    fault = drawn(rng, LENSES[lens])
                     camera = fault.calibrated(view.camera)
                     localizer = Localizer(renderer, extractor, optimizer, camera, config)
-                    found = _one(name, k, view, fault, localizer, depth_m, rng)
+                    found = _one(name, k, view, fault, localizer, rng)
                     yield replace(found, lens=lens)
 
 
@@ -79,7 +71,6 @@ def _one(
     view: BasinView,
     fault: InstallationFault,
     localizer: Localizer,
-    depth_m: float,
     rng: np.random.Generator,
 ) -> FaultOutcome:
     truth = view.truth
@@ -93,9 +84,8 @@ def _one(
     east, north, up = (float(e) for e in estimate.world_from_camera.translation - truth.translation)
     P = estimate.covariance
     sigma = (float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])), float(np.sqrt(P[2, 2])))
-    ax, ay, az = (float(a) for a in truth.rotation[:, 2])
     return FaultOutcome(
-        name, k, view.condition, view.height, depth_m, view.camera.horizontal_fov_deg,
-        float(np.hypot(*fault.velocity)), fault.focal, estimate.accepted, sigma,
-        (east, north, up), fault.beside_m, (ax, ay, az),
+        name, k, view.condition, view.height, float(np.hypot(*fault.velocity)),
+        estimate.accepted, sigma,
+        (east, north, up), fault.beside_m,
     )  # fmt: skip

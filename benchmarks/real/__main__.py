@@ -1,15 +1,14 @@
 """The product's judgement on real imagery: what it accepts, and how wrong it says that it may be.
 
     python -m benchmarks.real FOLDER [--sets fengyuan neon ...] [--attitudes 0.3 1 3 none]
-    python -m benchmarks.real FOLDER --search --rivals --json real.json --plot real.png
+    python -m benchmarks.real FOLDER --search --json real.json --plot real.png
 
 FOLDER keeps the maps between runs. Each image begins from a prior up to 10 m off; roll, pitch and
 the height (3 m) are reported with the stated sigma, or not at all. A registration is right where
 the middle of its image lies on its true ground. NEES: squared error over the claimed covariance and
 the truth's own, per degree of freedom, the median of the accepted. --search: each image without a
-prior, heading unknown, on its map and on one that does not hold it. --rivals: SIFT, XFeat and
-ALIKED + LightGlue on the same images, those that are installed. --displaced N: only wrong priors, N
-of each image, 45 to 110 m off while they claim 6 m, with roll and pitch known to 1 degree.
+prior, heading unknown, on its map and on one that does not hold it. --displaced N: only wrong
+priors, N of each image, 45 to 110 m off while they claim 6 m; roll and pitch known to 1 degree.
 """
 
 from __future__ import annotations
@@ -22,31 +21,25 @@ from typing import Any
 
 from benchmarks.common.arguments import Parser, output, whole
 from benchmarks.common.figures import markdown, show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
+from benchmarks.common.named_errors import named_errors
+from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
+from benchmarks.real.report import (
+    DISPLACED,
+    JUDGED,
+    SEARCHED,
+    attitude_text,
+    displaced_cells,
+    displaced_row,
+    judged_cells,
+    judged_row,
+    plot,
+    searched_cells,
+    searched_row,
+)
+from benchmarks.real.searched import searched_images
+from benchmarks.real.sets import SETS, RealView, describe, load
 
-with needs_torch():
-    from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
-    from benchmarks.real.report import (
-        DISPLACED,
-        JUDGED,
-        RIVALS,
-        SEARCHED,
-        attitude_text,
-        displaced_cells,
-        displaced_row,
-        judged_cells,
-        judged_row,
-        plot,
-        rival_cells,
-        rival_rows,
-        searched_cells,
-        searched_row,
-    )
-    from benchmarks.real.rivals import load_rivals, rival_images
-    from benchmarks.real.searched import searched_images
-    from benchmarks.real.sets import SETS, RealView, describe, load
-
-_JUDGED_AT = 1.0  # degrees of attitude, of rivals and displaced priors
+_JUDGED_AT = 1.0  # degrees of attitude, of displaced priors
 _ELSEWHERE = {"caliterra": "fengyuan"}  # whose map holds no place of a set; else caliterra's
 _SEARCHED = ("fengyuan", "caliterra")
 
@@ -68,7 +61,6 @@ def parser() -> Parser:
     p.add_argument("--width", type=whole(64, 2048), default=320, help="working width, px")
     p.add_argument("--search", action="store_true", help="without a prior, too")
     p.add_argument("--displaced", type=whole(1, 100), default=0, help="wrong priors of each image")
-    p.add_argument("--rivals", action="store_true", help="matchers on the same images")
     p.add_argument("--json", type=output, help="rows and every image")
     p.add_argument("--plot", type=output, help="PNG: error over protection level")
     return p
@@ -100,17 +92,6 @@ def main() -> None:
             if name in _SEARCHED
         ]
         print(markdown(SEARCHED, list(map(searched_cells, result["searched"]))))
-    if args.rivals:
-        rivals, at = load_rivals(), [i for i in judged if i.attitude_deg == _JUDGED_AT]
-        matched = [
-            row
-            for name in args.sets
-            for row in rival_images(
-                name, describe(name), views[name], rivals, _JUDGED_AT, args.width
-            )
-        ]
-        result["rivals"] = rival_rows(matched, at)
-        print(markdown(RIVALS, list(map(rival_cells, result["rivals"]))))
     result["images"] = [asdict(i) for i in judged]
     show_figures(args.json, JUDGED, list(map(judged_cells, rows)), result)
     if args.plot:

@@ -17,13 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, whole
-from benchmarks.common.named_errors import named_errors, needs_torch
-
-with needs_torch():
-    from benchmarks.basin.views import load_views
-    from benchmarks.real.judged import judged_images
-    from benchmarks.real.sets import SETS, RealView, describe, load
+from benchmarks.common.named_errors import named_errors
+from benchmarks.real.judged import judged_images
+from benchmarks.real.sets import SETS, RealView, describe, load
 from companion.integrity_monitor.config import VideoCheckConfig
 from companion.integrity_monitor.video import detail, thumbnail
 from localizer.types import Image

@@ -11,7 +11,6 @@ import numpy as np
 
 if TYPE_CHECKING:
     from benchmarks.real.judged import JudgedImage
-    from benchmarks.real.rivals import RivalImage
     from benchmarks.real.searched import SearchedImage
 
 FOUND_M = 6.0  # an answer of the search within this is right
@@ -129,35 +128,6 @@ def searched_cells(r: dict[str, Any]) -> tuple[str, ...]:
         r["set"], str(r["images"]), str(r["found"]), str(r["wrong"]), _metres(r["farthest_m"]),
         f"{r['found_on_another_map']} of {r['on_another_map']}", f"{r['seconds']:.1f}",
     )  # fmt: skip
-
-
-def rival_rows(rivals: Sequence[RivalImage], ours: Sequence[JudgedImage]) -> list[dict[str, Any]]:
-    """Share of right images of every method on every set, ours of the same images."""
-    rows = []
-    for name in dict.fromkeys(r.set for r in rivals):
-        mine = [i for i in ours if i.set == name]
-        entries: list[tuple[str, list[float], list[bool], float | None]] = [
-            ("ours", [i.centre_m for i in mine], [i.right for i in mine], None)
-        ]
-        for method in dict.fromkeys(r.method for r in rivals):
-            of = [r for r in rivals if (r.set, r.method) == (name, method)]
-            seconds = float(np.median([r.seconds for r in of]))
-            entries.append((method, [r.centre_m for r in of], [r.right for r in of], seconds))
-        for method, centre, right, took in entries:
-            rows.append({
-                "set": name, "method": method, "centre_m": float(np.median(centre)),
-                "right": float(np.mean(right)), "seconds": took,
-            })  # fmt: skip
-    return rows
-
-
-RIVALS = ("set", "method", "middle of the image m", "right", "s")
-
-
-def rival_cells(r: dict[str, Any]) -> tuple[str, ...]:
-    """One of `rival_rows` as `RIVALS` names it."""
-    took = "-" if r["seconds"] is None else f"{r['seconds']:.2f}"
-    return r["set"], r["method"], f"{r['centre_m']:.2f}", f"{100 * r['right']:.0f} %", took
 
 
 def plot(images: Sequence[JudgedImage], path: Path) -> None:

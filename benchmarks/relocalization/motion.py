@@ -31,14 +31,10 @@ from benchmarks.basin.views import SIZE, ground_height
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
-from benchmarks.common.named_errors import named_errors, needs_torch
+from benchmarks.common.named_errors import named_errors
 from benchmarks.common.shares import exact_interval
 from benchmarks.odometry.stretches import StretchPlan, TestStretch, make_stretch
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, with_threads
-
-with needs_torch():
-    from localizer.training.data.batches import limit_haze
-    from localizer.training.data.pairs import soften
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
 from localizer.evaluation.places import SimulatedPlaceData
@@ -56,11 +52,13 @@ from localizer.synth.appearance.model import (
     CONDITIONS,
     Appearance,
     apply_appearance,
+    limit_haze,
     sample_appearance,
 )
 from localizer.tracking.attitude_bias import AttitudePrior
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.tracking.pipeline import Localizer
+from localizer.training.data.pairs import soften
 from localizer.types import Frame, PosePrior, TrackingState
 
 # Of a set: the map that is searched, the world that is seen, how far from the middle it is flown.

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import re
 
-from mavlink_bridge.alerts.alert import PREFIX, AlertSpec, Inhibits, OutputAction
+from mavlink_bridge.alerts.alert import (
+    NOTHING,
+    PREFIX,
+    WHILE,
+    AlertSpec,
+    Inhibits,
+    OutputAction,
+    Severity,
+)
 from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
 from mavlink_bridge.alerts.injection import INJECTION
 from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
@@ -17,68 +25,71 @@ hide: [toc]
 
 # Alerts
 
-For the pilot and the operator: every text that the companion sends, its cause, its effect and what
-to do. Made from the catalogue by `python -m benchmarks.site`; do not edit.
+For the pilot and the operator: every text that the companion sends. Made from the catalogue by
+`python -m benchmarks.site`; do not edit.
 
-An alert is sent as STATUSTEXT `{PREFIX}TEXT`. `events.csv` and `health.json` contain its
-identifier. In a text, N is a number, and other capitals are a name, a number or a reason. Names
-such as `bridge.origin` are keys of the deployment file; limits without a key are fixed.
+An alert is sent as STATUSTEXT `{PREFIX}TEXT`. Left: its text, its identifier in `events.csv` and
+`health.json`, and the severity *error* or *critical* (others: warning or less). Right: its cause,
+end, meaning and effect, and in bold what to do. In a text, N is a number; other capitals are a
+name, a number or a reason. `bridge.origin` and the like are keys of the deployment file.
+
+**Fixes:** an alert stops fixes only if its text begins with *output held* or *not sent*, or its row
+says *no fixes*.
+
+**Ends:** with *while*, an alert is active as long as this is true; with *Ends:*, until that is
+true; others report one moment. The end is sent as `cleared: NAME` (checks of positions), as the
+text in brackets, or by the next text, such as `injecting`, `the EKF follows` or `localization
+tracking`, after 1.5 s (up to 60 s if the alert recurs).
+
+**Times:** "for 2 s" means all the time. A check without data (no fix for 1 s, no frame for 2 s, no
+IMU messages) leaves its alert as it is. "More than A, and more than B": both.
 
 | term | meaning |
 |---|---|
-| fix | a position from vision. Injection sends it to the autopilot: in mode inject after the \
-shadow check (see *Not ready*), in mode rc after the pilot's order. In mode shadow none is sent |
-| fixes continue | this alert does not stop fixes; another alert can |
-| no fixes | vision makes no fix, so none is sent, until the alert ends |
-| output held; hold | fixes are made, but none is sent, until the alert ends |
-| exclude and reset | as *hold*; the first fix afterwards also increments `reset_counter`, which \
-tells the EKF to jump |
-| inhibit | injection and the switch to the vision source set do not start. Injection that runs \
-continues. If the program crashes before injection has started, and restarts within 10 min, the \
-alert stays active |
-| one-off | the alert reports one moment; nothing has to end |
-| good GNSS | GNSS has a 3D fix, and neither `gnss_refused` nor `gnss_vision_mismatch` is active |
+| fix | a position from vision |
+| injection | fixes are sent to the autopilot: in mode inject from the shadow check on, in mode \
+rc from the pilot's order until he ends it, in mode shadow never |
+| shadow check | compares the fixes of the last 2 min with the EKF's position on GNSS. *Valid \
+pass*: it passed at most 10 min ago, and at most 30 s before the last compared fix |
+| not ready | why the shadow check has not passed: do not fly on vision. Injection then starts \
+only by `bridge.injection.force`, by the pilot (mode rc), or without GNSS if the check has not \
+failed. Sent in mode inject when fixes have waited for 10 s. Limits apply to 50 or more fixes; \
+without GNSS a failed check stays failed |
+| not sent | why no position is sent (mode shadow: could be sent) |
+| output held | fixes are made, but none is sent until the alert ends |
+| reset | the first fix after *output held* increments `reset_counter`: the EKF jumps to it |
+| inhibit | injection and the switch to the vision source set do not start, except by the pilot \
+(mode rc) or `force`. Running injection continues. A restart within 10 min after a crash before \
+injection restores the alert |
+| no fixes | vision makes no fix until the alert ends |
+| EKF check | the first alert from `fix_rate_low` to `ekf_rejects_fixes` whose condition is true \
+for the positions sent in the last 3 s |
+| accepted, rejected | the frame matches the map well enough, or not |
+| odometry | motion from frame to frame; it continues the position without the map |
+| good GNSS | a 3D fix, without `gnss_refused` and `gnss_vision_mismatch` |
 | take over | On the ground: wait, and do not take off on vision. In flight: if the EKF uses good \
-GNSS, do nothing; if GNSS is good but not used, select the GNSS source set; without good GNSS \
-change to ALT_HOLD or STABILIZE (PX4: Altitude, Stabilized), which need no position |
-| compare with landmarks | compare the position on the ground station's map with what the pilot or \
-the video shows. If it is wrong, take over |
-| in flight | armed, and 3 m or more above or below the take-off height |
-| sigma | one standard deviation of the value or difference that is judged |
+GNSS, nothing; if good GNSS is not used, select the GNSS source set; without good GNSS change to \
+ALT_HOLD or STABILIZE (PX4: Altitude, Stabilized), which need no position, and land if it lasts |
+| check landmarks | compare the position on the ground station's map with what pilot or video \
+show; if it is wrong, take over |
+| give the position | send the approximate position: *I am here* in the console, or \
+MAV_CMD_EXTERNAL_POSITION_ESTIMATE to component 197. It limits the search, and is never a fix |
+| in flight | armed, and 3 m or more from the take-off height; otherwise the alert ends |
+| sigma | one standard deviation of the judged value |
 | protection level | radius that the position error exceeds in at most 0.1 % of fixes \
 (`integrity_monitor.protection.risk`) |
 | message | the value of `bridge.injection.message` |
+| test ratio | of EKF_STATUS_REPORT (PX4: ESTIMATOR_STATUS): above 1 the EKF rejects positions |
 
-Without GNSS and without fixes, ArduPilot's EKF has no input. ArduPilot then lands after 5 to 8 s
-([when vision ends](../how-to/when-vision-ends.md)). PX4 sends
-ESTIMATOR_STATUS in place of EKF_STATUS_REPORT.
-
-**Not sent:** the EKF receives no position; the alert says why. In mode shadow it says why none
-could be sent.
-
-**Effect:** a row that names no effect on fixes has none.
-
-**Not ready:** such an alert says why the shadow check has not passed. Until it passes, injection
-does not start, with three exceptions: `bridge.injection.force`; the pilot (mode rc); no GNSS, if
-the check has not failed (`injection_unchecked`). The first two also override *inhibit*. The check
-compares the fixes of the last two minutes with the EKF's position on GNSS. Such an alert is sent
-as a text only in mode inject, if fixes are made but injection has not started for 10 s. It ends
-when 50 or more compared fixes meet the limit; without GNSS a failed check stays failed. *Valid
-pass*: the check passed at most 10 min ago, and at most 30 s before the last compared fix.
-
-**Fixes and EKF:** `fix_rate_low` to `ekf_rejects_fixes` need 3 s or more of sent fixes. Only the
-first of these six whose condition holds is active.
-
-**Repeats and ends:** statuses of localization are assessed once a second; the same one is sent at
-most every 10 s. The end of a check of positions is sent as `cleared: NAME`, that of some others as
-the text in brackets. Other alerts have no such text: the next status, for example `localization
-tracking`, shows their end.
+Without GNSS and without fixes, ArduPilot lands after 5 to 8 s
+([when vision ends](../how-to/when-vision-ends.md)). The same localization status is sent every 10 s
+at most.
 """
 _TABLE = """
 ## {}
 
-| identifier | text | severity, action | raised when | ends when | meaning | what to do |
-|---|---|---|---|---|---|---|
+| text | raised, ends, meaning, **what to do** |
+|---|---|
 """
 _GROUPS = {
     "Checks of positions (integrity monitor)": (*INTEGRITY, *MONITOR, *SOURCES),
@@ -90,8 +101,8 @@ _GROUPS = {
 }
 _ACTIONS = {
     OutputAction.NONE: "",
-    OutputAction.HOLD: "hold",
-    OutputAction.EXCLUDE_AND_RESET: "exclude and reset",
+    OutputAction.HOLD: "",
+    OutputAction.EXCLUDE_AND_RESET: "reset",
 }
 
 
@@ -104,16 +115,20 @@ def alerts_page() -> str:
 
 def _row(spec: AlertSpec) -> str:
     shown = re.sub(r"\{\w+[^}]*\}", lambda m: _value(m.group(), spec), spec.template)
-    ended = spec.cleared or "one-off"
-    if spec.reports_end and spec.cleared_text is not None:
-        ended += f" (`{spec.cleared_text}`)"
-    inhibits = ["inhibit"] if Inhibits.INJECTION in spec.inhibits else []
-    action = ", ".join(
-        [spec.severity.name.lower(), *filter(None, [_ACTIONS[spec.action]]), *inhibits]
+    lines = [f"*while* {spec.raised}" if spec.cleared == WHILE else spec.raised]
+    if spec.cleared not in ("", WHILE):
+        text = f" (`{spec.cleared_text}`)" if spec.cleared_text else ""
+        lines.append(f"*Ends:* {spec.cleared}{text}")
+    lines.append(f"*Means:* {spec.meaning}")
+    if spec.operator != NOTHING:
+        lines.append(f"**{spec.operator}**")
+    marks = (
+        spec.severity.name.lower() if spec.severity <= Severity.ERROR else "",
+        _ACTIONS[spec.action],
+        "inhibit" if Inhibits.INJECTION in spec.inhibits else "",
     )
-    text = shown.removeprefix(PREFIX)
-    cells = (f"`{spec.id.value}`", text, action, spec.raised, ended, spec.meaning, spec.operator)
-    return f"| {' | '.join(cells)} |\n"
+    name = ", ".join([f"`{spec.id.value}`", *filter(None, marks)])
+    return f"| {shown.removeprefix(PREFIX)}<br>{name} | {'<br>'.join(lines)} |\n"
 
 
 def _value(field: str, spec: AlertSpec) -> str:

@@ -35,6 +35,7 @@ _STALE_S = 2.0
 _RATE_S = 5.0
 _LEAST_HZ = 3.0  # below 4 an EKF does without; a frame or two more or less is no news
 _SHORT_BRIDGE_NS = 2_000_000_000
+_LASTING = (AlertId.NO_SEARCH, AlertId.SEARCH_HANGS)  # obstacles of a search
 _OF_FEED = {
     StreamState.FAILED: (HealthLevel.FAILED, AlertId.VIDEO_FAILED),
     StreamState.MISFIT: (HealthLevel.FAILED, AlertId.VIDEO_SIZE),
@@ -212,7 +213,7 @@ class HealthMonitor:
         fault, lacks = self._bridge.injection_fault, self._search_obstacle(engine)
         if fault is not None:  # the bridge told it
             return HealthStatus(HealthLevel.DEGRADED, (fault,), is_reported=True)
-        if lacks not in (None, AlertId.SEARCH_NOT_READY):
+        if lacks in _LASTING:
             overload = alert(lacks)
         if overload is not None:
             return HealthStatus(HealthLevel.DEGRADED, (overload,))
@@ -332,6 +333,8 @@ def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:
         return lacks or AlertId.SEARCHING
     if engine.last_error:
         return _error(engine)
+    if engine.searches:  # between two searches
+        return AlertId.SEARCHING
     return AlertId.WAITING_FOR_PRIOR if engine.frames_in > 0 else AlertId.WAITING_FOR_VIDEO
 
 

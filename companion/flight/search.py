@@ -33,6 +33,7 @@ _HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
 _STOP_S = 10.0
 _WHOLE_MAP_EVERY = 5  # searches
+_NEWS_S = 2.0  # for which the last search tells what is missing
 
 # What the autopilot knows of the camera while it does not know where it is.
 _TILT_SIGMA_RAD = math.radians(SENSORS.unaided_tilt_deg)
@@ -181,11 +182,18 @@ class PlaceSearch:
         self._in_reach = 0  # searches since the whole map was searched
         self._hint: Hint | None = None
         self._open: OpenRelocalizer | None = None
-        self.lacks: AlertId | None = AlertId.SEARCH_NOT_READY
-        """Why no place can be searched now; None where one can."""
+        self._obstacle: AlertId | None = AlertId.SEARCH_NOT_READY
+        self._without_pose_s = -math.inf  # when attitude or height was missing last
         self._stop = threading.Event()
         # A daemon: one that hangs must not keep the process from ending.
         self._thread = threading.Thread(target=self.prepare, name="overview", daemon=True)
+
+    @property
+    def lacks(self) -> AlertId | None:
+        """Why no position can be searched now; None if one can."""
+        if self._obstacle is None and self._clock() - self._without_pose_s < _NEWS_S:
+            return AlertId.WAITING_FOR_PRIOR
+        return self._obstacle
 
     def start(self) -> None:
         """Start the thread that runs `prepare`."""
@@ -262,7 +270,9 @@ class PlaceSearch:
         rotation = self._autopilot.rotation(frame.exposure_time_ns)
         height_m = self._autopilot.height_m
         if rotation is None or height_m is None:
+            self._without_pose_s = self._clock()
             return None
+        self._without_pose_s = -math.inf
         return PlaceQuery(
             frame,
             rotation,
@@ -294,7 +304,7 @@ class PlaceSearch:
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)
-            self.lacks = None
+            self._obstacle = None
         except (LocalizerError, OSError) as error:
             self._disable(str(error))
         except Exception as error:  # the flight goes on without it, and says so
@@ -302,5 +312,5 @@ class PlaceSearch:
             self._disable(f"{type(error).__name__}: {error}")
 
     def _disable(self, why: str) -> None:
-        self.lacks = AlertId.NO_SEARCH
+        self._obstacle = AlertId.NO_SEARCH
         self._event("warning", f"no search for a lost place: {why}")

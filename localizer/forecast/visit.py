@@ -7,18 +7,15 @@ texture `localizer.synth.visits.texture`'s. Moved shadows and map errors are not
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
-from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.synth.visits.texture import hard_surfaces, with_new_texture
 from localizer.types import Float32, Image, RenderedView
 
 SEASON = "season"
 FORECAST_CONDITIONS = (*CONDITIONS, SEASON)
-_DENSEST_HAZE = 2.0  # optical depth at the view's median distance: beyond it nobody flies by sight
 _SOFT_PX = (0.4, 1.3)  # a map's texture is coarser than the picture
 _CHANGED = (0.0, 0.06)  # share of the picture that shows something else by now
 _CHANGE_M = 6.0  # side of such a place: a shed, a lorry, a felled tree
@@ -41,9 +38,7 @@ def simulate_visit(view: RenderedView, condition: str, rng: np.random.Generator)
     image = _changed(grown, cell_m, rng)
     if rng.random() < 0.5:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(*_SOFT_PX)), np.uint8)
-    look = sample_appearance(rng, "day" if condition == SEASON else condition)
-    look = replace(look, extinction_per_m=min(look.extinction_per_m, _DENSEST_HAZE / far_m))
-    return apply_appearance(image, view.depth, look, rng)
+    return weathered(image, view.depth, "day" if condition == SEASON else condition, rng)
 
 
 def _other_texture(rgb: Image, cell_m: float, rng: np.random.Generator, dry: bool) -> Image:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from pyproj import Transformer
 
 from localizer.errors import GeoreferenceError
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, matrix_from_euler
 
 EARTH_RADIUS_M = 6.371e6  # mean
 _ECEF_FROM_GEODETIC = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
@@ -62,6 +62,16 @@ def geodetic_from_ecef(ecef: ArrayLike) -> Array:
 
 # ENU <-> NED is its own inverse: swap x and y, negate z.
 NED_FROM_ENU: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# OpenCV's z (forward), x (right), y (down) are the x, y, z of a body or gimbal.
+BODY_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def level_camera(position: Array, heading_rad: float, pitch_rad: float) -> Pose:
+    """world_from_camera (ENU) of a camera without roll. heading: clockwise from north; pitch: of
+    the optical axis above the horizon.
+    """
+    attitude = matrix_from_euler(0.0, pitch_rad, heading_rad)
+    return Pose(NED_FROM_ENU.T @ attitude @ BODY_FROM_CAMERA, position)
 
 
 @dataclass(frozen=True)

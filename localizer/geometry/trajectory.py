@@ -6,7 +6,6 @@ poses here are `world_from_camera` in the map's ENU frame, OpenCV camera axes.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -16,7 +15,7 @@ import numpy as np
 
 from localizer.errors import PoseFileError
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, quaternion_from_matrix
-from localizer.plain_files import plain_text
+from localizer.geometry.posefile import text_lines
 
 _TUM_FIELDS = "time x y z qx qy qz qw"
 COVARIANCE_COLUMNS = (
@@ -65,13 +64,9 @@ def read_tum(path: Path) -> tuple[StampedPose, ...]:
     that begin with # are skipped. `PoseFileError` if the file cannot be read, a line is malformed,
     or there is no pose.
     """
-    try:
-        lines = plain_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
     poses = tuple(
         _parse_tum(line, f"{path}:{number}")
-        for number, line in enumerate(lines, start=1)
+        for number, line in enumerate(text_lines(path), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     )
     if not poses:
@@ -95,20 +90,6 @@ def _parse_tum(line: str, where: str) -> StampedPose:
     if not np.isfinite([*position, *q]).all() or abs(np.linalg.norm(q) - 1.0) > 0.01:
         raise PoseFileError(f"{where}: not a position and a unit quaternion")
     return StampedPose(str(time_ns), Pose(matrix_from_quaternion(q), position), time_ns)
-
-
-def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
-    """Write the upper triangles as CSV (`COVARIANCE_COLUMNS`). Poses without one are skipped.
-
-    Axes 0 to 2: position east, north, up (m); 3 to 5: rotation vector about them (rad).
-    """
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COVARIANCE_COLUMNS)
-        for pose in poses:
-            row = covariance_row(pose)
-            if row is not None:
-                writer.writerow(row)
 
 
 def covariance_row(pose: StampedPose) -> tuple[str, ...] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,10 +36,15 @@ class OdometryStart:
     constraint: PoseConstraint | None
 
     def corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
-        """The constraint without the sensors' constant error, known at the start; None stays."""
+        """The constraint without the sensors' constant error at the start, whose variances are
+        added: that error is measured with the start's pose and is as wrong. None stays.
+        """
         if constraint is None or self.constraint is None:
             return constraint
-        return without_constant_error(constraint, self.constraint, self.pose)
+        corrected = without_constant_error(constraint, self.constraint, self.pose)
+        information = np.diag(corrected.information)
+        widened = information / (1.0 + information * self.covariance.diagonal())
+        return replace(corrected, information=np.diag(widened))
 
 
 @dataclass(frozen=True)

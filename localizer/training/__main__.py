@@ -54,29 +54,6 @@ def train(
 
 
 @app.command()
-def ablation(
-    config: ConfigPath,
-    steps: Annotated[int, typer.Option(help="Steps of each run.")] = 1000,
-    scenes: Annotated[int, typer.Option(help="Places of each run.")] = 80,
-) -> None:
-    """Repeat the paper's training-data ablation (Table 4): three runs, exported for the benchmark.
-
-    Compare them with: python -m benchmarks.features --baselines --models RUN/tiny.onnx ...
-    """
-    from localizer.training.export.export import export as write
-    from localizer.training.loop.ablation import ablations
-    from localizer.training.loop.train import Trainer
-
-    for name, run in ablations(load_config(config), steps, scenes).items():
-        _generate(run)
-        trainer = Trainer(run)
-        trainer.run()
-        model = run.output / f"{run.name}.onnx"
-        write(trainer.checkpoint, model)
-        typer.echo(f"{name}: {model}")
-
-
-@app.command()
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint (.pt) of a run.")],
     model: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
@@ -90,19 +67,6 @@ def export(
         f"{model}: largest difference to torch in float32 {parity.difference:.2g}, "
         f"least mean cosine {parity.cosine:.6f}"
     )
-
-
-@app.command("contact-sheet")
-def contact_sheet_of(
-    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to show pairs of.")],
-    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("pairs.png"),
-    pairs: Annotated[int, typer.Option(help="Pairs from each shard.")] = 2,
-) -> None:
-    """Show training pairs, each with its depth-warp check."""
-    from localizer.training.data.contact_sheet import contact_sheet
-    from localizer.training.data.shards import read_shard
-
-    typer.echo(contact_sheet([p for s in shards for p in read_shard(s)[:pairs]], out))
 
 
 def _generating(config: TrainConfig) -> Future[None]:

@@ -17,6 +17,10 @@ Value = float | int | Word | Name | AlertId
 Kind = str | type[Word | AlertId] | tuple[type[Word], type[Word | RcChannel | ChosenSet]]
 """Of a value: its unit (empty: none), "name" for a `Name`, or the list that it is one of."""
 AlertKey = tuple[AlertId, bool, tuple[str, ...]]
+NOTHING = "nothing"
+"""What the operator does about an alert that only informs."""
+WHILE = "that is no longer true"
+"""End of an alert that is active just while the condition that raises it is true."""
 
 
 class Severity(enum.IntEnum):

@@ -7,175 +7,161 @@ from mavlink_bridge.alerts.ids import AlertId as A
 from mavlink_bridge.alerts.words import CalibrationError, GnssDisagreement
 
 WARNING, ERROR = Severity.WARNING, Severity.ERROR
-_WITHIN = "the difference + 2 sigma is below the limit for 10 s"
-_CALIBRATE = "before the next flight run `companion calibrate flight` on this flight's record"
-_TAKE_OVER = "take over; if it lasts without good GNSS, land"
-_SENT = "fixes continue"
-_WIDER = "fixes continue, with a larger covariance"
-_LAND = "if it lasts without good GNSS, take over and land"
-_OR_GNSS = "select the GNSS source set if GNSS is good"
+_WITHIN = "N + 2 sigma is below the limit for 10 s"
+_CALIBRATE = "after landing run `companion calibrate flight` on the record"
+_TAKE_OVER = "take over"
+_IF_LASTS = "if it lasts, take over"
+_ADDED = "now included in covariance and protection level"
+_STILL_VELOCITY = "during `bridging` ArduPilot still receives the velocity"
 
 INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VIDEO_FROZEN, ERROR, "video frozen", "video frozen {seconds:.0f} s",
               {"seconds": "s"},
-              "in flight: identical frames for 1.5 s; or no image motion while the EKF's velocity "
-              "moves the vehicle by 2 m; or no image motion for 3 s (2 s + 0.027 s per metre of "
-              "ground across the image, if that is longer)",
+              "in flight: identical frames for 1.5 s; no image motion over 2 m of flight (EKF's "
+              "velocity), or for 2 s + 0.027 s per metre of ground across the image (3 s or more)",
               "the image moves for 2 s",
-              "camera or link repeat an old frame, so the position from vision stands still",
+              "camera or link repeat a frame: the position stands still",
               _TAKE_OVER, action=OutputAction.EXCLUDE_AND_RESET, clear_s=2.0),
     AlertSpec(A.VIDEO_REPEATS, ERROR, "video repeats", "video repeats, {seconds:.0f} s old",
               {"seconds": "s"}, "in flight: the frames of 2 s equal frames of the last 60 s",
               "frames are new for 5 s",
-              "the video source plays a recording or a loop; N: age of the shown frames",
+              "the source plays a recording or loop; N: age of the frames",
               _TAKE_OVER, action=OutputAction.EXCLUDE_AND_RESET, clear_s=5.0),
     AlertSpec(A.LOW_CONTRAST, WARNING, "low image contrast",
               "low image contrast {gray:.1f}: dark or haze", {"gray": "gray levels"},
-              "in flight: the local contrast of the frames is below 2.0 gray levels of 255 for 2 s",
+              "in flight: the local contrast N is below 2.0 gray levels of 255 for 2 s",
               "it is above for 5 s",
-              f"{_SENT}; the image is dark or hazy, or the ground has no structure; vision will "
-              "fail soon",
-              f"increase the camera's exposure; fly home, or {_OR_GNSS}",
+              "dark, haze or plain ground: vision will fail soon",
+              "increase the exposure; use good GNSS, or fly home",
               raise_s=2.0, clear_s=5.0, repeat_s=60.0),
     AlertSpec(A.VISION_IMU_MISMATCH, ERROR, "vision/IMU mismatch",
               "vision/IMU mismatch {metres:.0f} m", {"metres": "m"},
-              "the mean distance between fixes and the positions that the IMU predicts exceeds a "
-              "limit for 0.2 s: 1.5 m over 1 s, 1.0 m over 3 s or 0.8 m over 10 s, + 4 sigma of "
-              "this mean + 1.5 sigma of a fix",
-              "the distance is below half of the limit, and the position moves, for 5 s",
-              "the position from vision does not move as the vehicle does: it is wrong", _TAKE_OVER,
+              "for 0.2 s the fixes' mean distance N from the IMU's prediction exceeds 1.5 m over 1 "
+              "s, 1.0 m over 3 s or 0.8 m over 10 s (+ 4 sigma + 1.5 sigma of a fix)",
+              "for 5 s N is below half the limit, and the position moves",
+              "the position does not move as the vehicle does: it is wrong", _TAKE_OVER,
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=0.2, clear_s=5.0),
     AlertSpec(A.HEIGHT_MISMATCH, ERROR, "height mismatch", "height {metres:.0f} m off barometer",
               {"metres": "m"},
-              "the difference between vision's height and the barometer's has changed by more than "
-              "8 m + 4 sigma + 16 % of the climb, for 2 s", "it is within the limit for 5 s",
-              "vision's height is wrong, and its horizontal position probably too", _TAKE_OVER,
+              "armed: in the last 2 min vision's height changed N more or less than the "
+              "barometer's; for 2 s N exceeds 8 m + 4 sigma + 16 % of the climb",
+              "N is within the limit for 5 s",
+              "vision's height is wrong, its position probably too", _TAKE_OVER,
               action=OutputAction.EXCLUDE_AND_RESET, raise_s=2.0, clear_s=5.0),
     AlertSpec(A.POSITION_JUMP, ERROR, "position jump", "position jumped {metres:.0f} m",
               {"metres": "m"},
-              "at once: a fix is 3 m farther from the last one than flight and 4 sigma explain; "
-              "10 m if the localizer announced the jump (it found the position again)",
-              "the new position moves as the IMU for 5 s (up to 60 s if vision's heading turned "
-              "and the gyros did not), or the old position is back",
-              "the old or the new position is wrong",
-              "wait 5 s; if it lasts, take over",
+              "a fix lies N farther from the last one than flight and 4 sigma explain: more than 3 "
+              "m, or 10 m if vision reports that it found the position again",
+              "for 5 s the new position moves as the IMU measures (up to 60 s if vision's heading "
+              "turned and the gyros did not); or a fix at the old one",
+              "old or new position is wrong", f"wait 5 s; {_IF_LASTS}",
               action=OutputAction.EXCLUDE_AND_RESET),
     AlertSpec(A.POSITION_STEP, WARNING, "position step",
               "position step {metres:.0f} m, unexplained", {"metres": "m"},
-              "the mean of five fixes is off that of the five before by more than 1 m, and by "
-              "more than motion and 4 sigma explain; but by less than a jump (3 m)",
-              "the position steps back; or the vehicle is disarmed; or, for a step along the "
-              "course, the measured time offset is within 80 ms (`time_offset`) or half of the "
-              "delay that would explain the step; or, for a step "
-              "across, the position is lost and found again",
-              f"{_WIDER}; the position may be wrong by N (sum of the steps, at most 3 m; in a "
-              "hover each counts as across), which the protection level now includes",
-              "increase the distance to obstacles by N", repeat_s=60.0),
+              "the mean of five fixes is off that of the five before by more than 1 m, and by more "
+              "than motion and 4 sigma explain, but less than a jump",
+              "a step back; disarmed; for steps along the course: a measured time offset that is "
+              "too small to explain them; for steps across (in a hover: all): the position is "
+              "found again after `bridging` or `lost`",
+              f"the position may be wrong by N (sum of steps, 3 m at most), {_ADDED}",
+              "keep N more distance to obstacles", repeat_s=60.0),
     AlertSpec(A.TILT_MISMATCH, WARNING, "tilt mismatch", "tilt {degrees:.0f} deg off autopilot",
               {"degrees": "deg"},
-              "vision's roll and pitch differ from those of gimbal and autopilot by more than 3 "
-              "sigma (2.7 deg or more) for 1 s",
-              "the difference is below 2 sigma for 3 s",
-              f"{_WIDER}; the position may be wrong by tilt times height, at most 3 m, which the "
-              "protection level now includes; cause: low over ground with little structure, tilt "
-              "and shift look alike",
+              "for 1 s vision's roll and pitch are N off those of gimbal and autopilot: over 3 "
+              "sigma (2.7 deg or more)",
+              "N is below 2 sigma for 3 s",
+              "low over plain ground tilt and shift look alike: the position may be wrong by N "
+              f"times height, 3 m at most, {_ADDED}",
               "climb, or fly over buildings and roads", raise_s=1.0, clear_s=3.0,
               repeat_s=60.0),
     AlertSpec(A.GNSS_VISION_MISMATCH, WARNING, "GNSS/vision mismatch",
               "GNSS/vision mismatch {metres:.0f} m", {"metres": "m"},
-              "their horizontal distance exceeds vision's protection level + 4 times the "
-              "receiver's stated accuracy (1 to 3 m) + 0.2 s times the speed, for 2 s; not with "
-              "message gps_input",
-              "the distance is within the limit for 5 s; not while GNSS or fixes are missing",
-              f"{_SENT}; GNSS or vision is wrong, and it is not known which",
-              "compare with landmarks; select the source set that is right", raise_s=2.0,
+              "for 2 s their horizontal distance N exceeds protection level + 4 times the "
+              "receiver's accuracy (1 to 3 m) + 0.2 s times speed; not with message gps_input",
+              "N is within the limit for 5 s",
+              "GNSS or vision is wrong",
+              "check landmarks; select the right source set", raise_s=2.0,
               clear_s=5.0, repeat_s=10.0),
-    AlertSpec(A.EKF_REJECTS_VISION, WARNING, "EKF rejects vision",
-              "EKF rejects vision ({ratio:.1f})", {"ratio": ""},
-              "the horizontal test ratio in EKF_STATUS_REPORT is above 1 for 2 s, while fixes are "
-              "made", "the ratio is 1 or less, or no fix is made, for 3 s",
-              f"{_SENT}, but the EKF does not use them, and its position drifts; if injection is "
-              "off, the EKF rejects GNSS; N: the ratio", "take over", raise_s=2.0,
-              clear_s=3.0, repeat_s=10.0),
+    AlertSpec(A.EKF_REJECTS_VISION, WARNING, "EKF rejects its position input",
+              "EKF rejects its position input ({ratio:.1f})", {"ratio": ""},
+              "the test ratio N is above 1 for 2 s, while fixes are made",
+              "N is 1 or less, or no fix is made, for 3 s",
+              "the EKF does not use the fixes (injection off: GNSS) and drifts",
+              _TAKE_OVER, raise_s=2.0, clear_s=3.0, repeat_s=10.0),
     AlertSpec(A.EKF_JUMP, WARNING, "EKF jump", "EKF jumped {metres:.0f} m, unconfirmed",
               {"metres": "m"},
-              "armed: LOCAL_POSITION_NED steps by 3 m more than the velocity explains",
-              "vision moves as the IMU, and output is not held, for 10 s; or disarmed",
-              f"{_SENT}; the EKF was reset to a position that is not confirmed yet; until then "
-              "`ekf_follows` is not reported",
-              "compare the position with landmarks until it ends", inhibits=Inhibits.EKF_OK),
+              "armed: the EKF's position steps by 3 m more than its velocity explains",
+              "for 10 s fixes move as the IMU measures and are not held; or disarmed",
+              "the EKF was reset to an unconfirmed position; `ekf_follows` waits for the end",
+              "check landmarks", inhibits=Inhibits.EKF_OK),
     AlertSpec(A.VIDEO_TIMESTAMPS, ERROR, "video timestamps", "video timestamps not monotonic", {},
-              "the timestamps of five frames in a row do not increase, for 0.5 s",
-              "frames are newer than all before for 3 s",
-              "the video's timestamps are wrong, and with them the times of the positions",
-              "take over; if it lasts, restart the video source", action=OutputAction.HOLD,
+              "for 0.5 s no frame, of five or more, is newer than those before",
+              "frames are newer for 3 s", "the positions' times are wrong",
+              f"{_TAKE_OVER}; restart the video source", action=OutputAction.HOLD,
               raise_s=0.5, clear_s=3.0),
     AlertSpec(A.HPL_OVER_LIMIT, ERROR, "HPL over limit", "HPL {metres:.0f} m over limit",
               {"metres": "m"},
-              "the horizontal protection level (HPL) is above "
-              "`bridge.injection.alert_limit_m` (default 10 m) for 1 s",
-              "it is below the limit for 3 s",
-              "the position may be wrong by N; no position is sent, but during `bridging` "
-              "ArduPilot receives the velocity",
-              f"fly higher, or over buildings and roads; {_LAND}",
+              "the horizontal protection level N is above `bridge.injection.alert_limit_m` "
+              "(default 10 m) for 1 s",
+              "it is below for 3 s",
+              f"the position may be wrong by N; {_STILL_VELOCITY}",
+              f"fly higher, or over buildings and roads; {_IF_LASTS}",
               action=OutputAction.HOLD, raise_s=1.0, clear_s=3.0),
     AlertSpec(A.FOCAL_LENGTH, WARNING, "focal length", "focal length {percent:.1f} % {direction}",
               {"percent": "%", "direction": CalibrationError},
-              "the estimated focal length differs from the calibration by more than 2.5 %, and by "
-              "more than 4 sigma, for 2 s", _WITHIN,
-              f"{_WIDER}; positions are wrong by about N % of the height above ground",
+              "the calibrated focal length proves N too *long* or *short*: for 2 s more than 2.5 "
+              "%, and more than 4 sigma", _WITHIN,
+              f"positions are wrong by N % of the height above ground, {_ADDED}",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=2.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.BORESIGHT, WARNING, "boresight", "camera {degrees:.0f} deg off in {axis}",
               {"degrees": "deg", "axis": CalibrationError},
-              "the attitude from vision differs from that of gimbal and autopilot by more than 3 "
-              "deg, and by more than 4 sigma, for 3 s", _WITHIN,
-              f"{_SENT}; AXIS: roll, pitch or yaw; the mounting angles in the deployment file, "
-              "the gimbal or the compass are wrong",
+              "vision's roll, pitch or yaw differs by N from that of gimbal and autopilot: for 3 s "
+              "more than 3 deg, and more than 4 sigma", _WITHIN,
+              "mounting angles, gimbal or compass are wrong",
               _CALIBRATE,
               inhibits=Inhibits.INJECTION, raise_s=3.0, clear_s=10.0, repeat_s=60.0),
     AlertSpec(A.TIME_OFFSET, WARNING, "time offset",
               "video timestamps {milliseconds:.0f} ms {direction}",
               {"milliseconds": "ms", "direction": CalibrationError},
-              "vision's motion is late or early by more than 80 ms, and by more than 4 sigma, for "
-              "1 s",
+              "vision's motion is N *late* or *early*: for 1 s more than 80 ms, and more than 4 "
+              "sigma",
               _WITHIN,
-              f"{_WIDER}; positions are behind (late) or ahead of (early) the vehicle by speed "
-              "times N",
-              "fly slowly; before the next flight set `camera.settings.time_offset_ms`",
+              "positions are behind (late) or ahead of (early) the vehicle by speed times N, "
+              f"{_ADDED}",
+              "fly slowly; after landing correct `camera.settings.time_offset_ms`",
               inhibits=Inhibits.INJECTION, raise_s=1.0, clear_s=10.0, repeat_s=60.0),
 )  # fmt: skip
 MONITOR: tuple[AlertSpec, ...] = (
     AlertSpec(A.MONITOR_FAILED, ERROR, "integrity monitor failed", "integrity monitor failed", {},
-              "a check fails by a fault in the program, or the monitor's thread does not run for "
-              "2 s",
-              "all checks run again for 3 s",
-              "no position is sent while the thread does not run, or after ten failed runs in a "
-              "row (1 s); a shorter failure drops at most one fix",
+              "a check fails by a program fault, or the monitor's thread does not run for 2 s",
+              "all checks run for 3 s",
+              "output is held after 1 s of failures, or without the thread; shorter failures drop "
+              "one fix at most",
               _TAKE_OVER, action=OutputAction.HOLD, clear_s=3.0,
               repeat_s=10.0),
     AlertSpec(A.FIXES_NOT_CHECKED, ERROR, "fix checks failed", "fix dropped: its checks failed", {},
-              "the comparison of a fix with the map's offset fails by a fault in the program (a "
-              "fault of the other checks raises `monitor_failed`)", "no such fault for 3 s",
-              "the fix is dropped; other fixes are checked and sent as usual",
+              "a fix's correction by the map's offset fails by a program fault (other checks: "
+              "`monitor_failed`)", "no such fault for 3 s",
+              "this fix is dropped, others are sent",
               "if `no_fresh_fix` follows, take over; after landing read the log",
               clear_s=3.0, repeat_s=10.0),
     AlertSpec(A.COMPONENT_STALLED, WARNING, "component stalled",
               "{component} stalled {seconds:.0f} s", {"seconds": "s", "component": "name"},
-              "the thread `health`, which assesses the localization every second, has not run for "
-              "4 s", "it runs again for 3 s",
-              f"{_SENT}, and are checked; health.json, the heartbeat's status and alerts such as "
-              "`lost` are out of date", _LAND,
+              "the thread `health` has not run for 4 s", "it runs for 3 s",
+              "health.json, the heartbeat's state and texts such as `localization lost` are out of "
+              "date", _IF_LASTS,
               clear_s=3.0, repeat_s=10.0),
 )  # fmt: skip
 SOURCES: tuple[AlertSpec, ...] = (
     AlertSpec(A.GNSS_REFUSED, WARNING, "GNSS refused", "GNSS refused: {size:.1f} {why}",
               {"size": "m or m/s", "why": GnssDisagreement},
-              "the EKF uses vision, GNSS has a 3D fix, and for 2 s its position or velocity "
-              "differs from vision or IMU, scatters, or has a stated accuracy above 5 m",
-              "GNSS has no 3D fix, or the EKF uses GNSS, or GNSS agrees for 5 s",
-              f"{_SENT}, and the EKF stays on vision; the receiver is jammed, spoofed or not "
-              "settled, or the map has an offset",
-              "stay on vision; select GNSS only if landmarks confirm it",
+              "the EKF uses vision, and for 2 s GNSS with a 3D fix differs from vision (*off "
+              "vision*) or IMU (*off IMU*), scatters (*noise*), or states over 5 m accuracy "
+              "(*claimed*)",
+              "no 3D fix; the EKF uses GNSS; or GNSS agrees for 5 s",
+              "the EKF stays on vision; GNSS is jammed, spoofed or not settled, or the map has an "
+              "offset",
+              "select GNSS only if landmarks confirm it",
               cleared_text="GNSS agrees with vision", raise_s=2.0, clear_s=5.0, repeat_s=10.0),
 )  # fmt: skip

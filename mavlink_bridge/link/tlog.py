@@ -22,6 +22,8 @@ from mavlink_bridge.errors import TlogError
 _log = logging.getLogger(__name__)
 
 _MAX_BYTES = 2 << 30
+WHOLE, PART = "it has 2 GiB", "the disk took only a part"
+"""Why the file ends, for the operator."""
 _MAX_WAITING = 8192  # frames: 10 s of five times the usual traffic
 _WRITE_EVERY_S = 0.2
 _CLOSE_S = 5.0
@@ -141,7 +143,7 @@ class TlogRecorder:
             return
         if len(records) > self._left:
             self.dropped += count
-            self._fail("the file has reached its greatest size")
+            self._fail(WHOLE)
             return
         try:
             written = self._file.write(records)
@@ -154,7 +156,7 @@ class TlogRecorder:
         self.dropped += count
         if written:
             self._left = 0  # half a record ends the file: what came behind it could not be read
-            self._fail("the disk took only a part")
+            self._fail(PART)
 
     def _fail(self, why: str) -> None:
         if not self._failed:

@@ -114,7 +114,7 @@ def bound_figures(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) 
     """Check the horizontal errors of the accepted estimates in a time span against their stated
     bounds: the 95 % ellipse of the reported sigmas, and the protection level.
 
-    truth: map ENU, m, matched by exposure time. None without estimates.
+    truth: map ENU, m, matched by exposure time. The figures are None without estimates.
     """
     rows, found = _matched(truth, estimates, span_ns)
     if not len(rows):

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.geometry import GIMBAL_FROM_CAMERA
-from localizer.geometry.geo import NED_FROM_ENU
-from localizer.geometry.pose import Array, Pose, matrix_from_euler
+from localizer.geometry.geo import level_camera
+from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
@@ -49,7 +48,7 @@ def camera_path(scenario: Scenario, ground_m: float) -> Iterator[tuple[int, Pose
             limit = min(scenario.speed_m_s, np.sqrt(2 * _ACCELERATION * away))
             speed = min(speed + _ACCELERATION * _STEP_S, limit)
             position = position + (goal - position) / away * min(speed * _STEP_S, away)
-            yield round(time_s * 1e9), _camera(position, yaw, pitch)
+            yield round(time_s * 1e9), level_camera(position, yaw, pitch)
             time_s += _STEP_S
 
 
@@ -83,10 +82,6 @@ def record_scenario(assets: FlightAssets, scenario: Scenario, seed: int, out: Pa
         return record_sequence(camera, track, times, cache.frame, out, calibrated)
     finally:
         streamer.close()
-
-
-def _camera(position: Array, yaw: float, pitch: float) -> Pose:
-    return Pose(NED_FROM_ENU.T @ matrix_from_euler(0.0, pitch, yaw) @ GIMBAL_FROM_CAMERA, position)
 
 
 def _towards(value: float, goal: float, step: float) -> float:

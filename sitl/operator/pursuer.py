@@ -45,7 +45,7 @@ class _FrameLog:
         self._file.close()
 
     def newest(self) -> tuple[int, Pose]:
-        """(true exposure time ns, true camera pose) of the newest frame."""
+        """(true exposure time ns, true camera pose) of the newest frame; RuntimeError if none."""
         lines = (self._rest + self._file.read()).split("\n")
         self._rest = lines.pop()
         self._rows = [*self._rows, *csv.DictReader(lines, FRAME_COLUMNS)][-1:]

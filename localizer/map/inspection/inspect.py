@@ -14,8 +14,8 @@ from PIL import Image as PillowImage
 
 from localizer.errors import MapCacheError, OutsideMapError
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
-from localizer.geometry.pose import Array, Pose, matrix_from_euler
+from localizer.geometry.geo import Geodetic, level_camera
+from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.cache.tile import TileMesh
@@ -27,8 +27,6 @@ MIN_HOLE_M2 = 25.0  # smaller gaps are ponds, glass roofs and other failures of 
 _MAX_CELLS = 20_000 * 20_000
 
 # Camera axes (x right, y down, z forward) of a camera that looks along the body's x (FRD).
-_BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @dataclass(frozen=True)
@@ -118,8 +116,7 @@ def camera_pose(
     """
     p = Geodetic(latitude_deg, longitude_deg, height_m)  # names what is no place on Earth
     position = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
-    attitude = matrix_from_euler(0.0, np.radians(pitch_deg), np.radians(heading_deg))
-    return Pose(_ENU_FROM_NED @ attitude @ _BODY_FROM_CAMERA, position)
+    return level_camera(position, np.radians(heading_deg), np.radians(pitch_deg))
 
 
 def render_view(cache: TileCache, world_from_camera: Pose, camera: Camera) -> RenderedView:

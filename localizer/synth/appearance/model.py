@@ -6,7 +6,7 @@ seasons belong to the rendered world.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from localizer.types import Float32, Image
 
 CONDITIONS = ("day", "dusk", "night", "fog", "rain", "snow")
 _SKY_DEPTH_M = 4000.0  # haze distance given to pixels without a surface
+_DENSEST_HAZE = 2.0  # optical depth at the median distance: beyond it nobody flies by sight
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,20 @@ def sample_appearance(rng: np.random.Generator, condition: str | None = None) ->
         motion_blur_deg=float(rng.uniform(0.0, 180.0)),
         jpeg_quality=int(rng.integers(25, 96)),
     )
+
+
+def limit_haze(appearance: Appearance, depth: Float32) -> Appearance:
+    """The appearance with less haze if surfaces at these depths (m) would be invisible."""
+    surface = depth[depth > 0]
+    if not surface.size:
+        return appearance
+    limit = _DENSEST_HAZE / float(np.median(surface))
+    return replace(appearance, extinction_per_m=min(appearance.extinction_per_m, limit))
+
+
+def weathered(image: Image, depth: Float32, condition: str, rng: np.random.Generator) -> Image:
+    """The image under random light and weather of a condition, with limited haze."""
+    return apply_appearance(image, depth, limit_haze(sample_appearance(rng, condition), depth), rng)
 
 
 def apply_appearance(

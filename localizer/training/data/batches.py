@@ -13,7 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from localizer.errors import SequenceError
-from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import (
+    Appearance,
+    apply_appearance,
+    sample_appearance,
+    weathered,
+)
 from localizer.training.data.pairs import Pair, relative_pose
 from localizer.training.data.shards import read_shard
 from localizer.training.losses import Batch
@@ -21,7 +26,6 @@ from localizer.types import Float32, Image
 
 _POLL_S = 0.5  # between looks for a shard that is still being generated
 _MOST_DRAWS = 200  # for one sample; most pairs give one
-_DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it nothing is left
 
 
 @dataclass(frozen=True)
@@ -157,8 +161,7 @@ def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Tra
     """Crop as `window_pair`; with `appearance`, images degraded by light, weather and sensor."""
     query, reference = pair.query, pair.reference
     if config.appearance:
-        look = limit_haze(sample_appearance(rng, pair.condition), pair.query_depth)
-        query = apply_appearance(query, pair.query_depth, look, rng)
+        query = weathered(query, pair.query_depth, pair.condition, rng)
         survey = survey_appearance(rng)
         if survey is not None:
             reference = apply_appearance(reference, pair.reference_depth, survey, rng)
@@ -259,15 +262,6 @@ def collate(samples: list[TrainingSample]) -> Batch:
         )
     ]
     return Batch(pixels.float() / 255.0, *stacked)
-
-
-def limit_haze(appearance: Appearance, depth: Float32) -> Appearance:
-    """The appearance with less haze if surfaces at these depths (m) would be invisible."""
-    surface = depth[depth > 0]
-    if not surface.size:
-        return appearance
-    limit = _DENSEST_HAZE / float(np.median(surface))
-    return replace(appearance, extinction_per_m=min(appearance.extinction_per_m, limit))
 
 
 def _unoccluded(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
@@ -144,26 +143,6 @@ def draw_place(
 def draw_visit(rng: np.random.Generator) -> FlightDay:
     """Draw the conditions of a training flight."""
     return FlightDay(draw_condition(rng), bool(rng.random() < 0.4), None)
-
-
-def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
-    """The query's colours brought into the reference view by depth and poses (paper, Fig. 14).
-
-    Returns the warped image (H, W, 3) float32 in 0..255 and the mask (H, W) of what both views see.
-    """
-    camera = pair.camera
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
-    rays = camera.rays(np.stack([u, v], -1))
-    points = pair.world_from_reference.apply(rays * pair.reference_depth[..., None])
-    local = pair.world_from_query.inverse.apply(points)
-    pixels, inside = camera.project(local)
-    pixels = np.nan_to_num(pixels, nan=-1.0).astype(np.float32) - np.float32(0.5)
-    x, y = pixels[..., 0], pixels[..., 1]
-    warped = cv2.remap(pair.query.astype(np.float32), x, y, cv2.INTER_LINEAR)
-    depth = cv2.remap(pair.query_depth, x, y, cv2.INTER_NEAREST)
-    z = local[..., 2]
-    same = np.abs(depth - z) < 0.02 * z + 1.0
-    return warped, inside & same & (pair.reference_depth > 0)
 
 
 def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneConfig) -> LitScene:

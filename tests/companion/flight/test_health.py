@@ -47,7 +47,7 @@ class FakeBridge:
         return {"fix_latency_ms": float("nan")}
 
     def shadow_score(self):
-        return SimpleNamespace(go=False, line=lambda: "no comparison yet")
+        return SimpleNamespace(ready=False, line=lambda: "no comparison yet")
 
 
 def _one_report(
@@ -101,6 +101,8 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, of):
     ("engine", "of"),
     [
         (EngineHealth(frames_in=3), AlertId.WAITING_FOR_PRIOR),
+        (EngineHealth(frames_in=3, searches=2, searching=True), AlertId.SEARCHING),
+        (EngineHealth(frames_in=3, searches=2), AlertId.SEARCHING),  # between two searches
         (EngineHealth(frames_in=3, last_error="x"), AlertId.LOCALIZATION_FAILED),
         (EngineHealth(frames_in=3, last_error="x", map_loading=True), AlertId.MAP_LOADING),
     ],
@@ -228,6 +230,7 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
         (False, AlertId.NO_SEARCH, AlertId.NO_SEARCH, AlertId.NO_SEARCH),
         # At a map's first start, for minutes: no news for who is not lost.
         (False, AlertId.SEARCH_NOT_READY, AlertId.TRACKING, AlertId.SEARCH_NOT_READY),
+        (False, AlertId.WAITING_FOR_PRIOR, AlertId.TRACKING, AlertId.WAITING_FOR_PRIOR),
         (False, None, AlertId.TRACKING, AlertId.LOST),
     ],
 )

@@ -78,6 +78,7 @@ class Falling:
 
     def __init__(self, velocity=None):
         self.time_s, self.velocity = 0.0, velocity
+        self.attitude: np.ndarray | None = np.eye(3)
 
     @property
     def height_m(self):
@@ -91,7 +92,7 @@ class Falling:
         return None
 
     def rotation(self, _time_ns):
-        return np.eye(3)
+        return self.attitude
 
     def frame(self):
         return Frame(
@@ -198,6 +199,19 @@ def test_a_search_that_is_not_ready_or_cannot_be_says_so(cache, monkeypatch):
     search.stop()
     assert search.lacks.value == AlertId.NO_SEARCH.value
     assert events == [("warning", "no search for a lost place: too large a map")]
+
+
+def test_without_the_autopilots_attitude_it_says_what_it_waits_for(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    assert search.lacks is None
+    falling.attitude = None
+    search.search(falling.frame(), lambda: False)
+    assert search.lacks is AlertId.WAITING_FOR_PRIOR
+    falling.attitude = np.eye(3)
+    search.search(falling.frame(), lambda: False)
+    assert len(slow.queries) == 1
+    assert search.lacks is None
 
 
 def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, cache):

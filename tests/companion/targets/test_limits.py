@@ -131,11 +131,11 @@ def clicked(cast, place):
 @pytest.mark.parametrize(
     ("floor_m", "aside_m", "why"),
     [
-        (-HOLE_M, 0.0, "the map has a hole there"),
+        (-HOLE_M, 0.0, "a hole in the map"),
         (-HOLE_M, 5.0, "known to 200 m only"),
         (-HOLE_M, 7.0, "known to"),
         (np.nan, 0.0, "no map under it"),
-        (np.nan, 7.0, "the map has a hole there"),
+        (np.nan, 7.0, "a hole in the map"),
     ],
 )
 def test_a_click_into_a_hole_of_the_map_or_beside_it_is_refused_with_a_word(floor_m, aside_m, why):

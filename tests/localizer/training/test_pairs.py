@@ -4,6 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from localizer.errors import SequenceError
 from localizer.geometry.pose import Pose
@@ -15,12 +16,32 @@ from localizer.training.data.pairs import (
     draw_views,
     scene_pairs,
     survey_scene,
-    warp_check,
 )
 from localizer.training.data.shards import read_shard, write_shard, write_shards
 from localizer.training.places.photos import PhotoLibrary
+from localizer.types import Float32
 
 SMALL = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
+
+
+def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
+    """The query's colours brought into the reference view by depth and poses (paper, Fig. 14).
+
+    Returns the warped image (H, W, 3) float32 in 0..255 and the mask (H, W) of what both views see.
+    """
+    camera = pair.camera
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    rays = camera.rays(np.stack([u, v], -1))
+    points = pair.world_from_reference.apply(rays * pair.reference_depth[..., None])
+    local = pair.world_from_query.inverse.apply(points)
+    pixels, inside = camera.project(local)
+    pixels = np.nan_to_num(pixels, nan=-1.0).astype(np.float32) - np.float32(0.5)
+    x, y = pixels[..., 0], pixels[..., 1]
+    warped = cv2.remap(pair.query.astype(np.float32), x, y, cv2.INTER_LINEAR)
+    depth = cv2.remap(pair.query_depth, x, y, cv2.INTER_NEAREST)
+    z = local[..., 2]
+    same = np.abs(depth - z) < 0.02 * z + 1.0
+    return warped, inside & same & (pair.reference_depth > 0)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from localizer.targets.limits import RefusalReason, TargetRefusal
 from mavlink_bridge.alerts.alert import (
     PREFIX,
     Alert,
@@ -18,6 +19,7 @@ from mavlink_bridge.alerts.catalogue import CATALOGUE, TEXT_LENGTH, alert, clear
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
 from mavlink_bridge.alerts.words import ChosenSet, Name, RcChannel, Word
+from mavlink_bridge.link.tlog import PART, WHOLE
 
 NUMBERS = {
     "used": 200, "system": 200, "device": 200, "number": 12, "level": 88.0, "seconds": 30.0,
@@ -27,10 +29,11 @@ NAMES = {  # the longest that comes from outside
     "component": "integrity monitor", "what": "localizati",
     "name": "car 12",
 }  # fmt: skip
+REFUSED = max((str(TargetRefusal(why, 88.8)) for why in RefusalReason), key=len)
 WHY = {
-    AlertId.TLOG_INCOMPLETE: "Read-only file system",
-    AlertId.TARGET_REFUSED: "the map has a hole there", AlertId.TARGET_SILENT: "moved 12 m",
-    AlertId.TARGET_NOT_LOCATED: "no map under it",
+    AlertId.TLOG_INCOMPLETE: max(WHOLE, PART, "No space left on device", key=len),
+    AlertId.TARGET_REFUSED: REFUSED, AlertId.TARGET_SILENT: REFUSED,
+    AlertId.TARGET_NOT_LOCATED: REFUSED,
 }  # fmt: skip
 
 
