@@ -1,9 +1,9 @@
 """Normalised correlation of one patch with a level of the overview, block by block, by FFT.
 
-A block is `SIZE` cells wide; the patch, smaller than `SIZE - STEP`, is compared at `STEP` by `STEP`
-origins of each, which tile the map. What is summed over channels is a product of spectra, so that a
-patch costs one transform per channel and each block one inverse transform; the blocks' own spectra
-are kept within a budget.
+A block is `SIZE` cells wide; a patch is compared at all origins of each at which the block contains
+it. They tile the map. What is summed over channels is a product of spectra, so that a patch costs
+one transform per channel and each block one inverse transform; the blocks' own spectra are kept
+within a budget.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from localizer.relocalization.overview import OverviewLevel
 from localizer.types import Float32
 
 SIZE = 256
-STEP = 160
+MOST_CELLS = 96  # of a patch's side
+_STEPS = (192, 160)  # origins of a block's side, for patches of up to 64 and 96 cells
 _COARSE = 8  # cells of the map's energy that are summed before it is correlated
 # Spectra of so many blocks and patches are multiplied row by row, so that a row of all of them
 # stays in the cache: one block and one patch after the other took more than twice as long.
-BLOCKS_TOGETHER, _PATCHES_TOGETHER = 8, 4
+BLOCKS_TOGETHER, PATCHES_TOGETHER = 8, 4
 _LEAST_ENERGY = 0.3  # of the map's usual one under a patch: bare or missing ground scores less
 
 Complex64 = NDArray[np.complex64]
@@ -34,10 +35,11 @@ Complex64 = NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class Block:
-    """Origins (row, column) to (row + STEP, column + STEP) of the map, in cells; may be < 0."""
+    """Origins (row, column) to (row + step, column + step) of the map, in cells; may be < 0."""
 
     row: int
     column: int
+    step: int
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,8 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
     lines[:, :, :n] = features.transpose(2, 0, 1)
     half = scipy.fft.rfft(lines, axis=2, workers=1, overwrite_x=True)
     spectra = scipy.fft.fft(half, SIZE, axis=1, workers=1, overwrite_x=True)
-    padded = np.zeros((SIZE, SIZE), np.float32)
-    padded[:n, :n] = mask
-    coarse = scipy.fft.rfft2(_summed(padded) / _COARSE**2, workers=1)
+    sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
+    coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)
     norm = float(np.sqrt((features**2).sum()))
     return PatchSpectra(
         np.ascontiguousarray(spectra, np.complex64),
@@ -111,56 +112,53 @@ class LevelCorrelator:
         with self._lock:
             self._search += 1
 
-    def blocks(self) -> list[Block]:
-        """All blocks; they reach half a block beyond the map, so that patches may, too."""
+    def blocks(self, cells: int) -> list[Block]:
+        """All blocks for patches of up to so many cells a side; half of the largest patch may be
+        beyond the map.
+        """
         rows, columns = self.level.shape
-        lead = (SIZE - STEP) // 2
+        step = next(s for s in _STEPS if SIZE - s >= cells)
+        lead = (SIZE - step) // 2
         return [
-            Block(r, c) for r in range(-lead, rows - lead, STEP)
-            for c in range(-lead, columns - lead, STEP)
+            Block(r, c, step) for r in range(-lead, rows - lead, step)
+            for c in range(-lead, columns - lead, step)
         ]  # fmt: skip
 
     def correlate(self, patch: PatchSpectra, block: Block) -> Float32:
-        """Scores (STEP, STEP) of the patch at the block's origins."""
+        """Scores (step, step) of the patch at the block's origins."""
         return self.correlate_all([patch], [(0, block)])[0]
 
     def correlate_all(
         self, patches: Sequence[PatchSpectra], pairs: Sequence[tuple[int, Block]]
     ) -> list[Float32]:
-        """Scores (STEP, STEP) of each pair: number of a patch, and the block. At most
-        `BLOCKS_TOGETHER` different blocks.
+        """Scores (step, step) of each pair: number of a patch, and the block. At most
+        `PATCHES_TOGETHER` patches and `BLOCKS_TOGETHER` different blocks.
         """
         blocks = {b: k for k, b in enumerate(dict.fromkeys(b for _, b in pairs))}
         spectra = [self._spectra(b) for b in blocks]
         products = np.empty((len(pairs), SIZE, SIZE // 2 + 1), np.complex64)
-        for first in range(0, len(patches), _PATCHES_TOGETHER):
-            some = patches[first : first + _PATCHES_TOGETHER]
-            mine = [
-                (blocks[b], n - first, at)
-                for at, (n, b) in enumerate(pairs)
-                if first <= n < first + len(some)
-            ]
-            if mine:
-                _multiplied(
-                    _filled([s.features for s in spectra], BLOCKS_TOGETHER),
-                    _filled([p.features for p in some], _PATCHES_TOGETHER),
-                    np.array(mine, np.int64),
-                    products.view(np.float32),
-                )
+        _multiplied(
+            _filled([s.features for s in spectra], BLOCKS_TOGETHER),
+            _filled([p.features for p in patches], PATCHES_TOGETHER),
+            np.array([(blocks[b], n, at) for at, (n, b) in enumerate(pairs)], np.int64),
+            products.view(np.float32),
+        )
         return [
-            self._normalised(product, spectra[blocks[b]], patches[n])
+            self._normalised(product, spectra[blocks[b]], patches[n], b.step)
             for product, (n, b) in zip(products, pairs, strict=True)
         ]
 
-    def _normalised(self, product: Complex64, block: _Spectra, patch: PatchSpectra) -> Float32:
-        """Scores (STEP, STEP) from the product of the spectra, which is overwritten."""
-        # Only the first STEP rows are origins: the others' last transform is left out.
-        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:STEP]
+    def _normalised(
+        self, product: Complex64, block: _Spectra, patch: PatchSpectra, step: int
+    ) -> Float32:
+        """Scores (step, step) from the product of the spectra, which is overwritten."""
+        # Only the first rows are origins: the others' last transform is left out.
+        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:step]
         raw = scipy.fft.irfft(columns, SIZE, axis=1, workers=1)
         small = SIZE // _COARSE
         energy = scipy.fft.irfft2(block.energy * patch.mask.conj(), (small, small), workers=1)
         least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
-        scores = np.empty((STEP, STEP), np.float32)
+        scores = np.empty((step, step), np.float32)
         _normalised(raw, energy, np.float32(least), np.float32(max(patch.norm, 1e-9)), scores)
         return scores
 
@@ -168,7 +166,7 @@ class LevelCorrelator:
         """Compile the kernels of a search."""
         channels = self.level.features.shape[0]
         patch = transform_patch(np.ones((8, 8, channels), np.float32), np.ones((8, 8), np.float32))
-        self.correlate(patch, self.blocks()[0])
+        self.correlate(patch, self.blocks(patch.cells)[0])
 
     def _spectra(self, block: Block) -> _Spectra:
         with self._lock:
