@@ -24,6 +24,9 @@ from localizer.types import Float32
 SIZE = 256
 MOST_CELLS = 96  # of a patch's side
 _STEPS = (192, 160)  # origins of a block's side, for patches of up to 64 and 96 cells
+# Frequencies that are kept on each side: a quarter of a cycle per cell. Above are 1 % of the energy
+# of a map's features.
+_LOW = SIZE // 4
 _COARSE = 8  # cells of the map's energy that are summed before it is correlated
 # Spectra of so many blocks and patches are multiplied row by row, so that a row of all of them
 # stays in the cache: one block and one patch after the other took more than twice as long.
@@ -44,7 +47,7 @@ class Block:
 
 @dataclass(frozen=True)
 class _Spectra:
-    """features: (K, SIZE, SIZE/2+1) complex64; energy: (SIZE/8, SIZE/16+1) complex64."""
+    """features: (K, 2 _LOW, _LOW+1) complex64; energy: (SIZE/8, SIZE/16+1) complex64."""
 
     features: Complex64
     energy: Complex64
@@ -56,7 +59,7 @@ class _Spectra:
 
 @dataclass(frozen=True)
 class PatchSpectra:
-    """A patch's Fourier transform. features: (K, SIZE, SIZE/2+1); mask: as `_Spectra.energy`; norm:
+    """A patch's Fourier transform. features: (K, 2 _LOW, _LOW+1); mask: as `_Spectra.energy`; norm:
     root of its energy; cells: side of the patch; weight: share of cells in view.
     """
 
@@ -73,13 +76,13 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
     # Row by row first: most rows are empty and stay so.
     lines = np.zeros((features.shape[2], n, SIZE), np.float32)
     lines[:, :, :n] = features.transpose(2, 0, 1)
-    half = scipy.fft.rfft(lines, axis=2, workers=1, overwrite_x=True)
-    spectra = scipy.fft.fft(half, SIZE, axis=1, workers=1, overwrite_x=True)
+    half = scipy.fft.rfft(lines, axis=2, workers=1, overwrite_x=True)[:, :, : _LOW + 1]
+    spectra = scipy.fft.fft(half, SIZE, axis=1, workers=1)
     sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
     coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)
     norm = float(np.sqrt((features**2).sum()))
     return PatchSpectra(
-        np.ascontiguousarray(spectra, np.complex64),
+        _low(spectra),
         np.ascontiguousarray(coarse, np.complex64),
         norm,
         n,
@@ -136,7 +139,7 @@ class LevelCorrelator:
         """
         blocks = {b: k for k, b in enumerate(dict.fromkeys(b for _, b in pairs))}
         spectra = [self._spectra(b) for b in blocks]
-        products = np.empty((len(pairs), SIZE, SIZE // 2 + 1), np.complex64)
+        products = np.zeros((len(pairs), SIZE, _LOW + 1), np.complex64)
         _multiplied(
             _filled([s.features for s in spectra], BLOCKS_TOGETHER),
             _filled([p.features for p in patches], PATCHES_TOGETHER),
@@ -206,9 +209,15 @@ class LevelCorrelator:
             )
         energy = _summed((window**2).sum(axis=0))
         return _Spectra(
-            scipy.fft.rfft2(window, workers=1).astype(np.complex64, copy=False),
+            _low(scipy.fft.rfft2(window, workers=1)),
             scipy.fft.rfft2(energy, workers=1).astype(np.complex64, copy=False),
         )
+
+
+def _low(spectra: Complex64) -> Complex64:
+    """The low frequencies (K, 2 _LOW, _LOW+1) of spectra (K, SIZE, at least _LOW+1)."""
+    kept = [spectra[:, :_LOW, : _LOW + 1], spectra[:, -_LOW:, : _LOW + 1]]
+    return np.concatenate(kept, axis=1).astype(np.complex64, copy=False)
 
 
 def _summed(values: Float32) -> Float32:
@@ -227,12 +236,13 @@ def _filled(spectra: Sequence[Complex64], count: int) -> tuple[Float32, ...]:
 def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
     """Sum over channels of block * conj(patch) for each pair (m, 3): block, patch, place in out.
 
-    blocks, patches: (K, SIZE, 2 n) each, out: (., SIZE, 2 n) float32, real and imaginary in turn.
+    blocks, patches: (K, 2 _LOW, 2 n) each, out: (., SIZE, 2 n) float32, real and imaginary in turn.
     """
     channels, rows, width = blocks[0].shape
     for i in range(rows):
+        at = i if i < _LOW else i + SIZE - 2 * _LOW
         for m in range(pairs.shape[0]):
-            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], i]
+            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], at]
             o[:] = 0
             for k in range(channels):
                 x, y = a[k, i], b[k, i]

@@ -39,6 +39,13 @@ def query(heading_sigma_rad=None, height_m=100.0, height_sigma_m=2.0):
     return PlaceQuery(frame, DOWN, 0.01, heading_sigma_rad, height_m, height_sigma_m)
 
 
+def smooth(seed, side, channels=3):
+    """Features (channels, side, side) int8 as smooth as a network's."""
+    values = np.random.default_rng(seed).normal(size=(side, side, channels))
+    blurred = cv2.GaussianBlur(values, (0, 0), 1.5)
+    return np.rint(blurred * 30 / blurred.std()).clip(-127, 127).astype(np.int8).transpose(2, 0, 1)
+
+
 def level(features):
     side = features.shape[1] // 16
     ground = np.zeros((side, features.shape[2] // 16), np.float32)
@@ -71,7 +78,7 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
 
 def test_scores_are_normalised_correlations():
     rng = np.random.default_rng(0)
-    features = rng.integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    features = smooth(0, 288)
     n = 24
     mask = (rng.random((n, n)) > 0.2).astype(np.float32)
     patch = rng.normal(size=(n, n, 3)).astype(np.float32) * mask[..., None]
@@ -96,7 +103,7 @@ def test_scores_are_normalised_correlations():
 def test_patches_and_blocks_together_score_as_each_pair_alone():
     """As many patches as are multiplied at once, not each with each block, in any order."""
     rng = np.random.default_rng(3)
-    correlator = LevelCorrelator(level(rng.integers(-60, 60, (3, 288, 288)).astype(np.int8)), 0)
+    correlator = LevelCorrelator(level(smooth(0, 288)), 0)
     patches = [
         transform_patch(rng.normal(size=(n, n, 3)).astype(np.float32), np.ones((n, n), np.float32))
         for n in (16, 20, 24, 17)
@@ -112,8 +119,7 @@ def test_patches_and_blocks_together_score_as_each_pair_alone():
 
 @pytest.mark.parametrize("n", [40, 64, 65, 96])
 def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else(n):
-    rng = np.random.default_rng(1)
-    features = rng.integers(-60, 60, (3, 320, 320)).astype(np.int8)
+    features = smooth(1, 320)
     r, c = 150, 201
     cut = features[:, r : r + n, c : c + n].transpose(1, 2, 0).astype(np.float32) * 0.01
     correlator = LevelCorrelator(level(features), 0)  # no budget: nothing is kept
@@ -131,7 +137,7 @@ def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else(n):
 
 def test_a_patch_of_which_nothing_is_seen_looks_like_no_place():
     """The search of a low, steep view ended with a division by zero."""
-    features = np.random.default_rng(2).integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    features = smooth(2, 288)
     correlator = LevelCorrelator(level(features), 0)
     unseen = transform_patch(np.zeros((16, 16, 3), np.float32), np.zeros((16, 16), np.float32))
     for block in correlator.blocks(16):
@@ -140,11 +146,11 @@ def test_a_patch_of_which_nothing_is_seen_looks_like_no_place():
 
 def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
     """The least recently used would be the next one wanted: going round, nothing was ever found."""
-    features = np.random.default_rng(0).integers(-99, 99, (3, 512, 512)).astype(np.int8)
+    features = smooth(0, 512)
     one = LevelCorrelator(level(features), 1 << 40)
     patch = transform_patch(np.ones((16, 16, 3), np.float32), np.ones((16, 16), np.float32))
     blocks = one.blocks(96)
-    size = 3 * 256 * 129 * 8 + 32 * 17 * 8
+    size = 3 * 128 * 65 * 8 + 32 * 17 * 8
     made = []
     correlator = LevelCorrelator(level(features), 5 * size)
     transform = scipy.fft.rfft2
