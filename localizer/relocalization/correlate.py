@@ -251,17 +251,17 @@ def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
                     o[2 * j + 1] += x[2 * j + 1] * y[2 * j] - x[2 * j] * y[2 * j + 1]
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _normalised(raw, energy, least, norm, out):  # type: ignore[no-untyped-def]
     """Sample k of the coarse energy belongs to origin 8 k: between them it is interpolated."""
     step = np.float32(1.0 / _COARSE)
     for i in range(out.shape[0]):
         p = i // _COARSE
         a = (i - p * _COARSE) * step
-        for j in range(out.shape[1]):
-            q = j // _COARSE
-            b = (j - q * _COARSE) * step
-            top = energy[p, q] + b * (energy[p, q + 1] - energy[p, q])
-            low = energy[p + 1, q] + b * (energy[p + 1, q + 1] - energy[p + 1, q])
-            under = max(top + a * (low - top), least)
-            out[i, j] = raw[i, j] / (np.sqrt(under) * norm)
+        for q in range(out.shape[1] // _COARSE):
+            west = energy[p, q] + a * (energy[p + 1, q] - energy[p, q])
+            east = energy[p, q + 1] + a * (energy[p + 1, q + 1] - energy[p, q + 1])
+            slope = (east - west) * step
+            for b in range(_COARSE):
+                j = q * _COARSE + b
+                out[i, j] = raw[i, j] / (np.sqrt(max(west + b * slope, least)) * norm)
